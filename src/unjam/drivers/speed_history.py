@@ -55,7 +55,6 @@ class BufferedWindow:
         buffer.filled_steps += 1
         return BufferedWindow(buffer, self.start + 1, self.steps), buffer.speeds[self.start]
 
-
     def replace_rows(self, rows: Any, source: "BufferedWindow", source_rows: Any) -> "BufferedWindow":
         """Return a window, in a new buffer, in which some rows are those of another window of as many steps."""
         own, other = (each.buffer.speeds[each.start : each.start + each.steps] for each in (self, source))

@@ -19,7 +19,7 @@ from unjam.measures.step_metrics import step_metrics
 from unjam.physics.arrays import Array, clip, namespace, replace_entries
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
-from unjam.worlds.batch.noise import ArrayFactory, DrawNormal
+from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, draw_single_normal
 from unjam.worlds.batch.ring.record import as_numpy
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
@@ -43,7 +43,7 @@ class _ArrayKind(NamedTuple):
 
 def _numpy_kind(is_exact: bool, seed: Sequence[int]) -> _ArrayKind:
     to_array = partial(np.asarray, dtype=np.float64 if is_exact else np.float32)
-    draw = None if is_exact else partial(np.random.default_rng(seed).standard_normal, dtype=np.float32)
+    draw = None if is_exact else partial(draw_single_normal, np.random.default_rng(seed))
     return _ArrayKind(to_array, draw, lambda values: values.astype(np.float32), nullcontext)
 
 
@@ -53,6 +53,11 @@ def _torch_kind(is_exact: bool, seed: Sequence[int], device: str) -> _ArrayKind:
     generator = torch.Generator(device).manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
     draw = None if is_exact else partial(torch.randn, generator=generator, device=device)
     return _ArrayKind(to_array, draw, lambda values: values.float(), torch.no_grad)
+
+
+def _with_masks(values: dict[str, Any], mask: Array) -> dict[str, Any]:
+    """Return values of environments together with Gymnasium's masks, which say for which of them they are."""
+    return values | {f"_{name}": mask for name in values}
 
 
 class _Episodes:
@@ -74,8 +79,10 @@ class _Episodes:
         self._memory = decision.memory
         world.advance(decision.command)
         speed, _, gap = world.following_state()
-        columns = (each[:, None] for each in (world.last_applied_acceleration(), time_gap(gap, speed)))
-        return Outcome(world.speeds.T, *columns, world.crashed_roads, 0.0 * speed, speed[:, None])
+        accelerations, time_gaps = world.last_applied_acceleration()[:, None], time_gap(gap, speed)[:, None]
+        return Outcome(
+            world.speeds.T, accelerations, time_gaps, world.crashed_roads, 0.0 * speed, cav_speeds=speed[:, None]
+        )
 
     def observe(self) -> None:
         """Let the driver observe the current state, once in each control step."""
@@ -186,8 +193,10 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         if len(seeds) != self.num_envs:
             raise InputError(f"seed: {len(seeds)} seeds are not allowed; allowed: {self.num_envs}, or a single one")
         for row in rows:
-            if seeds[row] is not None or self._seeds[row] is None:
-                given = self.np_random.integers(2**31) if seeds[row] is None else seeds[row]
+            given = seeds[row]
+            if given is None and self._seeds[row] is None:
+                given = int(self.np_random.integers(2**31))
+            if given is not None:
                 self._seeds[row], self._episode_counts[row] = as_seed(given)[0], 0
                 self._prepared.pop(row, None)
         if len(rows) == self.num_envs and not self._prepared:
@@ -261,7 +270,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             for name, values in {"return": rewards, **step_metrics(outcome)}.items():
                 self._totals[name] = self._totals[name] + values
             ended = terminated | truncated
-            self._ended_rows = np.flatnonzero(as_numpy(ended)).tolist()
+            self._ended_rows = np.flatnonzero(as_numpy(ended)).tolist() if bool(ended.any()) else []
             if self._ended_rows:
                 info |= _with_masks({"episode_metrics": _with_masks(self._metrics(ended), ended)}, ended)
             if restarted:
@@ -278,13 +287,12 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         return self._kind.to_array(actions).reshape(-1)
 
     def _reward_terms(self, outcome: Outcome) -> dict[str, Array]:
-        if self._is_numpy:
-            return validate_reward_terms(self._road.reward, outcome, row_name="environment")
-        terms = self._road.reward(outcome)
-        for name, values in terms.items():
-            if np.shape(values) != (self.num_envs,):
-                raise InputError(f"reward: term {name!r} has shape {np.shape(values)}; allowed: ({self.num_envs},)")
-        return terms
+        reward = self._road.reward
+        terms = reward(outcome)
+        is_valid = all(getattr(values, "shape", None) == (self.num_envs,) for values in terms.values())
+        if is_valid and (not self._is_numpy or np.isfinite(sum(terms.values())).all()):
+            return terms
+        return validate_reward_terms(reward, outcome, row_name="environment")
 
     def _metrics(self, ended: Array) -> dict[str, Array]:
         """Return the metrics of the episodes that have ended, zeros for others."""
@@ -302,8 +310,3 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             values[rows] = [roads[row].drawn_values[name] for row in rows]
             drawn[name] = self._kind.to_array(values)
         return _with_masks({"drawn_values": _with_masks(drawn, is_new)}, is_new)
-
-
-def _with_masks(values: dict[str, Any], mask: Array) -> dict[str, Any]:
-    """Return values of environments together with Gymnasium's masks, which say for which of them they are."""
-    return values | {f"_{name}": mask for name in values}

@@ -1,20 +1,21 @@
 """Metrics of episodes that are means over control steps, without the record of an episode."""
 
-from unjam.measures.metrics import STANDING_SPEED
-from unjam.physics.arrays import Array, square_root
+from unjam.physics.arrays import Array, clamp_min, namespace, square_root
 from unjam.worlds.reward import Outcome
 
 
 def step_metrics(outcome: Outcome) -> dict[str, Array]:
     """Return metrics of control steps by their names in `METRICS`, shape (rows,) each.
 
-    Their means over an episode are its metrics on roads where all vehicles are present all the time.
+    Their means over an episode are its metrics on roads where all vehicles are present all the time. The variance is
+    the mean square minus the square of the mean, without an array of deviations: it is exact to some 1e-7 of the mean
+    square in single precision.
     """
-    speeds, mean = outcome.speeds, outcome.speeds.mean(-1)
+    speeds, count = outcome.speeds, outcome.speeds.shape[-1]
+    mean, mean_square = speeds.sum(-1) / count, namespace(speeds).einsum("rv,rv->r", speeds, speeds) / count
     return {
         "mean_speed": mean,
-        "speed_std_fleet": square_root(((speeds - mean[..., None]) ** 2).mean(-1)),
-        "share_standing": (speeds < STANDING_SPEED).sum(-1) / speeds.shape[-1],
-        "cav_mean_speed": outcome.cav_speeds.mean(-1),
-        "mean_abs_accel": abs(outcome.accelerations).mean(-1),
+        "speed_std_fleet": square_root(clamp_min(mean_square - mean * mean, 0.0)),
+        "cav_mean_speed": outcome.cav_speeds.sum(-1) / outcome.cav_speeds.shape[-1],
+        "mean_abs_accel": abs(outcome.accelerations).sum(-1) / outcome.accelerations.shape[-1],
     }

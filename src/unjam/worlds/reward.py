@@ -63,6 +63,8 @@ RewardLike = str | Callable[[Outcome], Any]
 
 def _nan_mean(values: Array) -> Array:
     """Mean over the last axis without NaN; 0 if all are NaN."""
+    if namespace(values) is np and not np.isnan(total := np.add.reduce(values, -1)).any():
+        return total / max(values.shape[-1], 1)  # no vehicle is absent; the way below takes several times as long
     return _nan_sum(values) / clamp_min((~namespace(values).isnan(values)).sum(-1), 1)
 
 

@@ -1,9 +1,11 @@
 """Random numbers of many episodes at once: those of SUMO's episodes of the same seeds, or quick ones."""
 
 from collections.abc import Callable, Mapping, Sequence
+from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unjam.physics.arrays import Array, Floats, namespace
 from unjam.worlds.ordered_road import NOISE_BLOCK_STEPS
@@ -14,6 +16,17 @@ DrawNormal = Callable[[tuple[int, ...]], Array]
 """draws standard normal numbers of a shape"""
 WorldSeeds = Sequence[Sequence[np.random.SeedSequence]]
 """seeds of each world, from `Scenario.draw_from_seed`"""
+
+
+def draw_single_normal(generator: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return standard normal numbers in single precision, several times faster than `generator.standard_normal`.
+
+    Source: Box and Muller 1958, Ann. Math. Stat. 29:610.
+    """
+    size = prod(shape)
+    uniform = generator.random((2, (size + 1) // 2), np.float32)
+    radius, angle = np.sqrt(-2.0 * np.log(1.0 - uniform[0])), 2.0 * np.pi * uniform[1]
+    return np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])[:size].reshape(shape)
 
 
 class NoiseState(NamedTuple):

@@ -1,7 +1,7 @@
 """W recorded roads as one world: platoons behind vehicles that replay recordings, stepped as arrays."""
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -56,10 +56,12 @@ class RecordedBatch(RingBatch):
         """Return the exact local state of the CAVs now."""
         return without_loop(super().exact_state())
 
-    def replace_roads(self, roads: Any, source: Self, source_roads: Any) -> None:
+    def replace_roads(self, roads: Any, source: Any, source_roads: Any) -> None:
         """Continue on some roads with those of another batch, see `RingBatch.replace_roads`."""
         longest = np.arange(max(len(each._replayed_speeds) for each in (self, source)))
-        own, other = (each._replayed_speeds[longest.clip(max=len(each._replayed_speeds) - 1)] for each in (self, source))
+        own, other = (
+            each._replayed_speeds[longest.clip(max=len(each._replayed_speeds) - 1)] for each in (self, source)
+        )
         self._replayed_speeds = replace_columns(own, roads, other, source_roads)
         super().replace_roads(roads, source, source_roads)
 

@@ -246,7 +246,7 @@ class RingBatch:
         return self.control_step_counts >= self._ends
 
     def last_applied_acceleration(self) -> Array:
-        """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2], shape (CAVs * W,)."""
+        """Return the accelerations of the CAVs in the last control step, after the filter [m/s2], shape (CAVs * W,)."""
         return sum(self.safe_accelerations) / len(self.safe_accelerations)
 
     @property
@@ -264,13 +264,17 @@ class RingBatch:
     def exact_state(self) -> LocalState:
         """Return the exact local state of the CAVs now."""
         loop, position = self._cav_loop_lengths, self._rows_of(self._position, self._cav_indices)
+        if self._has_quick_noise:
+            place = position - loop * namespace(position).floor(position / loop)  # `%` takes ten times as long
+        else:
+            place = position % loop
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
         distances = [(start - position) % loop for start in self._crossing_starts]
         return LocalState(
             *self.following_state(),
             self._rows_of(self._speed, self._follower_indices),
             self._rows_of(self._gap, self._follower_indices),
-            position % loop,
+            place,
             loop,
             distance_to_crossing=reduce(namespace(position).minimum, distances) if distances else None,
             penetration_rate=None if rate is None else position * 0.0 + rate,
