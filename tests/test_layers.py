@@ -35,7 +35,7 @@ ALLOWED = {
     "following": {"sumo_files", "physics", "drivers", "recordings", "scenarios"},
     "reports": {"physics", "drivers", "recordings", "scenarios", "worlds", "measures"},
     "models": {"following"},
-    "training": {"adapters", "controller", "reports"},
+    "training": {"adapters", "controller", "environments", "reports"},
     "cli": {"controller", "following", "reports"},
     "unjam_paper": {"controller", "following", "reports"},
     "environments": {"controller", "physics", "drivers", "recordings", "scenarios", "worlds", "measures", "reports"},

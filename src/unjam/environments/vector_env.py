@@ -18,7 +18,6 @@ from unjam.errors import InputError, MissingPartError, UnjamError, import_option
 from unjam.measures.step_metrics import step_metrics
 from unjam.physics.arrays import Array, clip, namespace, replace_entries
 from unjam.scenarios import make_scenario
-from unjam.scenarios.scenario import Scenario
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, draw_single_normal
 from unjam.worlds.batch.ring.record import as_numpy
 from unjam.worlds.batch.ring.world import RingBatch
@@ -63,13 +62,9 @@ def _with_masks(values: dict[str, Any], mask: Array) -> dict[str, Any]:
 class _Episodes:
     """Episodes on the roads of a batch, and the driver of their CAVs."""
 
-    def __init__(
-        self, scenario: Scenario, seeds: Sequence[Sequence[int]], driver: ExternalDriver, kind: _ArrayKind
-    ) -> None:
+    def __init__(self, world: RingBatch, driver: ExternalDriver, to_array: ArrayFactory) -> None:
         """Start the episodes, with their warm-up."""
-        batch: Any = required_batch_kind(scenario).world
-        self.world: RingBatch = batch([scenario] * len(seeds), seeds, kind.to_array, keep_record=False, draw=kind.draw)
-        self._driver, self._memory = driver, start_batch_drive(self.world, driver, kind.to_array).memory
+        self.world, self._driver, self._memory = world, driver, start_batch_drive(world, driver, to_array).memory
         self.observe()
 
     def advance(self, actions: Array) -> Outcome:
@@ -221,12 +216,17 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             raise InputError("options: reset_mask is not allowed in the first reset")
         return np.flatnonzero(mask).tolist()
 
-    def _start_episodes(self, rows: list[int]) -> _Episodes:
-        """Start the next episodes of some environments."""
+    def make_batch(self, rows: Sequence[int]) -> RingBatch:
+        """Return a batch of the next episodes of some environments, which has not been started."""
         seeds = [episode_seed(self._seeds[row] or 0, self._episode_counts[row]) for row in rows]
         for row in rows:
             self._episode_counts[row] += 1
-        return _Episodes(self._road.scenario, seeds, self._road.copy_driver(), self._kind)
+        kind, scenarios = self._kind, [self._road.scenario] * len(rows)
+        batch: Any = required_batch_kind(self._road.scenario).world
+        return batch(scenarios, seeds, kind.to_array, keep_record=False, draw=kind.draw)
+
+    def _start_episodes(self, rows: list[int]) -> _Episodes:
+        return _Episodes(self.make_batch(rows), self._road.copy_driver(), self._kind.to_array)
 
     def _restart(self, rows: list[int]) -> None:
         """Go on in some environments with their next episodes.

@@ -78,6 +78,11 @@ def square_root(array: Array) -> Array:
     return array.rsqrt().reciprocal()
 
 
+def as_indices(values: Array) -> Array:
+    """Return whole numbers as indices of arrays, through which no gradient flows."""
+    return values.astype(np.int64) if isinstance(values, np.ndarray) else values.detach().long()
+
+
 def replace_entries(values: Array, index: Any, source: Array, source_index: Any) -> Array:
     """Return a copy of an array with `source[source_index]` in place of the entries `values[index]`."""
     copy = values.copy() if isinstance(values, np.ndarray) else values.clone()

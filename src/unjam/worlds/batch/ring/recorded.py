@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from unjam.drivers.local_state import LocalState
-from unjam.physics.arrays import Array, clamp_max, namespace, replace_columns
+from unjam.physics.arrays import Array, as_indices, clamp_max, namespace, replace_columns
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.batch.human_idm import CONTACT_GAP, Leader, human_idm_speed, slow_to_desired_speed
 from unjam.worlds.batch.noise import ArrayFactory
@@ -75,7 +75,7 @@ class RecordedBatch(RingBatch):
     def _next_speeds(self, speed: Array, leader: Leader, cav_speeds: Array | None) -> tuple[Array, Array]:
         moved, speeds = super()._next_speeds(speed, leader, cav_speeds)
         xp = namespace(moved)
-        replayed = self._replayed_speeds[xp.asarray(self._next_samples, dtype=xp.int64), self._columns][None]
+        replayed = self._replayed_speeds[as_indices(self._next_samples), self._columns][None]
         self._next_samples = clamp_max(self._next_samples + 1.0, len(self._replayed_speeds) - 1.0)
         return xp.concatenate([moved[:-1], replayed]), xp.concatenate([speeds[:-1], replayed])
 
