@@ -251,11 +251,17 @@ def test_it_follows_the_conventions_of_gymnasium() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"scenario": "merge", "cavs": 1}, "vectorization_mode='async'"),
-        ({"scenario": "on-ramp", "cavs": 1}, "scenario: motorway is not allowed in a vector environment; or vector"),
+        (
+            {"scenario": "merge", "cavs": 1},
+            "scenario: merge is not possible in a batch (merge is not a ring); allowed: vec",
+        ),
+        (
+            {"scenario": "on-ramp", "cavs": 1},
+            "scenario: motorway is not possible in a batch (vehicles enter and leave); allowed: vec",
+        ),
         ({"actuation": "flow"}, "actuation: flow is not allowed in a batch; allowed: raw, or shielded"),
-        ({"backend": "sumo"}, "backend: is not allowed in a batch; allowed: none, or vectorization_mode='async'"),
-        ({"render_mode": "rgb_array"}, "render_mode: is not allowed in a batch"),
+        ({"backend": "sumo"}, "backend: is not an option of batches; allowed: vectorization_mode='async'"),
+        ({"render_mode": "rgb_array"}, "render_mode: is not an option of batches"),
         ({"cavs": 2}, "cavs: several are not allowed here; allowed: 1"),
         ({"num_envs": 0}, "num_envs: 0 is not allowed; allowed: an integer >= 1"),
         ({"lenght": 230}, "lenght: unknown name"),
@@ -272,6 +278,11 @@ def test_what_a_batch_cannot_do_is_refused_in_one_line(arguments: dict[str, Any]
     [
         (lambda made: made.reset(seed=[1]), "seed: 1 seeds are not allowed; allowed: 2, or a single one"),
         (lambda made: made.reset(seed=-1), "seed: -1 is not allowed; allowed: >= 0"),
+        (
+            lambda made: made.reset(seed="a"),
+            "seed: 'a' is not allowed; allowed: an integer, or one for each environment",
+        ),
+        (lambda made: made.reset(seed=[1, 0.5]), "seed: [1, 0.5] is not allowed; allowed: an integer"),
         (lambda made: made.reset(options={"length": 230}), "options: 'length' is not allowed; allowed: 'reset_mask'"),
         (lambda made: made.reset(options={"reset_mask": [1, 0]}), "options: reset_mask is not 2 booleans"),
         (lambda made: made.reset(options={"reset_mask": np.zeros(2, bool)}), "options: reset_mask is not 2 booleans"),
@@ -292,7 +303,9 @@ def test_other_wrong_uses_are_refused() -> None:
         RoadVectorEnv(2).step(np.zeros((2, 1)))
     with pytest.raises(InputError, match="reset_mask is not allowed in the first reset"):
         RoadVectorEnv(2).reset(options={"reset_mask": np.array([True, False])})
-    with pytest.raises(MissingPartError, match="device: "):
+    with pytest.raises(
+        MissingPartError, match="device: 'nonesuch' is not available to torch; allowed: 'cpu', or '' for NumPy"
+    ):
         RoadVectorEnv(2, device="nonesuch")
     made = RoadVectorEnv(2, reward=lambda outcome: {"mine": outcome.speeds.mean(-1) / 0.0 * np.array([1.0, 0.0])})
     made.reset(seed=0)

@@ -273,7 +273,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
     libsumo can run one simulation per process: if other code or another environment uses it, SUMO runs in a separate
     process, several times slower, with a warning. A second thread waits until the first has returned.
-    For parallel environments use ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
+    Many environments at once, without SUMO: `RoadVectorEnv`; in SUMO:
+    ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -4,6 +4,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
+from operator import index
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from unjam.worlds.batch.support import required_batch_kind, statistically_unsupp
 from unjam.worlds.episode import as_seed
 from unjam.worlds.reward import Outcome, RewardLike, time_gap, validate_reward_terms
 
-OTHER_MODE = "or vectorization_mode='async', which simulates in SUMO"
+OTHER_MODE = "allowed: vectorization_mode='async', which simulates in SUMO"
 
 
 class _ArrayKind(NamedTuple):
@@ -143,21 +144,22 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         """
         for name in ("backend", "render_mode"):
             if changes.pop(name, None):
-                raise InputError(f"{name}: is not allowed in a batch; allowed: none, {OTHER_MODE}")
+                raise InputError(f"{name}: is not an option of batches; {OTHER_MODE}")
         if not isinstance(num_envs, int) or num_envs < 1:
             raise invalid_value("num_envs", num_envs, "an integer >= 1")
         made = make_scenario(scenario, changes)
-        if reason := statistically_unsupported_reason(made):
-            raise InputError(f"{reason}; {OTHER_MODE}")
-        if not issubclass(required_batch_kind(made).world, RingBatch):
-            raise InputError(f"scenario: {made.title} is not allowed in a vector environment; {OTHER_MODE}")
+        reason = statistically_unsupported_reason(made)
+        if not reason and not issubclass(required_batch_kind(made).world, RingBatch):
+            reason = "vehicles enter and leave"
+        if reason:
+            raise InputError(f"scenario: {made.title} is not possible in a batch ({reason}); {OTHER_MODE}")
         check_single_cav(made)
         self._road = RoadStepper(scenario, changes, reward, expert, features, "batch")
         needs_numpy = self._road.copy_driver().expert.requirements().needs_numpy
         if device and needs_numpy:
             raise invalid_value("expert", expert, "one that takes tensors, like 'pi'; or device='', NumPy")
         self._make_kind = partial(_torch_kind, device=device) if device else _numpy_kind
-        self._exact, self._is_numpy, self.num_envs = exact, not device, num_envs
+        self._exact, self._device, self._is_numpy, self.num_envs = exact, device, not device, num_envs
         self._kind = self._make_array_kind((0,))
         self.single_observation_space, self.single_action_space = self._road.observation_space, self._road.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -174,25 +176,21 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
     def _make_array_kind(self, seed: Sequence[int]) -> _ArrayKind:
         try:
             return self._make_kind(self._exact, seed)
-        except (RuntimeError, AssertionError) as error:  # of torch, if it has no such device
-            raise MissingPartError(f"device: {str(error).splitlines()[0]}") from None
+        except (RuntimeError, AssertionError):  # of torch
+            message = f"device: {self._device!r} is not available to torch; allowed: 'cpu', or '' for NumPy"
+            raise MissingPartError(message) from None
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode in each environment, or in those of `options["reset_mask"]`, booleans of shape (W,)."""
-        rows, seeds = self._rows_to_reset(options or {}), [None] * self.num_envs if seed is None else seed
-        if isinstance(seeds, int | np.integer):
-            super().reset(seed=as_seed(seeds)[0])
-            seeds = range(int(seeds), int(seeds) + self.num_envs)
-        if len(seeds) != self.num_envs:
-            raise InputError(f"seed: {len(seeds)} seeds are not allowed; allowed: {self.num_envs}, or a single one")
+        rows, seeds = self._rows_to_reset(options or {}), self._seeds_of_environments(seed)
         for row in rows:
             given = seeds[row]
             if given is None and self._seeds[row] is None:
                 given = int(self.np_random.integers(2**31))
             if given is not None:
-                self._seeds[row], self._episode_counts[row] = as_seed(given)[0], 0
+                self._seeds[row], self._episode_counts[row] = given, 0
                 self._prepared.pop(row, None)
         if len(rows) == self.num_envs and not self._prepared:
             self._kind = self._make_array_kind((self._seeds[0] or 0, self._episode_counts[0]))
@@ -215,6 +213,22 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         if self._episodes is None and not mask.all():
             raise InputError("options: reset_mask is not allowed in the first reset")
         return np.flatnonzero(mask).tolist()
+
+    def _seeds_of_environments(self, seed: Any) -> list[int | None]:
+        """Return a seed or None for each environment."""
+        if isinstance(seed, int | np.integer):
+            super().reset(seed=as_seed(seed)[0])
+            return list(range(int(seed), int(seed) + self.num_envs))
+        try:
+            seeds = [
+                None if each is None else as_seed(index(each))[0]
+                for each in ([None] * self.num_envs if seed is None else seed)
+            ]
+        except TypeError:
+            raise invalid_value("seed", seed, "an integer, or one for each environment") from None
+        if len(seeds) != self.num_envs:
+            raise InputError(f"seed: {len(seeds)} seeds are not allowed; allowed: {self.num_envs}, or a single one")
+        return seeds
 
     def make_batch(self, rows: Sequence[int]) -> RingBatch:
         """Return a batch of the next episodes of some environments, which has not been started."""
