@@ -65,12 +65,12 @@ def measure_candidates(
     world = RecordedBatch(list(scenarios) * candidates, [(0,)] * (roads * candidates), keep_record=False)
     loop = start_batch_drive(world, with_parameter_rows(driver, parameters, roads) if parameters else driver)
     step, counted = scenarios[0].control_step, 1 + scenarios[0].vehicle_kinds[::-1].index("cav")
-    before = world.platoon_speeds[:counted]
+    before = world.speeds[:counted]
     totals = np.zeros((4, roads * candidates))
     max_gap, min_time_gap = np.zeros(roads * candidates), np.full(roads * candidates, np.inf)
     is_running = np.array(world.is_running)
     for _ in loop:
-        speeds, gap = world.platoon_speeds[:counted], world.exact_state().leader_gap
+        speeds, gap = world.speeds[:counted], world.exact_state().leader_gap
         fuel = fuel_rate(speeds, (speeds - before) / step).sum(0)
         totals += is_running * np.stack([fuel, speeds.sum(0), gap, np.ones_like(gap)])
         max_gap = np.maximum(max_gap, gap * is_running)

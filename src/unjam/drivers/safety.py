@@ -8,13 +8,13 @@ brakes hard; otherwise it brakes as hard as necessary.
 
 import sys
 from math import exp
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from unjam.parameters import STRICT, NonNegative, Positive, Subclassable, parameter_dataclass
-from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
+from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, replace_columns
 from unjam.physics.kinematics import max_speed_to_stop, next_speed, stopping_distance
 
 
@@ -293,6 +293,12 @@ class CAVActuation:
         self._limit, self._actuator, self._step = safety.limit, actuator, step
         self._has_lag = not actuator.is_instant
         self._states: dict[str, ActuatorState] = {}
+
+    def reset_rows(self, rows: Any) -> None:
+        """Let some of the vehicles with a common name start again, without acceleration and commands."""
+        for name, state in self._states.items():
+            initial = self._actuator.initial_state(state.acceleration, self._step)
+            self._states[name] = replace_columns(state, rows, initial, rows)
 
     def apply(self, name: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
         """Return the filtered command for a desired acceleration, and the acceleration in this step [m/s2].

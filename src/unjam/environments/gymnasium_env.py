@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from unjam.controller import make_expert
 from unjam.drivers.car_following import Constant
 from unjam.drivers.command import Command, Limits, as_numbers
-from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
+from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler, replace_memory_rows
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import (
     MAX_OBSERVATION,
@@ -30,12 +31,14 @@ from unjam.drivers.user_driver import DriverLike
 from unjam.drivers.wrappers import INNER_KEY
 from unjam.environments.threads import CopyableLock, synchronized
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
+from unjam.physics.arrays import replace_entries
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
+from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend, open_world
 from unjam.worlds.drive import DriveLoop, naming_cav
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
-from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap, validate_reward_terms
+from unjam.worlds.reward import Outcome, Reward, RewardLike, make_reward, time_gap, validate_reward_terms
 from unjam.worlds.road_world import RoadWorld
 
 Observations = NDArray[np.float32]
@@ -47,6 +50,17 @@ def as_action(action: Any, name: str) -> float:
     if values.size != 1 or not np.isfinite(values).all():
         raise InputError(f"step: {name}: {action!r:.60} is not allowed; allowed: one finite number")
     return values.item()
+
+
+def episode_seed(seed: int, episode_count: int) -> tuple[int, ...]:
+    """Return the seed of an episode of an environment, after so many others since the one of `seed`."""
+    return (seed, episode_count) if episode_count else (seed,)
+
+
+def check_single_cav(scenario: Scenario) -> None:
+    """Raise `InputError` unless a scenario has one CAV."""
+    if getattr(scenario, "cavs", None) != 1:
+        raise InputError("cavs: several are not allowed here; allowed: 1; use unjam.parallel_env")
 
 
 class ExternalDriver(Driver):
@@ -64,6 +78,12 @@ class ExternalDriver(Driver):
         return merge_requirements(
             self.expert.requirements(road), *(feature(each).requirements for each in self.features)
         )
+
+    def replace_rows(self, rows: Any, source: "ExternalDriver", source_rows: Any) -> None:
+        """Let some CAVs go on with the last observation of CAVs of another driver of this kind."""
+        own, other = (each._expert_acceleration for each in (self, source))
+        self._expert_acceleration = replace_entries(own, rows, other, source_rows)
+        self._next_memory = replace_memory_rows(self._next_memory, rows, source._next_memory, source_rows)
 
     def observation(self, state: LocalState, memory: Memory) -> Any:
         """Return the external observation, shape (CAVs, numbers), and store the expert's acceleration."""
@@ -144,7 +164,7 @@ class RoadStepper:
             self._seed, self._episode_count = seed, 0
         if self._seed is None:
             self._seed = int(generator.integers(2**31))
-        numbers = (self._seed, self._episode_count) if self._episode_count else (self._seed,)
+        numbers = episode_seed(self._seed, self._episode_count)
         self._episode_count += 1
         self._world = None  # also if the next one cannot be opened
         self._world_context.close()
@@ -200,6 +220,15 @@ class RoadStepper:
         while world.expects_cavs and not (world.cav_ids or world.has_ended):
             next(self._control_steps)
 
+    def copy_driver(self) -> ExternalDriver:
+        """Return a driver with the same expert and features, for other CAVs."""
+        return copy(self._driver)
+
+    @property
+    def reward(self) -> Reward:
+        """The reward of control steps."""
+        return self._reward
+
     @property
     def world(self) -> RoadWorld:
         """The world of the running episode; raise `UnjamError` if there is none."""
@@ -244,7 +273,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
     libsumo can run one simulation per process: if other code or another environment uses it, SUMO runs in a separate
     process, several times slower, with a warning. A second thread waits until the first has returned.
-    For parallel environments use ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
+    Many environments at once, without SUMO: `RoadVectorEnv`; in SUMO:
+    ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -288,8 +318,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
             raise invalid_value("render_mode", render_mode, "rgb_array, except with backend='sumo'")
         backend = "sumo-gui" if render_mode == "human" else backend
         self._road = RoadStepper(scenario, changes, reward, expert, features, backend)
-        if getattr(self._road.scenario, "cavs", None) != 1:
-            raise InputError("cavs: several are not allowed here; allowed: 1; use unjam.parallel_env")
+        check_single_cav(self._road.scenario)
         self.observation_space = self._road.observation_space
         self.action_space = self._road.action_space
 
