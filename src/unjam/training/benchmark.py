@@ -15,6 +15,7 @@ from functools import partial
 from statistics import median
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import torch
 
@@ -134,6 +135,7 @@ def _measure_round(
             yield Part(f"{name}: {EPISODE_PART}", sumo_part), _episode_rate(scenario, number, simulation)
         yield Part(f"{own}, network in every step", sumo), _episode_rate(ring, number, simulation, 0.0)
         yield Part(f"{own} without safety filter", own), _episode_rate(unfiltered, number, simulation)
+        yield Part("ring: env.step", sumo), _environment_rate(ring, number, simulation)
         yield Part("ring: audit of an episode", own), steps_per_second(partial(_repeat_audit, episode), ring.horizon)
         for rows, steps in ROLLOUT_SIZES:
             name = f"learned model: {rows:,} rollouts of {steps} control steps"
@@ -203,6 +205,14 @@ def _loop_rate(scenario: Scenario, driver: ResidualDriver, simulation: Simulatio
     options = WorldOptions(accepts_floats=not driver.requirements().needs_arrays)
     traffic = make_traffic(scenario, (1,), simulation, options)
     return steps_per_second(lambda: deque(DriveLoop(traffic, driver, explore=True), maxlen=0), scenario.horizon)
+
+
+def _environment_rate(scenario: Scenario, seed: int, simulation: Simulation) -> float:
+    """Return control steps per second of the Gymnasium environment with random actions; the reset is not timed."""
+    environment = gymnasium.make("unjam/Ring-v0", backend=SumoBackend(simulation))
+    environment.reset(seed=seed)
+    actions = np.random.default_rng(seed).uniform(-1.0, 1.0, (scenario.horizon, 1)).astype(np.float32)
+    return steps_per_second(lambda: deque(map(environment.step, actions), maxlen=0), len(actions))
 
 
 def _rollout_rate(episode: Episode, scenario: Scenario, driver: ResidualDriver, rows: int, steps: int) -> float:
