@@ -32,6 +32,7 @@ from unjam.environments.threads import CopyableLock, synchronized
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
+from unjam.seeds import warn_of_reserved_seed
 from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend, open_world
 from unjam.worlds.drive import DriveLoop, naming_cav
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
@@ -140,6 +141,7 @@ class RoadStepper:
 
         It is that of `seed`; without one, the next after that of the last seed, or one with a seed from `generator`.
         """
+        warn_of_reserved_seed(seed)
         if seed is not None:
             self._seed, self._episode_count = seed, 0
         if self._seed is None:
