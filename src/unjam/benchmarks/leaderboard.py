@@ -7,7 +7,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from unjam.benchmarks.result import BenchmarkResult, read_result
-from unjam.errors import InputError, naming
+from unjam.errors import InputError, naming, one_line
 from unjam.measures.statistics import format_ci
 from unjam.reports.figures import CAV_PLOT_COLOR, MUTED_COLOR, PLOT_STYLE, TEXT_COLOR, new_figure, short_label
 
@@ -23,7 +23,8 @@ def read_leaderboard(paths: Sequence[Path]) -> dict[str, BenchmarkResult]:
             result.check_comparable()
             if results and result.suite != (suite := next(iter(results.values())).suite):
                 raise InputError(f"suite: {result.suite} is not allowed; allowed: {suite}, as in {paths[0]}")
-        results[f"{result.driver} ({path.stem})" if result.driver in results else result.driver] = result
+        label = one_line(result.driver)
+        results[f"{label} ({one_line(path.stem)})" if label in results else label] = result
     return dict(sorted(results.items(), key=lambda entry: -entry[1].mean_gain().mean))
 
 

@@ -27,9 +27,11 @@ if TYPE_CHECKING:  # imported late, so that commands start quickly
 FILE_FORMAT = 1
 MAX_FILE_BYTES = 4 * 2**20
 """maximum size of a file; one with all roads has 200 kB"""
+MAX_LABEL_CHARACTERS = 500
+"""of the name of a driver"""
 DIGITS = 7
 """significant digits of stored metrics"""
-TOLERANCE = 1e-4
+MAX_RELATIVE_DIFFERENCE = 1e-4
 """allowed relative difference to reference values of the human baseline"""
 PARTS = {"all roads": ("training", "combination", "axis"), "training": ("training",), "unseen": ("combination", "axis")}
 """parts of the family by the name of their mean"""
@@ -49,7 +51,7 @@ class RoadRecord:
     baseline: Columns
     driver: Columns
     """empty if it cannot drive on this road: it then counts as the human baseline"""
-    note: Annotated[StrictStr, Field(max_length=500)] = ""
+    note: StrictStr = ""
     """why it cannot drive there"""
 
 
@@ -58,7 +60,7 @@ class BenchmarkResult:
     """The result of one driver in a suite: gain, feasibility and the worst road follow from the rows of its roads."""
 
     suite: StrictStr
-    driver: Annotated[StrictStr, Field(min_length=1, max_length=500)]
+    driver: Annotated[StrictStr, Field(min_length=1, max_length=MAX_LABEL_CHARACTERS)]
     sha256: StrictStr | None
     """hash of the driver: its controller file, or else its parameters, code and weights; None: a Python object"""
     training_steps: StrictInt | None
@@ -97,7 +99,7 @@ class BenchmarkResult:
     @property
     def worst_road(self) -> tuple[str, float]:
         """The road with the smallest gain, and this gain."""
-        return min(((name, each.mean) for name, (each, *_) in self._gains.items()), key=lambda pair: pair[1])
+        return min(self.gains().items(), key=lambda pair: pair[1])
 
     @property
     def feasible_count(self) -> int:
@@ -126,11 +128,7 @@ class BenchmarkResult:
 
     def summary(self) -> dict[str, Any]:
         """Return what follows from the rows, as the file has it."""
-        name, worst = self.worst_road
-        roads = {road: {**_interval(each), "feasible": text} for road, (each, _, text) in self._gains.items()}
-        means = {part: _interval(self.mean_gain(part)) for part in PARTS}
-        feasible = f"{self.feasible_count} of {len(self.roads)}"
-        return {"mean_gain": means, "worst_road": {"road": name, "gain": worst}, "feasible": feasible, "roads": roads}
+        return {"gains": self.road_rows(), "worst_road": self.worst_road, "feasible_roads": self.feasible_count}
 
     def document(self) -> dict[str, Any]:
         """Return the content of the file, a JSON object; with a summary if all roads are finished."""
@@ -145,7 +143,7 @@ class BenchmarkResult:
         for name, road in self.roads.items():
             found = [gain.performance(row) for row in _rows(road.baseline)]
             for value, expected in zip(found, references()[name]["baseline"], strict=True):
-                if not isclose(value, expected, rel_tol=TOLERANCE):
+                if not isclose(value, expected, rel_tol=MAX_RELATIVE_DIFFERENCE):
                     versions = f"unjam {self.manifest.get('unjam')!s:.20}, backend {road.backend:.40}"
                     reason = f"performance of the human baseline ({versions})"
                     raise invalid_value(f"{name}: {reason}", round(value, 4), f"{expected:.4f}, as in {self.suite}")
@@ -200,7 +198,7 @@ def read_result(path: Path) -> BenchmarkResult:
         if seeds != list(map(list, FAMILY_TEST_SEEDS)):
             raise InputError(f"seeds: they are not those of {result.suite}")
         expected = None if result.missing_roads else parse_json(to_json(result.summary()))
-        if difference := first_difference(expected, summary, TOLERANCE):
+        if difference := first_difference(expected, summary, MAX_RELATIVE_DIFFERENCE):
             name, computed, found = difference
             raise invalid_value(f"summary.{name}".rstrip("."), found, f"{computed!r}, which follows from the rows")
         return result

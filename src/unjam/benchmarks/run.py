@@ -9,15 +9,22 @@ from typing import Any
 from safetensors.numpy import save
 
 from unjam.benchmarks.episodes import FAMILY_METRICS, FAMILY_TEST_SEEDS, make_tasks
-from unjam.benchmarks.result import BenchmarkResult, RoadRecord, read_result, to_columns, write_result
+from unjam.benchmarks.result import (
+    MAX_LABEL_CHARACTERS,
+    BenchmarkResult,
+    RoadRecord,
+    read_result,
+    to_columns,
+    write_result,
+)
 from unjam.benchmarks.suites import DEFAULT_SUITE, find_suite
 from unjam.controller import DEFAULT_DRIVER, controller_hash, controller_path, make_driver
 from unjam.controller.file import read_controller, sha256_of
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable, user_code_recipes
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, invalid_value
-from unjam.files import check_parent_folder, to_json
+from unjam.errors import InputError, invalid_value, one_line
+from unjam.files import make_folder, to_json
 from unjam.manifest import manifest, without_folders
 from unjam.measures.gain import EpisodeRows
 from unjam.measures.metric_table import HUMAN_LABEL
@@ -72,14 +79,14 @@ def benchmark(
     origin = manifest()
     result = BenchmarkResult(
         suite=suite,
-        driver=without_folders([label])[0] or first.describe(),
+        driver=one_line(without_folders([label])[0] or first.describe(), MAX_LABEL_CHARACTERS),
         sha256=_driver_hash(label, first),
         training_steps=_recorded_steps(label) or training_steps,
         manifest={**origin, "command": without_folders(origin["command"]), "backend": backend},
     )
     path = None if out is None else Path(out)
     if path is not None:
-        check_parent_folder(path)
+        make_folder(path.parent)
         result = _stored_result(path, result) if os.path.lexists(path) else result
     with WorkerPool(workers or os.cpu_count() or 1) as pool:
         for number, name in enumerate(result.missing_roads, len(result.roads) + 1):
@@ -106,7 +113,7 @@ def _make_drivers(driver: str | DriverLike, roads: dict[str, Scenario]) -> tuple
             check_can_drive(made, road)
             drivers[name] = made
         except InputError as error:
-            reasons[name] = str(error)
+            reasons[name] = one_line(error)
     if not drivers:
         raise InputError(next(iter(reasons.values())))
     return drivers, reasons
@@ -165,7 +172,8 @@ def _stored_result(path: Path, new: BenchmarkResult) -> BenchmarkResult:
         made = result.manifest
         sumo = (made.get("packages") or {}).get("eclipse-sumo")
         names = {"suite": result.suite, "driver": result.driver, "hash of the driver": result.sha256}
-        return names | {"unjam": made.get("unjam"), "SUMO": sumo, "backend": made.get("backend")}
+        names |= {"training steps": result.training_steps, "backend": made.get("backend")}
+        return names | {"unjam": made.get("unjam"), "SUMO": sumo}
 
     if new.sha256 is None:
         raise invalid_value("out", str(path), "a new file: it is unknown whether a Python object has changed")

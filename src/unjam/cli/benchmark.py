@@ -10,7 +10,7 @@ from unjam.cli import options as opt
 from unjam.cli.output import console, err_console, new_table, print_json, print_next_command
 from unjam.controller import DEFAULT_DRIVER
 from unjam.errors import InputError, invalid_value
-from unjam.files import atomic_write, check_parent_folder, make_folder
+from unjam.files import atomic_write, make_folder
 
 LEADERBOARD_WIDTH = 80
 """width of a leaderboard [characters]"""
@@ -62,7 +62,6 @@ def benchmark_command(
     if out is None:
         slug = re.sub(r"[^\w-]+", "-", Path(driver).stem)[:40].strip("-")
         out = Path("runs") / f"benchmark-{suite}-{slug}.json"
-        make_folder(out.parent)
     line = (lambda text: None) if json else (lambda text: err_console.print(text, soft_wrap=True))
     result = benchmark(driver, suite, out, workers, backend, training_steps, line)
     if json:
@@ -88,9 +87,7 @@ def _compare(names: list[str], out: Path, json: bool) -> None:
     from unjam.reports.figures import png_bytes, svg_bytes
 
     results = leaderboard.read_leaderboard([Path(name) for name in names])
-    if out.parent == Path("runs"):
-        make_folder(out.parent)
-    check_parent_folder(out)
+    make_folder(out.parent)
     atomic_write(out, (svg_bytes if out.suffix == ".svg" else png_bytes)(leaderboard.leaderboard_figure(results)))
     if json:
         print_json({label: result.summary() for label, result in results.items()})
