@@ -94,7 +94,7 @@ def benchmark(
             human = make_driver(HUMAN_LABEL, scenario.control_step)
             _, baseline = _drive_road(scenario, human, backend, pool)
             used, rows = _drive_road(scenario, drivers[name], backend, pool) if name in drivers else ("", [])
-            record = RoadRecord(used, to_columns(baseline), to_columns(rows), reasons.get(name, ""))
+            record = RoadRecord(used, to_columns(baseline), to_columns(rows), one_line(reasons.get(name, "")))
             result = replace(result, roads={**result.roads, name: record})
             if path is not None:
                 write_result(path, result)
@@ -103,9 +103,11 @@ def benchmark(
     return result
 
 
-def _make_drivers(driver: str | DriverLike, roads: dict[str, Scenario]) -> tuple[dict[str, Driver], dict[str, str]]:
+def _make_drivers(
+    driver: str | DriverLike, roads: dict[str, Scenario]
+) -> tuple[dict[str, Driver], dict[str, InputError]]:
     """Return the driver of each road, and for others the reason why it cannot drive there; `InputError` without any."""
-    drivers, reasons = dict[str, Driver](), dict[str, str]()
+    drivers, reasons = dict[str, Driver](), dict[str, InputError]()
     for name, road in roads.items():
         try:
             step = road.control_step
@@ -113,9 +115,9 @@ def _make_drivers(driver: str | DriverLike, roads: dict[str, Scenario]) -> tuple
             check_can_drive(made, road)
             drivers[name] = made
         except InputError as error:
-            reasons[name] = one_line(error)
+            reasons[name] = error
     if not drivers:
-        raise InputError(next(iter(reasons.values())))
+        raise next(iter(reasons.values()))
     return drivers, reasons
 
 
