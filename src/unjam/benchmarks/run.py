@@ -92,8 +92,9 @@ def benchmark(
         for number, name in enumerate(result.missing_roads, len(result.roads) + 1):
             scenario = roads[name]
             human = make_driver(HUMAN_LABEL, scenario.control_step)
-            _, baseline = _drive_road(scenario, human, backend, pool)
-            used, rows = _drive_road(scenario, drivers[name], backend, pool) if name in drivers else ("", [])
+            used, rows = human_used, baseline = _drive_road(scenario, human, backend, pool)
+            if (own := drivers.get(name)) != human:
+                used, rows = _drive_road(scenario, own, backend, pool) if own else (human_used, [])
             record = RoadRecord(used, to_columns(baseline), to_columns(rows), one_line(reasons.get(name, "")))
             result = replace(result, roads={**result.roads, name: record})
             if path is not None:
