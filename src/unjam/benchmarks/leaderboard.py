@@ -24,7 +24,7 @@ def read_leaderboard(paths: Sequence[Path]) -> dict[str, BenchmarkResult]:
             if results and result.suite != (suite := next(iter(results.values())).suite):
                 raise InputError(f"suite: {result.suite} is not allowed; allowed: {suite}, as in {paths[0]}")
         label = one_line(result.driver)
-        results[f"{label} ({one_line(path.stem)})" if label in results else label] = result
+        results[f"{label} ({one_line(path)})" if label in results else label] = result
     return dict(sorted(results.items(), key=lambda entry: -entry[1].mean_gain().mean))
 
 
