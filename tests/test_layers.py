@@ -21,12 +21,12 @@ MODULES = {module: ast.parse(text) for module, text in TEXTS.items()}
 
 ORDER = (
     *("sumo_files", "physics", "drivers", "recordings", "scenarios", "worlds", "measures", "models", "learners"),
-    *("training", "cli", "unjam_paper"),
+    *("training", "benchmarks", "cli", "unjam_paper"),
 )
 """each may import those before it, and none after it"""
 EVERYWHERE = {
     *("", "adam", "child_processes", "errors", "file_names", "files", "folders", "kernels", "manifest", "onnx_models"),
-    *("parameters", "plugins", "processes", "sandbox", "tree", "trust", "user_code"),
+    *("parameters", "plugins", "processes", "road_family", "sandbox", "seeds", "tree", "trust", "user_code"),
 }
 """modules that every part may import: they import none of the layers"""
 ALLOWED = {
@@ -36,6 +36,7 @@ ALLOWED = {
     "reports": {"physics", "drivers", "recordings", "scenarios", "worlds", "measures"},
     "models": {"following"},
     "training": {"adapters", "controller", "environments", "reports"},
+    "benchmarks": {"controller", "reports"},
     "cli": {"controller", "following", "reports"},
     "unjam_paper": {"controller", "following", "reports"},
     "environments": {"controller", "physics", "drivers", "recordings", "scenarios", "worlds", "measures", "reports"},
@@ -44,7 +45,7 @@ ALLOWED = {
 LAZY = {
     "__init__": {
         *("controller", "drivers", "environments", "errors", "kernels", "resource_limits", "measures", "scenarios"),
-        *("training", "trust", "worlds"),
+        *("benchmarks", "seeds", "training", "trust", "worlds"),
     },
     "__main__": {"cli"},
     "resource_limits": {"child_processes", "controller", "errors", "trust"},

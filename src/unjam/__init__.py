@@ -31,12 +31,14 @@ from unjam.errors import missing_package_error  # noqa: E402
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from unjam.benchmarks.run import benchmark
     from unjam.controller import load_controller, make_driver
     from unjam.drivers import Driver, LocalState, check_driver
     from unjam.environments.pettingzoo_env import parallel_env
     from unjam.measures.metrics import measure
     from unjam.resource_limits import verify_controller, write_report
     from unjam.scenarios import make_scenario
+    from unjam.seeds import held_out_seeds
     from unjam.training.config import load_config
     from unjam.training.evaluate import drive
     from unjam.training.export import export_controller
@@ -49,12 +51,14 @@ if TYPE_CHECKING:
 _LAZY_IMPORTS = {
     name: module
     for module, names in {
+        "unjam.benchmarks.run": "benchmark",
         "unjam.controller": "load_controller make_driver",
         "unjam.drivers": "Driver LocalState check_driver",
         "unjam.environments.pettingzoo_env": "parallel_env",
         "unjam.measures.metrics": "measure",
         "unjam.resource_limits": "verify_controller write_report",
         "unjam.scenarios": "make_scenario",
+        "unjam.seeds": "held_out_seeds",
         "unjam.training.config": "load_config",
         "unjam.training.evaluate": "drive",
         "unjam.training.export": "export_controller",
@@ -68,9 +72,9 @@ _LAZY_IMPORTS = {
 
 register_environments()
 
-__all__ = ["Driver", "LocalState", "check_driver", "drive", "export_controller", "list_runs", "load_config"]
-__all__ += ["load_controller", "make_driver", "make_scenario", "measure", "parallel_env", "run_episode", "train"]
-__all__ += ["trusting_code", "verify_controller", "write_report"]
+__all__ = ["Driver", "LocalState", "benchmark", "check_driver", "drive", "export_controller", "held_out_seeds"]
+__all__ += ["list_runs", "load_config", "load_controller", "make_driver", "make_scenario", "measure", "parallel_env"]
+__all__ += ["run_episode", "train", "trusting_code", "verify_controller", "write_report"]
 
 
 def __getattr__(name: str) -> Any:

@@ -19,9 +19,9 @@ from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.physics.arrays import Array, Floats, clamp_min
 from unjam.physics.idm import PAPER_IDM, IDMParameters, idm_acceleration
 from unjam.reports.figures import LINE_COLORS, MUTED_COLOR, PLOT_STYLE, new_figure
+from unjam.road_family import AGGRESSIVE_IDM, SHORT_WARM_UP
 from unjam.scenarios.ring import Ring
-from unjam.training.road_family import AGGRESSIVE_IDM, SHORT_WARM_UP
-from unjam.training.seeds import make_test_seeds
+from unjam.seeds import held_out_seeds
 from unjam.worlds.batch.human_idm import Leader
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
@@ -109,7 +109,7 @@ def _measure_speeds(name: str, driver: str, workers: int) -> dict[str, list[Any]
     """Return the mean speed of all vehicles in each second and the limit after the change, by episode [m/s]."""
     ring, world = ROAD_CHANGES[name]
     rings = [ring.stratum(number, ADAPTATION_EPISODES) for number in range(ADAPTATION_EPISODES)]
-    changing = world(rings, make_test_seeds(ADAPTATION_EPISODES))
+    changing = world(rings, held_out_seeds(ADAPTATION_EPISODES))
     episodes = finish_drive(start_batch_drive(changing, make_driver(driver, ring.control_step)))
     speeds = [episode.speeds[1:].mean(1).reshape(-1, STEPS_PER_SECOND).mean(1) for episode in episodes]
     after = replace(ring, humans=world.humans_after)

@@ -7,7 +7,6 @@ for rounding.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +14,24 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from unjam.controller import PACKAGED_PREFIX, make_driver
+from unjam.benchmarks.episodes import (
+    EPISODES_PER_ROAD,
+    FAMILY_TEST_SEEDS,
+    Seeds,
+    drive_by_label,
+    family_metrics,
+    run_in_batches,
+)
+from unjam.controller import PACKAGED_PREFIX
 from unjam.measures import gain
 from unjam.measures.feasibility import FEASIBLE, overall_feasibility
 from unjam.measures.gain import EpisodeRows
 from unjam.measures.metric_table import HUMAN_LABEL
-from unjam.measures.metrics import measure
 from unjam.measures.statistics import estimate, estimate_on_shared_seeds, format_difference
 from unjam.physics.arrays import Floats
 from unjam.reports.figures import TEXT_COLOR, new_figure
 from unjam.reports.results import replace_null
-from unjam.scenarios.scenario import Scenario
-from unjam.training.road_family import (
+from unjam.road_family import (
     ACTUATOR_LATENCY,
     AGGRESSIVE_IDM,
     FAMILY,
@@ -35,24 +40,17 @@ from unjam.training.road_family import (
     SHARED_RINGS_GROUP,
     SHORT_WARM_UP,
     FamilyRoad,
-    family_roads,
     ring_options,
 )
-from unjam.training.seeds import make_test_seeds, tuning_seeds
-from unjam.worlds.batch.run import run_batches
-from unjam.worlds.batch.support import unsupported_reason
-from unjam.worlds.record import Episode
-from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam.scenarios import make_scenario
+from unjam.scenarios.family import family_roads
+from unjam.seeds import held_out_seeds, tuning_seeds
+from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import StudyPart, read_parts
 from unjam_paper.study import PlannedRun, Study, StudyFolder
 from unjam_paper.variants import RINGS_EXPERT, SHARED_RINGS_EXPERT, VARIANTS
 
-EPISODES_PER_ROAD = 10
-"""number of episodes of each driver on each road"""
-EXPERT_SELECTION_SEEDS, FAMILY_TEST_SEEDS = tuning_seeds(EPISODES_PER_ROAD, 1000), make_test_seeds(EPISODES_PER_ROAD)
-Seeds = Sequence[tuple[int, ...]]
-EpisodeRunner = Callable[[list[EpisodeTask]], EpisodeRows]
-"""runs tasks and returns the result of `family_metrics` for each of them, in their order"""
+EXPERT_SELECTION_SEEDS = tuning_seeds(EPISODES_PER_ROAD, 1000)
 PI_TUNED_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
 """result of `unjam tune rings --expert pi --max-string-gain 0`"""
 PI_TUNED_ON_ALL = (
@@ -128,34 +126,8 @@ SHARED_RING_ROADS = {
     },
 }
 """rings that several CAVs share: those of the family, and further unseen ones"""
-FRESH_TEST_SEEDS = make_test_seeds(20, 1000)
+FRESH_TEST_SEEDS = held_out_seeds(20, 1000)
 """test seeds that were not used in the decision which rings get an expert of their own"""
-FAMILY_METRICS = (
-    *("seed", "status", "travel_time", "delay", "mean_speed", "mean_speed_second_half", "speed_limit_ratio"),
-    *("outflow_veh_per_h", "fuel_ml_per_km", "required_time_gap", "has_lanes", "collisions", "min_time_gap"),
-    *("cav_min_ttc", "cav_max_braking", "cut_in_max_braking", "share_short_time_gap", "override_share"),
-    "human_braking_beyond_4_5",
-)
-
-
-def drive_by_label(
-    scenario: Scenario, drivers: Mapping[str, str], seeds: Seeds, run_episodes: EpisodeRunner
-) -> dict[str, EpisodeRows]:
-    """Return the metrics of each driver's episodes by label; `drivers` are names of drivers by label."""
-    made = [make_driver(name, scenario.control_step) for name in drivers.values()]  # one each: networks have memory
-    tasks = [
-        EpisodeTask(scenario.stratum(index, len(seeds)), driver, seed)
-        for driver in made
-        for index, seed in enumerate(seeds)
-    ]
-    rows, count = run_episodes(tasks), len(seeds)
-    return {label: rows[number * count : (number + 1) * count] for number, label in enumerate(drivers)}
-
-
-def family_metrics(index: int, episode: Episode) -> dict[str, Any]:
-    """Return the metrics of an episode, for `WorkerPool.run_and_map`: a whole motorway episode takes 80 MB."""
-    measured = measure(episode)
-    return {key: measured[key] for key in FAMILY_METRICS}
 
 
 def _family_drivers(road: FamilyRoad) -> dict[str, str]:
@@ -197,10 +169,10 @@ def measure_road(
 
     With `in_batches` the episodes are simulated in batches where these are supported.
     """
-    scenario = road.make_scenario()
+    scenario = make_scenario(road.scenario, road.options)
     candidates = {driver: driver for driver in (HUMAN_LABEL, *experts)}
     with WorkerPool(workers) as pool:
-        run = partial(_run_in_batches, pool) if in_batches else partial(pool.run_and_map, transform=family_metrics)
+        run = partial(run_in_batches, pool) if in_batches else partial(pool.run_and_map, transform=family_metrics)
         best = best_feasible_driver(drive_by_label(scenario, candidates, EXPERT_SELECTION_SEEDS, run))
         evaluated = {HUMAN_LABEL: HUMAN_LABEL, best: best, **drivers}
         rows = drive_by_label(scenario, evaluated, test_seeds, run)
@@ -238,6 +210,23 @@ def road_gains(folder: Path, parts: Sequence[str] = ("training", *UNSEEN_PARTS))
             "verdicts": {label: overall_feasibility(own, baseline) for label, own in rows.items()},
         }
     return roads
+
+
+def suite_references(path: Path) -> dict[str, Any]:
+    """Return the reference values of benchmark suites, from the results file of this study.
+
+    By road: the best expert, and the performance of the human baseline and of this expert by test seed.
+    """
+    parts = read_parts(path)
+    manifest, origin = parts["manifest"], ("unjam", "commit", "started")
+    references: dict[str, Any] = {}
+    for number, part in parts.items():
+        if number.isdecimal():
+            rows = {label: map(replace_null, part["rows"][label]) for label in (HUMAN_LABEL, part["best"])}
+            human, best = (list(map(gain.performance, rows[label])) for label in (HUMAN_LABEL, part["best"]))
+            references[part["road"]] = {"expert": part["best"], "baseline": human, "performance": best}
+    origin = {key: manifest[key] for key in origin} | {"sumo": manifest["packages"]["eclipse-sumo"]}
+    return {"study": "all-roads", **origin, "roads": references}
 
 
 def all_roads_table(parts: Sequence[str], folder: Path) -> pd.DataFrame:
@@ -356,14 +345,6 @@ def joint_controller(road: FamilyRoad, run: PlannedRun, study_folder: StudyFolde
     configs = run.config.task_configs().items()
     name = next(name for name, config in configs if GROUP_BY_SCENARIO[config.scenario] == group)
     return study_folder.run_folder(run) / name
-
-
-def _run_in_batches(workers: WorkerPool, tasks: list[EpisodeTask]) -> EpisodeRows:
-    """Return the metrics of episodes of one road and several drivers, in batches where they are supported."""
-    if unsupported_reason(tasks[0].scenario):
-        return workers.run_and_map(tasks, family_metrics)
-    by_driver = groupby(tasks, key=lambda task: id(task.driver))
-    return [family_metrics(*each) for _, own in by_driver for each in enumerate(run_batches(list(own)))]
 
 
 def joint_training_table(

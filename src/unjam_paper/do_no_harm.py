@@ -23,8 +23,8 @@ from unjam.measures.statistics import Estimate, format_difference, metric_estima
 from unjam.reports.results import replace_null
 from unjam.scenarios import make_scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
+from unjam.seeds import held_out_seeds
 from unjam.training.evaluate import raise_failure
-from unjam.training.seeds import make_test_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.open_test_roads import OPEN_TEST_ROADS, OpenTestRoad, write_road_files
@@ -132,7 +132,7 @@ def _run_seed_batch(
     file: Path, road: OpenTestRoad, first: int, rates: Sequence[float], pool: WorkerPool
 ) -> dict[str, Table]:
     """Return the rows of seeds from number `first` on by label: the human baseline, and at these rates both drivers."""
-    seeds = make_test_seeds(SEED_BATCH, first)
+    seeds = held_out_seeds(SEED_BATCH, first)
     drivers = {HUMAN_LABEL: (HUMAN_LABEL, rates[0])}
     drivers |= {_rate_label(name, rate): (name, rate) for rate in rates for name in (ACC_BASELINE, TESTED_CONTROLLER)}
     tasks = list[EpisodeTask]()

@@ -28,13 +28,13 @@ from unjam.drivers.sensors import Sensors
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.physics.arrays import Floats
+from unjam.road_family import LONG_WARM_UP
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.motorway import ON_RAMP, Motorway, Ramp
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.training.export import export_controller
 from unjam.training.presets import preset_values
-from unjam.training.road_family import LONG_WARM_UP
 from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.study import (
     NO_VALUE_TEXT,

@@ -18,8 +18,8 @@ from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
 from unjam.measures.metrics import GASOLINE_DENSITY, measure
 from unjam.measures.statistics import metric_estimate, paired_difference
 from unjam.scenarios import make_scenario
+from unjam.seeds import held_out_seeds
 from unjam.training.evaluate import raise_failure
-from unjam.training.seeds import make_test_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.results_file import read_part
@@ -51,7 +51,7 @@ def measure_fuel(road: str, emission_class: str, drivers: Sequence[str], workers
     tasks = [
         EpisodeTask(scenario, make_driver(name, scenario.control_step), seed, record_details=True)
         for name in drivers
-        for seed in make_test_seeds(FUEL_SEEDS)
+        for seed in held_out_seeds(FUEL_SEEDS)
     ]
 
     def episode_row(number: int, episode: Episode) -> dict[str, Any]:

@@ -20,8 +20,8 @@ from unjam.measures.metrics import measure
 from unjam.measures.statistics import estimate
 from unjam.measures.traffic_facts import TrafficFacts, measure_traffic
 from unjam.scenarios import Motorway, make_scenario
+from unjam.seeds import held_out_seeds, tuning_seeds
 from unjam.training.evaluate import raise_failure
-from unjam.training.seeds import make_test_seeds, tuning_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.results_file import read_part
@@ -168,7 +168,7 @@ def measure_traffic_candidate(number: int, workers: int) -> list[dict[str, Any]]
 def measure_step(settings: Mapping[str, Any], step: float, workers: int) -> dict[str, Table]:
     """Return the facts of human traffic on test seeds with a simulation step [s], and a control step of 1 s."""
     changes = {"simulation_step": step, "steps_per_control_step": round(1.0 / step)}
-    return {"episodes": measure_facts(settings, changes, make_test_seeds(FINAL_SEEDS), workers)}
+    return {"episodes": measure_facts(settings, changes, held_out_seeds(FINAL_SEEDS), workers)}
 
 
 def measure_facts(

@@ -16,8 +16,8 @@ from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import measure
 from unjam.measures.traffic_facts import measure_traffic
 from unjam.scenarios import Motorway
+from unjam.seeds import held_out_seeds, tuning_seeds
 from unjam.training.evaluate import raise_failure
-from unjam.training.seeds import make_test_seeds, tuning_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.do_no_harm import HARM_METRICS
@@ -159,7 +159,7 @@ def measure_finalist(method: str, number: int, workers: int) -> list[dict[str, A
 
 def measure_test(label: str, candidate: Candidate, rate: float, number: int, count: int, workers: int) -> Table:
     """Return episodes on a setting of the test half."""
-    jobs = [(SETTINGS[number], candidate, rate, seed) for seed in make_test_seeds(count)]
+    jobs = [(SETTINGS[number], candidate, rate, seed) for seed in held_out_seeds(count)]
     return [{"driver": label, **row} for row in run_jobs(jobs, workers)]
 
 
@@ -174,7 +174,7 @@ def measure_packaged(source: str, workers: int) -> Table:
 def measure_change(name: str, controller: Candidate, workers: int) -> dict[str, Table]:
     """Return the episodes of human traffic and of the controller on one setting with one changed assumption."""
     demand_factor, changes = CHANGES[name]
-    setting, seeds = SETTINGS[CHANGED_SETTING], make_test_seeds(CHANGE_SEEDS)
+    setting, seeds = SETTINGS[CHANGED_SETTING], held_out_seeds(CHANGE_SEEDS)
     setting = replace(setting, demand=demand_factor * setting.demand)
     drivers = {HUMAN_LABEL: (HUMAN, 0.0), CONTROLLER: (controller, BENCHMARK_RATES[0])}
     return {

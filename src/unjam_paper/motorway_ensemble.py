@@ -19,7 +19,7 @@ from unjam.measures.metric_table import estimate_cell
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import estimate
 from unjam.scenarios import Motorway, make_scenario
-from unjam.training.seeds import tuning_seeds
+from unjam.seeds import tuning_seeds
 from unjam.worlds.episode import run_episode
 from unjam_paper.human_traffic import POPULATIONS, TARGETS, fact_values, measure_scenario
 from unjam_paper.results_file import read_part

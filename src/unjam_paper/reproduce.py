@@ -17,11 +17,11 @@ from unjam.files import make_folder
 from unjam.manifest import manifest
 from unjam.reports.results import EVALUATION_FILE
 from unjam.scenarios import SCENARIOS
+from unjam.seeds import held_out_seeds
 from unjam.training.config import load_config
 from unjam.training.evaluate import evaluate, raise_failures, save_evaluation
 from unjam.training.executors import Executor, run_all, training_command
 from unjam.training.run_folder import read_config
-from unjam.training.seeds import make_test_seeds
 from unjam.worlds.episode import can_drive
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import collect_results
@@ -148,7 +148,7 @@ def drive_references(road: str, study_folder: StudyFolder, workers: int) -> None
     drivers = {label: make_driver(name, scenario.control_step) for label, name in names.items()}
     drivers = {label: driver for label, driver in drivers.items() if can_drive(driver, scenario)}
     with WorkerPool(workers) as pool:
-        evaluation = evaluate(scenario, drivers, make_test_seeds(config.evaluation.episodes), pool)
+        evaluation = evaluate(scenario, drivers, held_out_seeds(config.evaluation.episodes), pool)
     raise_failures(evaluation)
     metadata = {"scenario": config.scenario, "manifest": manifest()}
     save_evaluation(study_folder.reference_folder(road), evaluation, metadata)

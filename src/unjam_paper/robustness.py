@@ -19,10 +19,10 @@ from unjam.drivers.wrappers import ImpairedDriver
 from unjam.measures.feasibility import overall_feasibility
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.statistics import Estimate, paired_difference
+from unjam.road_family import NGSIM_IDM
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import load_config
 from unjam.training.evaluate import TRAINED_LABEL
-from unjam.training.road_family import NGSIM_IDM
 from unjam_paper.comparison import COMPARISON_METRICS, comparison_rows, estimate_metrics, training_curves
 from unjam_paper.results_file import StudyPart, read_part, write_part
 from unjam_paper.study import (

@@ -19,9 +19,9 @@ from unjam.drivers.registry import driver_from_name
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
 from unjam.measures.statistics import metric_estimate, paired_difference
 from unjam.reports.figures import LINE_COLORS, new_figure
+from unjam.road_family import ACTUATOR_LATENCY
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
-from unjam.training.road_family import ACTUATOR_LATENCY
 from unjam.training.search_space import SearchSpace, default_search_space
 from unjam.training.string_limit import find_operating_points
 from unjam.training.tune import tune

@@ -1,6 +1,6 @@
 """All studies by name, and the names of the paper's tables and figures."""
 
-from unjam.training.road_family import ALL_ROADS_GROUP, SHARED_RINGS_GROUP
+from unjam.road_family import ALL_ROADS_GROUP, SHARED_RINGS_GROUP
 from unjam_paper.adaptation import ADAPTATION
 from unjam_paper.all_roads import (
     ALL_ROADS_BASELINES,

@@ -22,10 +22,10 @@ from unjam.measures.metric_table import estimate_cell, with_no_break_spaces
 from unjam.measures.statistics import Estimate, estimate, estimate_on_shared_seeds, estimate_over_trainings, format_ci
 from unjam.reports.results import EVALUATION_FILE, read_progress, read_rows
 from unjam.scenarios.scenario import Scenario
+from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import TRAINED_LABEL, evaluate, raise_failures
 from unjam.training.run_folder import read_config
-from unjam.training.seeds import make_test_seeds
 from unjam.worlds.record import Floats
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import CONTROLLERS, StudyPart, measure_parts, write_figure, write_part
@@ -212,7 +212,7 @@ def evaluate_drivers(
         for label, source in drivers.items()
     }
     with WorkerPool(workers) as pool:
-        evaluation = evaluate(scenario, made, make_test_seeds(seeds), pool)
+        evaluation = evaluate(scenario, made, held_out_seeds(seeds), pool)
     raise_failures(evaluation)
     return evaluation.rows
 

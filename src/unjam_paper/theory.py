@@ -24,9 +24,9 @@ from unjam.drivers.residual import ResidualDriver
 from unjam.measures.statistics import estimate_over_trainings, metric_estimate
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, new_figure, stacked_bars
 from unjam.reports.results import read_progress, seconds_by_part
+from unjam.seeds import held_out_seeds
 from unjam.training.evaluate import evaluate
 from unjam.training.run_folder import create_run_folder
-from unjam.training.seeds import make_test_seeds
 from unjam.training.train import Trainer
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import read_part, write_part
@@ -69,7 +69,7 @@ def untrained_rows(road: str, policies: int, workers: int) -> Table:
         network = random_network(observation_size(inputs, base), limit, number)
         drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, inputs)
     with WorkerPool(workers) as pool:
-        evaluation = evaluate(scenario, drivers, make_test_seeds(4), pool)
+        evaluation = evaluate(scenario, drivers, held_out_seeds(4), pool)
     returns = {label: metric_estimate(own, "return").mean for label, own in evaluation.rows.items()}
     rows: Table = []
     for kind in bases:

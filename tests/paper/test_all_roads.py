@@ -7,7 +7,7 @@ import pytest
 
 from unjam.measures.gain import MAX_GAIN, MIN_GAIN
 from unjam.measures.metric_table import HUMAN_LABEL
-from unjam.training.road_family import FAMILY
+from unjam.road_family import FAMILY
 from unjam_paper.all_roads import (
     FAMILY_DRIVERS,
     SINGLE_CONTROLLERS,

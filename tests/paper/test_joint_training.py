@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from unjam.drivers.wrappers import MIN_SHARED_PENETRATION_RATE
-from unjam.training.road_family import FAMILY, family_roads
+from unjam.road_family import FAMILY
+from unjam.scenarios.family import family_roads
 from unjam_paper.all_roads import (
     FAMILY_EXPERTS,
     FAMILY_TEST_SEEDS,

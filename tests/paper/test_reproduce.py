@@ -14,6 +14,7 @@ import pytest
 from unjam.controller import make_driver
 from unjam.errors import InputError
 from unjam.files import atomic_write
+from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import load_config
 from unjam.training.run_folder import read_config
@@ -80,7 +81,7 @@ def test_drivers_of_every_study_can_drive_its_roads(name: str, tmp_path: Path) -
         sources: Sequence[DriverSource]
         if function is measure_road:
             _, road, experts, drivers, _, _ = arguments
-            scenario, sources = road.make_scenario(), [*experts, *drivers.values()]
+            scenario, sources = make_scenario(road.scenario, road.options), [*experts, *drivers.values()]
         elif function is evaluate_metrics:
             scenario, sources = arguments[0], [*arguments[1].values()]
         else:

@@ -58,6 +58,7 @@ COMMANDS = [
     "drivers",
     "drive",
     "assess",
+    "benchmark",
     "calibrate",
     "train",
     "evaluate",

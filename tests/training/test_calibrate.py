@@ -14,6 +14,7 @@ from unjam.drivers import PISaturation
 from unjam.errors import InputError, LostWorkerError, UnjamError
 from unjam.measures.detectors import DETECTOR_COLUMNS, aggregate_passages, compute_agreement
 from unjam.scenarios.user_network import UserNetwork, load_user_network
+from unjam.seeds import held_out_seeds
 from unjam.sumo_files import read_sumo_files
 from unjam.training.calibrate import (
     CALIBRATED_NETWORK_FILE,
@@ -26,7 +27,6 @@ from unjam.training.calibrate import (
     parse_factor_space,
     scale_vehicle_types,
 )
-from unjam.training.seeds import make_test_seeds
 from unjam.training.trial_log import REQUEST_FILE, TRIALS_FILE
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.detectors import DetectorPool
@@ -109,9 +109,7 @@ def test_written_network_has_the_reported_agreement(corridor: Corridor, done: tu
     assert float(files.types["person"]["speedFactor"]) == pytest.approx(found.factors["speedFactor"])
     assert {**files.types["person"], "speedFactor": own["speedFactor"]} == own
     with DetectorPool(1) as counting:
-        (passed,) = counting.run(
-            corridor.scenario(folder / CALIBRATED_NETWORK_FILE), make_test_seeds(1), corridor.loops
-        )
+        (passed,) = counting.run(corridor.scenario(folder / CALIBRATED_NETWORK_FILE), held_out_seeds(1), corridor.loops)
     flows, speeds = aggregate_passages(corridor.measurements, corridor.loop_numbers, passed)
     assert compute_agreement(corridor.measurements, flows, speeds) == found.calibrated[0]
     road = load_user_network(str(folder / CALIBRATED_NETWORK_FILE), {"penetration_rate": 0.2})

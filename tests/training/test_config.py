@@ -13,9 +13,9 @@ from unjam.drivers.car_following import Constant
 from unjam.errors import InputError
 from unjam.learners.settings import AGENT_NAMES, PolicySettings, TRPOSettings
 from unjam.parameters import merge_changes, nest_keys, read_toml
+from unjam.seeds import TEST_SEED, VALIDATION_SEED
 from unjam.training.config import EvaluationSettings, RunConfig, load_config, to_toml
 from unjam.training.presets import preset_values
-from unjam.training.seeds import TEST_SEED, VALIDATION_SEED
 
 
 def written(folder: Path, text: str) -> Path:

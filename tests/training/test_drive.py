@@ -15,8 +15,8 @@ from unjam.files import to_json
 from unjam.measures.metrics import METRICS, measure
 from unjam.reports.results import read_results
 from unjam.scenarios import Ring
+from unjam.seeds import held_out_seeds
 from unjam.training.evaluate import DriveResult, drive, raise_failures
-from unjam.training.seeds import make_test_seeds
 from unjam.worlds.episode import run_episode
 
 ROAD: dict[str, Any] = {"length": (120, 130), "vehicles": 8, "horizon": 60}
@@ -45,7 +45,7 @@ def test_row_measures_the_episode_of_its_seed(drive_result: DriveResult) -> None
 
 def test_test_seeds_are_those_of_training_evaluations() -> None:
     judged = drive("ring", "pi", episodes=2, scenario_options=ROAD, workers=1, test_seeds=True).rows["pi"]
-    again = [run_episode(Ring(**ROAD), PISaturation(), seed).trajectories[0] for seed in make_test_seeds(2)]
+    again = [run_episode(Ring(**ROAD), PISaturation(), seed).trajectories[0] for seed in held_out_seeds(2)]
     assert [row["return"] for row in judged] == [trajectory.reward.sum() for trajectory in again]
 
 

@@ -14,8 +14,8 @@ from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, 
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import read_results
 from unjam.scenarios import Ring
+from unjam.seeds import TUNING_SEED, VALIDATION_SEED, held_out_seeds, tuning_seeds
 from unjam.training.evaluate import Evaluation, evaluate, raise_failure, save_evaluation
-from unjam.training.seeds import TUNING_SEED, VALIDATION_SEED, make_test_seeds, tuning_seeds
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import WorkerPool
 
@@ -127,7 +127,7 @@ def numbers_of(seed: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def test_seed_families_are_disjoint() -> None:
-    judging = {numbers_of(seed) for seed in make_test_seeds(500)}
+    judging = {numbers_of(seed) for seed in held_out_seeds(500)}
     choosing = {numbers_of((VALIDATION_SEED, index)) for index in range(500)}
     tuning = {numbers_of(seed) for seed in tuning_seeds(500)}
     training = {
@@ -143,7 +143,7 @@ def test_seed_families_are_disjoint() -> None:
 
 
 def test_more_test_seeds_contain_fewer() -> None:
-    assert make_test_seeds(20)[:5] == make_test_seeds(5)
+    assert held_out_seeds(20)[:5] == held_out_seeds(5)
 
 
 def strict(text: str) -> Any:

@@ -14,9 +14,9 @@ from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
 from unjam.reports.html import render_report
 from unjam.reports.results import read_results
+from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig
 from unjam.training.evaluate import TRAINED_LABEL, drivers_to_compare, evaluate_run
-from unjam.training.seeds import make_test_seeds
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import WorkerPool
 
@@ -97,13 +97,13 @@ def test_evaluation_uses_test_seeds_and_is_saved(run: tuple[Path, RunConfig], po
     found = evaluate_run(folder, config, pool)
     assert list(found.rows) == ["human", "pi", TRAINED_LABEL]
     for rows in found.rows.values():
-        assert [tuple(row["seed"]) for row in rows] == make_test_seeds(2)
+        assert [tuple(row["seed"]) for row in rows] == held_out_seeds(2)
     saved = read_results(folder)
     assert list(saved.rows) == list(found.rows)
     assert saved.metadata["expert"] == "pi"
     assert saved.metadata["manifest"]["unjam"]
     scenario = config.make_scenario()
-    (trajectory,) = run_episode(scenario, load_controller(folder), make_test_seeds(1)[0]).trajectories
+    (trajectory,) = run_episode(scenario, load_controller(folder), held_out_seeds(1)[0]).trajectories
     assert found.rows[TRAINED_LABEL][0]["return"] == trajectory.reward.sum()
 
 
@@ -132,7 +132,7 @@ def test_trained_controller_can_be_the_next_expert(
     trained, expert = load_controller(folder), load_controller(first)
     assert isinstance(trained, ResidualDriver)
     assert controller_bytes(trained.expert, {}) == controller_bytes(expert, {})
-    (trajectory,) = run_episode(config.make_scenario(), expert, make_test_seeds(1)[0]).trajectories
+    (trajectory,) = run_episode(config.make_scenario(), expert, held_out_seeds(1)[0]).trajectories
     assert found.rows["pi + residual"][0]["return"] == trajectory.reward.sum()
 
 
@@ -152,7 +152,7 @@ def test_user_expert_and_reward_are_used(pool: WorkerPool, tmp_path: Path, my_dr
     assert list(found.rows) == ["human", "mine.py:gentle", TRAINED_LABEL]
     about = json.loads((folder / "evaluation.json").read_text())
     assert about["reward"] == f"{my_drivers}:calm"
-    driver, seed = load_controller(folder), make_test_seeds(1)[0]
+    driver, seed = load_controller(folder), held_out_seeds(1)[0]
     (trajectory,) = run_episode(config.make_scenario(), driver, seed, config.reward).trajectories
     assert set(trajectory.reward_terms) == {"speed", "push"}
     assert found.rows[TRAINED_LABEL][0]["return"] == trajectory.reward.sum()
@@ -167,7 +167,7 @@ def test_an_onnx_expert_is_trained_with_and_stored_as_data(pool: WorkerPool, tmp
     graph.unlink()
     driver = load_controller(folder)
     assert driver.describe() == "policy.onnx + residual"
-    seed = make_test_seeds(1)[0]
+    seed = held_out_seeds(1)[0]
     episode = run_episode(config.make_scenario(), driver, seed, config.reward)
     assert found.rows[TRAINED_LABEL][0]["return"] == episode.trajectories[0].reward.sum()
 

@@ -2,8 +2,9 @@
 
 import pytest
 
+from unjam.road_family import FAMILY, ROAD_GROUPS
+from unjam.scenarios.family import family_scenarios
 from unjam.scenarios.ring import Ring
-from unjam.training.road_family import FAMILY, ROAD_GROUPS, family_scenarios
 
 TRAINING, UNSEEN = family_scenarios("all-roads", "training"), family_scenarios("all-roads", "combination", "axis")
 

@@ -18,9 +18,9 @@ from unjam.errors import InputError
 from unjam.learners.algorithm import TaskEpisodes
 from unjam.learners.settings import unused_tables
 from unjam.reports.results import read_progress
+from unjam.seeds import TEST_SEED, VALIDATION_SEED
 from unjam.training.config import RunConfig, load_config
 from unjam.training.run_folder import create_run_folder, load_checkpoint, resume_run_folder, save_checkpoint
-from unjam.training.seeds import TEST_SEED, VALIDATION_SEED
 from unjam.training.train import IterationCallback, Trainer
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import WorkerPool

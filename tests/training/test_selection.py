@@ -9,7 +9,7 @@ import pytest
 from tests.measures.test_effect import USUAL
 from unjam.errors import InputError
 from unjam.measures.recommendation import MIN_VERDICT_SEEDS
-from unjam.training.seeds import SELECTION_SEED, TEST_SEED
+from unjam.seeds import SELECTION_SEED, TEST_SEED
 from unjam.training.selection import (
     ACC_DRIVER,
     HUMAN_BASELINE,

@@ -18,10 +18,10 @@ from unjam.drivers.car_following import Constant
 from unjam.errors import InputError, UnjamError
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import read_progress, read_results
+from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig
 from unjam.training.evaluate import gain_over_expert
 from unjam.training.run_folder import read_config
-from unjam.training.seeds import make_test_seeds
 from unjam.training.train import TrainResult, exclusive_random_state, train
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import WorkerPool
@@ -85,7 +85,7 @@ def test_every_driver_is_evaluated_on_test_seeds(finished_training: Trained) -> 
     rows = finished_training.result.rows
     assert list(rows) == ["human", "pi", "trained"]
     for found in rows.values():
-        assert [tuple(row["seed"]) for row in found] == make_test_seeds(2)
+        assert [tuple(row["seed"]) for row in found] == held_out_seeds(2)
         assert {row["status"] for row in found} == {"completed"}
         assert {row["steps"] for row in found} == {100}
 
@@ -97,7 +97,7 @@ def test_evaluation_reports_progress(finished_training: Trained) -> None:
 
 def test_controller_has_the_reported_return(finished_training: Trained) -> None:
     scenario, driver = finished_training.config.make_scenario(), load_controller(finished_training.result.controller)
-    for seed, row in zip(make_test_seeds(2), finished_training.result.rows["trained"], strict=True):
+    for seed, row in zip(held_out_seeds(2), finished_training.result.rows["trained"], strict=True):
         (trajectory,) = run_episode(scenario, driver, seed).trajectories
         assert trajectory.reward.sum() == row["return"]
 
@@ -136,7 +136,7 @@ def test_plot_episode_is_the_first_of_each_driver(finished_training: Trained) ->
     expected = run_episode(
         finished_training.config.make_scenario(),
         load_controller(finished_training.result.controller),
-        make_test_seeds(1)[0],
+        held_out_seeds(1)[0],
     )
     np.testing.assert_array_equal(shown["trained"].speeds, expected.speeds.astype(np.float32))
     assert shown["trained"].speeds.shape == (101, 8)

@@ -18,9 +18,9 @@ from unjam.measures.gain import MAX_GAIN, MEAN_GAIN, MIN_GAIN
 from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Merge, Ring
 from unjam.scenarios.motorway import ON_RAMP
+from unjam.seeds import TUNING_SEED, tuning_seeds
 from unjam.training import tune as tuning
 from unjam.training.search_space import SearchSpace, default_search_space, expert_search_space
-from unjam.training.seeds import TUNING_SEED, tuning_seeds
 from unjam.training.trial_log import TRIALS_FILE
 from unjam.training.tune import TUNING_EPISODES, TUNING_EPISODES_PER_ROAD, TUNING_FILE, TUNING_FINALISTS, tune
 from unjam.worlds.batch.run import run_batches

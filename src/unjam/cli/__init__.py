@@ -35,6 +35,7 @@ COMMANDS = {
     "drivers": "unjam.cli.catalog",
     "drive": "unjam.cli.drive",
     "assess": "unjam.cli.drive",
+    "benchmark": "unjam.cli.benchmark",
     "calibrate": "unjam.cli.calibration",
     "train": "unjam.cli.train",
     "evaluate": "unjam.cli.runs",
@@ -55,7 +56,7 @@ COMMANDS = {
 }
 """module of each command, which defines NAME_command"""
 CODE_RUNNING_COMMANDS = {
-    *("drive", "assess", "train", "evaluate", "model", "search", "export", "certify", "verify", "watch")
+    *("drive", "assess", "benchmark", "train", "evaluate", "model", "search", "export", "certify", "verify", "watch")
 }
 """commands with the option --trust-code: they read folders, which can name Python code"""
 

@@ -10,9 +10,10 @@ from unjam.cli import options as opt
 from unjam.cli import output
 from unjam.cli.output import console, err_console, print_json
 from unjam.errors import InputError
+from unjam.road_family import FAMILY, ROAD_GROUPS
 from unjam.scenarios import make_scenario
+from unjam.scenarios.family import family_scenarios
 from unjam.scenarios.population import write_population
-from unjam.training.road_family import FAMILY, ROAD_GROUPS, family_scenarios
 from unjam.training.run_folder import lock_new_folder
 from unjam.training.trial_log import REQUEST_FILE
 from unjam.worlds.reward import make_reward

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from unjam.cli.options import JsonOption
-from unjam.cli.output import console, new_table, print_json
+from unjam.cli.output import console, err_console, new_table, print_json
 from unjam.controller import PACKAGED_PREFIX, packaged_file, packaged_names
 from unjam.controller.file import read_controller
 from unjam.drivers.observation import FEATURES
@@ -20,17 +20,20 @@ from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError
 from unjam.files import atomic_write, check_parent_folder
 from unjam.measures.gain import MEAN_GAIN
-from unjam.scenarios import SCENARIOS, example_scenario, scenario_recipe
+from unjam.road_family import FAMILY_PREFIX, FAMILY_SCENARIOS
+from unjam.scenarios import SCENARIOS, example_scenario, make_scenario, scenario_recipe
 from unjam.scenarios.road import format_drawn_values
 from unjam.worlds.backend import WorldOptions
 from unjam.worlds.sumo.backend import SumoBackend
 
+FAMILY_GROUP = FAMILY_PREFIX.rstrip("/")
+"""argument that lists the roads of the family"""
 PICTURE_SECONDS = 60.0
 """simulated time after which an open road is drawn [s]; at the start it is almost empty"""
 
 
 def scenarios_command(
-    name: Annotated[str | None, Argument(help="Scenario to describe in detail.")] = None,
+    name: Annotated[str | None, Argument(help="Scenario to describe; family: list benchmark roads.")] = None,
     picture: Annotated[Path | None, Option(help="Draw the road with its first vehicles into this .png file.")] = None,
     json: JsonOption = False,
 ) -> None:
@@ -40,21 +43,25 @@ def scenarios_command(
 
     - unjam scenarios
     - unjam scenarios ring
+    - unjam scenarios family
     - unjam scenarios figure-eight --picture eight.png
     """
     if picture is not None and (name is None or picture.suffix.lower() != ".png"):
         raise InputError("picture: it needs the name of a scenario, and a file that ends in .png")
-    if name is None:
+    if name is None or name == FAMILY_GROUP:
+        scenarios = SCENARIOS if name is None else {key: make_scenario(key) for key in FAMILY_SCENARIOS}
         if json:
-            print_json({key: scenario_recipe(scenario) for key, scenario in SCENARIOS.items()})
+            print_json({key: scenario_recipe(scenario) for key, scenario in scenarios.items()})
             return
         columns = ("road", "vehicles", "limit")
         table = new_table(("scenario", *columns, "control steps", "warm-up"))
-        for key, scenario in SCENARIOS.items():
+        for key, scenario in scenarios.items():
             facts = dict(scenario.facts())
             warmup = f"{scenario.warmup * scenario.simulation_step:g} s"
             table.add_row(key, *(facts[column] for column in columns), f"{scenario.horizon:,}", warmup)
         console.print(table)
+        if name is None:
+            err_console.print(f"{len(FAMILY_SCENARIOS)} roads of `unjam benchmark`: unjam scenarios {FAMILY_GROUP}")
         return
     scenario = example_scenario(name)
     if picture is not None:

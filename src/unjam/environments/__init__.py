@@ -2,6 +2,8 @@
 
 from gymnasium.envs.registration import register, registry
 
+from unjam.road_family import FAMILY, FAMILY_PREFIX
+
 ENVIRONMENT_ARGUMENTS = {
     "unjam/Ring-v0": {"scenario": "ring"},
     "unjam/FigureEight-v0": {"scenario": "figure-eight"},
@@ -9,8 +11,9 @@ ENVIRONMENT_ARGUMENTS = {
     "unjam/OnRamp-v0": {"scenario": "on-ramp", "cavs": 1},
     "unjam/Recorded-v0": {"scenario": "recorded"},
     "unjam/UserNetwork-v0": {"scenario": "my.sumocfg", "cavs": 1},
+    **{f"unjam/{name}-v1": {"scenario": f"{FAMILY_PREFIX}{name}", "cavs": 1} for name in FAMILY},
 }
-"""arguments of `RoadEnv`, by the Gymnasium id of the environment"""
+"""arguments of `RoadEnv`, by the Gymnasium id of the environment; roads of benchmarks have one CAV there"""
 
 
 def register_environments() -> None:

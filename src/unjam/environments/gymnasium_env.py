@@ -37,6 +37,7 @@ from unjam.physics.arrays import clip, replace_entries
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
+from unjam.seeds import warn_of_reserved_seed
 from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend, open_world
 from unjam.worlds.drive import DriveLoop
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
@@ -190,6 +191,7 @@ class RoadStepper:
         `options` are changes to the parameters of the scenario, in addition to those of the constructor, for this
         episode alone.
         """
+        warn_of_reserved_seed(seed)
         if self._opened is None:
             self._opened = self._backend_context.enter_context(open_backend(self._backend))
         scenario = self._with_options(options, self._opened) if options else self.scenario

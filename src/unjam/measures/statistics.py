@@ -258,20 +258,20 @@ def is_bimodal(values: Sequence[float]) -> bool:
     return len(gaps) > 0 and gaps.max() > (1 / 3 + 2 / len(ordered)) * (ordered[-1] - ordered[0])
 
 
-def estimate_crossed(values: Any) -> Estimate:
-    """Return the mean over trainings that were evaluated on shared seeds, with its 95 % CI.
+def estimate_crossed(values: Any, allows_bimodal: bool = False) -> Estimate:
+    """Return the mean over trainings, or roads, that were evaluated on shared seeds, with its 95 % CI.
 
     Values have the shape (trainings, seeds): two-way random effects without repetition. The CI is Student's t
     with Satterthwaite's degrees of freedom. Fewer than `MIN_INTERVAL_VALUES` trainings or seeds, and bimodal
-    trainings, have only the range of their means. Sources: Satterthwaite 1946, Biometrics Bulletin 2; Searle,
-    Casella, McCulloch 1992, Variance Components.
+    trainings unless `allows_bimodal`, have only the range of their means. Sources: Satterthwaite 1946, Biometrics
+    Bulletin 2; Searle, Casella, McCulloch 1992, Variance Components.
     """
     table = np.asarray(values, np.float64)
     if not table.size:
         return Estimate(nan, nan, nan, 0)
     mean, means = float(table.mean()), table.mean(1)
     point = Estimate(mean, nan, nan, len(table), float(means.min()), float(means.max()))
-    if min(table.shape) < MIN_INTERVAL_VALUES or is_bimodal(means):
+    if min(table.shape) < MIN_INTERVAL_VALUES or (is_bimodal(means) and not allows_bimodal):
         return point
     variance, degrees = _crossed_variance(table)
     half = _student_t(degrees) * sqrt(variance)

@@ -63,15 +63,19 @@ def new_figure(height: float, width: float = FIGURE_WIDTH) -> Figure:
 
 def data_uri(figure: Figure) -> str:
     """Return a figure as the `data:` address of an SVG, for a page that works offline."""
+    return f"data:image/svg+xml;base64,{base64.b64encode(svg_bytes(figure)).decode()}"
+
+
+def svg_bytes(figure: Figure) -> bytes:
+    """Return a figure as an SVG."""
     content = io.BytesIO()
     with rc_context({"svg.hashsalt": "unjam"}):  # the same figure has the same bytes
         figure.savefig(content, format="svg", dpi=DPI, metadata={"Date": None})
-    drawing = re.sub(
+    return re.sub(
         rb'(?<=data:image/png;base64,)[^"]+',
         lambda match: base64.b64encode(_reduce_colors(base64.b64decode(match[0]))),
         content.getvalue(),
     )
-    return f"data:image/svg+xml;base64,{base64.b64encode(drawing).decode()}"
 
 
 def png_bytes(figure: Figure) -> bytes:

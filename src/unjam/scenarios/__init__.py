@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from unjam.drivers.user_driver import is_file_reference, object_label
-from unjam.errors import invalid_value, unknown_name
+from unjam.errors import invalid_value, spelling_hint, unknown_name
 from unjam.parameters import build_dataclass, merge_changes, nest_keys
+from unjam.road_family import FAMILY_PREFIX, FAMILY_SCENARIOS
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.merge import Merge
 from unjam.scenarios.motorway import MOTORWAY_SCENARIOS, Motorway, Ramp
@@ -51,7 +52,7 @@ SCENARIO_KINDS = {**TOML_KINDS, UserNetwork.title: UserNetwork}
 
 
 ScenarioLike = str | Scenario | type[Scenario]
-"""a scenario, its class, or its name: of a built-in one, a .sumocfg or .toml file, or `path.py:name`"""
+"""a scenario, its class, or its name: of a built-in one, `family/NAME`, a .sumocfg or .toml file, or `path.py:name`"""
 
 
 def make_scenario(scenario: ScenarioLike, changes: dict[str, Any] | None = None) -> Scenario:
@@ -85,8 +86,14 @@ def _base_scenario(scenario: ScenarioLike) -> Scenario:
         return load_toml_scenario(Path(scenario), TOML_KINDS)[0]
     if scenario == Motorway.title:  # the kind of a TOML file, without its settings
         return Motorway()
+    if road := FAMILY_SCENARIOS.get(scenario):
+        return make_scenario(road.scenario, road.options)
     if scenario not in SCENARIOS:
-        raise unknown_name("scenario", scenario, [*SCENARIOS, "a .sumocfg or .toml file", "path.py:name"])
+        if scenario.startswith(FAMILY_PREFIX):
+            hint = spelling_hint(scenario, FAMILY_SCENARIOS)
+            raise invalid_value("scenario", scenario, f"one that `unjam scenarios family` lists{hint}")
+        others = f"{FAMILY_PREFIX}NAME", "a .sumocfg or .toml file", "path.py:name"
+        raise unknown_name("scenario", scenario, [*SCENARIOS, *others])
     return SCENARIOS[scenario]
 
 
@@ -94,7 +101,8 @@ def default_scenario(name: str) -> Scenario | type[Scenario]:
     """Return the scenario or class that a configuration with this scenario starts from; the base class if unknown."""
     if name.endswith(".sumocfg"):
         return UserNetwork
-    is_known = name in (*SCENARIOS, Motorway.title) or name.endswith(".toml") or is_file_reference(name)
+    is_built_in = name in (*SCENARIOS, *FAMILY_SCENARIOS, Motorway.title)
+    is_known = is_built_in or name.endswith(".toml") or is_file_reference(name)
     return _base_scenario(name) if is_known else Scenario
 
 

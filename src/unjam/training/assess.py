@@ -30,10 +30,10 @@ from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_ass
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
+from unjam.seeds import held_out_seeds
 from unjam.training.evaluate import Evaluation, evaluate_on_roads, raise_failure, save_evaluation
 from unjam.training.executors import MessageCallback
 from unjam.training.run_folder import make_new_folder
-from unjam.training.seeds import make_test_seeds
 from unjam.training.selection import (
     ACC_DRIVER,
     HUMAN_BASELINE,
@@ -212,7 +212,7 @@ def assess(
             for option in options
         }
 
-    first = evaluate_options([HUMAN_BASELINE], make_test_seeds(1), with_plots=True)
+    first = evaluate_options([HUMAN_BASELINE], held_out_seeds(1), with_plots=True)
     raise_failure(first.rows[HUMAN_BASELINE.label])
     duration, total = format_duration(budget.elapsed_seconds), format_duration(budget.estimate_seconds(budget.episodes))
     on_message(
@@ -232,7 +232,7 @@ def assess(
     best = plotted_result(findings.controller_results)
     plotted = Option(best.penetration_rate, best.driver) if best else Option(rates[-1], ACC_DRIVER)
     plot_episodes = first.plot_episodes
-    plot_episodes |= evaluate_options([plotted], make_test_seeds(1), with_plots=True).plot_episodes
+    plot_episodes |= evaluate_options([plotted], held_out_seeds(1), with_plots=True).plot_episodes
 
     metadata = {"scenario": Path(request.file).name, "reward": request.network.reward, "manifest": manifest()}
     selection_rows = {option.label: rows for option, rows in selection.rows.items()}

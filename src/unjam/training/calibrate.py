@@ -34,11 +34,11 @@ from unjam.measures.metrics import UNBOUNDED
 from unjam.measures.statistics import Estimate, estimate
 from unjam.processes import PrivateFolder
 from unjam.scenarios.user_network import ROAD_CLASSES, UserNetwork, load_user_network, passenger_types
+from unjam.seeds import held_out_seeds, tuning_seeds
 from unjam.sumo_files import SumoFiles, read_sumo_files
 from unjam.sumo_files.variants import write_variant
 from unjam.training.assess import ZERO_PENETRATION_RATE
 from unjam.training.search_space import SearchSpace, boundary_values, float_range, parse_search_space
-from unjam.training.seeds import make_test_seeds, tuning_seeds
 from unjam.training.trial_log import TrialLog
 from unjam.worlds.sumo.detectors import DetectorPool
 from unjam.worlds.sumo.networks import network_geometry
@@ -323,7 +323,7 @@ def calibrate(
     ]
     best = min(finalists, key=_ranking_score).factors
     on_message(f"evaluating on {CALIBRATION_TEST_SEEDS} test seeds: {_factor_text(best)}")
-    before, after = (simulate(factors, make_test_seeds(CALIBRATION_TEST_SEEDS)) for factors in (original, best))
+    before, after = (simulate(factors, held_out_seeds(CALIBRATION_TEST_SEEDS)) for factors in (original, best))
     types, file = scale_vehicle_types(corridor.files, best), folder / CALIBRATED_NETWORK_FILE
     result = CalibrationResult(best, types, before, after, results, _write_network(corridor, best, file))
     document = {

@@ -37,8 +37,8 @@ from unjam.parameters import (
 )
 from unjam.scenarios import default_scenario, make_scenario, without_toml_file
 from unjam.scenarios.scenario import Scenario
+from unjam.seeds import TRAINING_SEED_LIMIT
 from unjam.training.presets import preset_values
-from unjam.training.seeds import TRAINING_SEED_LIMIT
 from unjam.training.task_sampling import TaskSampling, count_episodes, weight_shares
 from unjam.trust import check_trusted_values
 from unjam.worlds.backend import check_backend_name

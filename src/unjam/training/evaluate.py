@@ -30,9 +30,9 @@ from unjam.measures.statistics import Estimate, paired_difference, summarize
 from unjam.reports.results import EPISODE_ENTRIES, EVALUATION_FILE, pack_episode, to_plot_episode
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
+from unjam.seeds import TRAINING_SEED_LIMIT, held_out_seeds
 from unjam.training.config import RunConfig
 from unjam.training.run_folder import lock_new_folder
-from unjam.training.seeds import TRAINING_SEED_LIMIT, make_test_seeds
 from unjam.worlds.backend import BackendLike, backend_notes, check_support, open_backend
 from unjam.worlds.checked_world import backend_label
 from unjam.worlds.episode import can_drive, check_can_drive, run_episode
@@ -288,7 +288,7 @@ def evaluate_run(
     `config.evaluation` may be another than that of the run.
     """
     scenario, drivers = config.make_scenario(), drivers_to_compare(config, folder)
-    seeds = make_test_seeds(config.evaluation.episodes)
+    seeds = held_out_seeds(config.evaluation.episodes)
     evaluation = evaluate(scenario, drivers, seeds, workers, config.reward, progress, config.episode_backend)
     metadata = {
         "scenario": Path(config.scenario).name,
@@ -385,7 +385,7 @@ def drive(
     with open_backend(backend) as simulator:
         check_support(simulator, road)
     folder, report = Path(out) if out is not None else None, None
-    seeds = make_test_seeds(episodes) if test_seeds else [(seed + index,) for index in range(episodes)]
+    seeds = held_out_seeds(episodes) if test_seeds else [(seed + index,) for index in range(episodes)]
     pool = WorkerPool(min(workers or os.cpu_count() or 1, episodes * len(drivers)))
     with lock_new_folder(folder) if folder is not None else nullcontext(), pool:
         evaluation = evaluate(road, drivers, seeds, pool, reward, progress, backend)

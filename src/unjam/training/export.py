@@ -24,9 +24,9 @@ from unjam.reports.results import EVALUATION_FILE, read_evaluation
 from unjam.scenarios import example_scenario, scenario_from_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_scenario import CODE_ENTRY
+from unjam.seeds import held_out_seeds
 from unjam.training.evaluate import TRAINED_LABEL, raise_failure
 from unjam.training.run_folder import check_run_files, controller_origin, read_config
-from unjam.training.seeds import make_test_seeds
 from unjam.trust import check_trusted, expecting_code
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
@@ -240,7 +240,7 @@ def _test_metrics(folder: Path) -> dict[str, Any] | None:
 def _sample_states(scenario: Scenario, driver: Driver, backend: str) -> LocalState:
     """Return the local states of the CAV with the longest trip in a test episode, arrays of shape (T,)."""
     with WorkerPool(1) as workers:
-        (episode,) = workers.run([EpisodeTask(scenario, driver, make_test_seeds(1)[0], backend=backend)])
+        (episode,) = workers.run([EpisodeTask(scenario, driver, held_out_seeds(1)[0], backend=backend)])
     raise_failure([measure(episode)] if not episode.has_run else [])
     longest = max(episode.trajectories, key=lambda trajectory: len(trajectory.applied_acceleration))
     states = longest.states.select(slice(min(len(longest.applied_acceleration), MAX_SAMPLE_STEPS)))

@@ -9,9 +9,10 @@ from typing import Any, cast
 from unjam.errors import invalid_value, unknown_name
 from unjam.parameters import merge_changes
 from unjam.plugins import load_plugins
+from unjam.road_family import FAMILY
+from unjam.scenarios.family import family_scenarios
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.scenario import Scenario
-from unjam.training.road_family import FAMILY, family_scenarios
 
 BRAKING_COST = 0.0075
 """weight of the reward's acceleration term on loops, where the speed term is 1 at the speed limit"""

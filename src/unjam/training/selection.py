@@ -14,9 +14,9 @@ from unjam.measures.effect import Effect, describe_harm, effect_of, is_too_small
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.recommendation import MIN_VERDICT_SEEDS, AccResult, ControllerResult, required_seeds
 from unjam.measures.statistics import CONFIDENCE, Estimate, format_percent, paired_difference
+from unjam.seeds import held_out_seeds, selection_seeds
 from unjam.training.evaluate import raise_failure
 from unjam.training.executors import MessageCallback
-from unjam.training.seeds import make_test_seeds, selection_seeds
 
 MAX_SELECTION_SEEDS = 10
 """seeds of a round of successive halving, at most"""
@@ -195,7 +195,7 @@ def compare_on_test_seeds(
         count = max(min(wanted, budget.affordable_seeds(1 + len(active))), 0 if seeds else MIN_TEST_SEEDS)
         if not count:
             break
-        _extend_rows(rows, run_options([HUMAN_BASELINE, *active], make_test_seeds(count, seeds)))
+        _extend_rows(rows, run_options([HUMAN_BASELINE, *active], held_out_seeds(count, seeds)))
         results = [_controller_result(option, rows, confidence, precision) for option in finalists]
         acc_results = [_acc_result(option, rows, confidence, precision) for option in acc_options]
         max_seeds = len(rows[HUMAN_BASELINE]) + budget.affordable_seeds(1 + len(active))

@@ -12,9 +12,9 @@ from unjam.drivers.driver import Driver
 from unjam.measures.metrics import measure
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import Scenario
+from unjam.seeds import tuning_seeds
 from unjam.training.evaluate import raise_failure
 from unjam.training.export import driver_with_filter
-from unjam.training.seeds import tuning_seeds
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 MAX_STRING_GAIN = 1.0 + GAIN_TOLERANCE

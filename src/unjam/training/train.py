@@ -36,6 +36,7 @@ from unjam.measures.statistics import Estimate, format_ci
 from unjam.processes import lock_folder
 from unjam.reports.html import write_report_page
 from unjam.reports.results import read_progress
+from unjam.seeds import VALIDATION_SEED
 from unjam.training import run_folder
 from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
 from unjam.training.evaluate import (
@@ -50,7 +51,6 @@ from unjam.training.executors import IterationCallback, train_in_subprocess
 from unjam.training.export import ControllerStore
 from unjam.training.fingerprint import check_file_hashes, code_hashes, fingerprint
 from unjam.training.model_facts import no_facts_reason, write_model_facts
-from unjam.training.seeds import VALIDATION_SEED
 from unjam.training.string_limit import find_operating_points
 from unjam.training.task_sampling import TaskSampler, make_episodes, warm_up_iterations
 from unjam.trust import expecting_code

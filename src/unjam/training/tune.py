@@ -25,11 +25,11 @@ from unjam.measures.gain import MEAN_GAIN, EpisodeRows, normalized_gain, perform
 from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
+from unjam.seeds import tuning_seeds
 from unjam.training.evaluate import raise_failure
 from unjam.training.fingerprint import file_hashes
 from unjam.training.run_folder import controller_origin
 from unjam.training.search_space import SearchSpace
-from unjam.training.seeds import tuning_seeds
 from unjam.training.setting_sampler import SettingSampler, invalid_reason
 from unjam.training.string_limit import find_operating_points
 from unjam.training.trial_log import TrialLog, TrialVerdict, TuningTrial

@@ -10,16 +10,15 @@ from unjam.drivers.local_state import MAX_OBSERVED_GAP
 from unjam.drivers.registry import driver_from_name
 from unjam.measures.metrics import measure
 from unjam.scenarios import Merge, Ring, make_scenario
-from unjam.training.road_family import FAMILY
-from unjam.training.seeds import make_test_seeds
+from unjam.seeds import held_out_seeds
 from unjam.worlds.audit import OVERRIDE_TOLERANCE
 from unjam.worlds.episode import run_episode
 
 
 @pytest.mark.long
 def test_preventing_creeping_is_not_an_override() -> None:
-    road = FAMILY["ring-66-grown-4-cavs"].make_scenario().stratum(1, 10)
-    row = measure(run_episode(replace(road, horizon=620), PISaturation(), make_test_seeds(2)[1]))
+    road = make_scenario("family/ring-66-grown-4-cavs").stratum(1, 10)
+    row = measure(run_episode(replace(road, horizon=620), PISaturation(), held_out_seeds(2)[1]))
     assert 0.0 < row["shield_max_braking"] < OVERRIDE_TOLERANCE, "SUMO holds it, a micrometre from its place"
     assert (row["override_share"], row["shield_override_share"]) == (0.0, 0.0)
 

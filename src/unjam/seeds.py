@@ -4,6 +4,8 @@ A training draws its episodes from (its seed, iteration, episode), where its see
 seeds of the other families begin with their own number.
 """
 
+import warnings
+
 TRAINING_SEED_LIMIT = 1_000_000
 """seeds of trainings, and of `unjam drive --seed`, are smaller"""
 TEST_SEED = 1_000_039
@@ -14,10 +16,22 @@ TUNING_SEED = 1_000_037
 """first number of tuning seeds, for parameters of an expert or of the human drivers on a user's road"""
 SELECTION_SEED = 1_000_081
 """first number of selection seeds, which select a controller for a user's road"""
+RESERVED_SEEDS = range(TRAINING_SEED_LIMIT, TRAINING_SEED_LIMIT + 1000)
+"""first numbers of seeds that are reserved for such purposes"""
 
 
-def make_test_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
-    """Return test seeds, from number `first` on."""
+def warn_of_reserved_seed(seed: int | None) -> None:
+    """Warn if the seed of an environment is reserved: test seeds begin with it."""
+    if seed in RESERVED_SEEDS:
+        text = f"reset: seed={seed} is reserved for tests; allowed in trainings: other seeds"
+        warnings.warn(f"{text}, such as those below {TRAINING_SEED_LIMIT:,}", stacklevel=3)
+
+
+def held_out_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
+    """Return test seeds, from number `first` on, for `run_episode`; nothing may be trained, selected or tuned on them.
+
+    The roads of `unjam benchmark` have the first ten.
+    """
     return [(TEST_SEED, index) for index in range(first, first + count)]
 
 

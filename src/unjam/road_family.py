@@ -3,17 +3,16 @@
 Each road draws its size, its human drivers and their noise from the seed. Unseen are whole axes (a density, a
 number of vehicles, human drivers, a demand, a radius) and new combinations of training values; the division was
 fixed before anything was trained or tuned on these roads. Noisy sensors, long actuator delays and calibrated
-populations were added last, as unseen roads.
+populations were added last, as unseen roads. Each road is the scenario `family/NAME`; this module imports nothing of
+unjam, because `import unjam` registers the roads as environments.
 """
 
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from unjam.drivers.wrappers import MIN_SHARED_PENETRATION_RATE
-from unjam.scenarios import make_scenario
-from unjam.scenarios.scenario import Scenario
-
 FamilyPart = Literal["training", "combination", "axis"]
+FAMILY_PREFIX = "family/"
+"""beginning of the names of the family's roads as scenarios"""
 
 SHORT_WARM_UP, LONG_WARM_UP = 750, 6000
 """human-only simulation steps before the CAVs are switched on: a wave begins, or is fully developed"""
@@ -42,10 +41,6 @@ class FamilyRoad:
     options: dict[str, Any] = field(default_factory=dict)
     part: FamilyPart = "training"
     """`training` also covers tuning; unseen: a new `combination` of training values, or a whole `axis`"""
-
-    def make_scenario(self) -> Scenario:
-        """Return the scenario of the road."""
-        return make_scenario(self.scenario, self.options)
 
 
 def ring_options(
@@ -101,23 +96,11 @@ FAMILY: dict[str, FamilyRoad] = {
     ),
 }
 """all roads by name"""
+FAMILY_SCENARIOS = {f"{FAMILY_PREFIX}{name}": road for name, road in FAMILY.items()}
+"""all roads by their names as scenarios"""
 GROUP_BY_SCENARIO = {"ring": "rings", "figure-eight": "figure-eights", "on-ramp": "motorways", "on-ramp-1": "motorways"}
 """group of roads of each scenario, for which one expert exists"""
 SHARED_RINGS_GROUP, ALL_ROADS_GROUP = "shared-rings", "all-roads"
 """names of the rings with several CAVs, and of the whole family"""
 ROAD_GROUPS = (*dict.fromkeys(GROUP_BY_SCENARIO.values()), SHARED_RINGS_GROUP, ALL_ROADS_GROUP)
 """names of all groups"""
-
-
-def family_roads(group: str) -> dict[str, FamilyRoad]:
-    """Return all roads of a group, one of `ROAD_GROUPS`, by name."""
-    if group == SHARED_RINGS_GROUP:
-        rings, limit = family_roads(GROUP_BY_SCENARIO["ring"]), MIN_SHARED_PENETRATION_RATE
-        return {name: ring for name, ring in rings.items() if ring.options["cavs"] >= limit * ring.options["vehicles"]}
-    groups = {name: (GROUP_BY_SCENARIO[road.scenario], ALL_ROADS_GROUP) for name, road in FAMILY.items()}
-    return {name: road for name, road in FAMILY.items() if group in groups[name]}
-
-
-def family_scenarios(group: str, *parts: FamilyPart) -> dict[str, Scenario]:
-    """Return the scenarios of some parts of a group, one of `ROAD_GROUPS`, by name."""
-    return {name: road.make_scenario() for name, road in family_roads(group).items() if road.part in parts}

@@ -1,0 +1,219 @@
+"""The result of a benchmark and its file: metrics of each road and seed, from which everything else is computed."""
+
+from dataclasses import asdict, field
+from functools import cached_property
+from math import isclose, nan
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr
+
+from unjam.benchmarks.episodes import FAMILY_METRICS, FAMILY_TEST_SEEDS
+from unjam.benchmarks.suites import Suite, find_suite, references
+from unjam.controller.manifest import first_difference, short_text
+from unjam.errors import InputError, invalid_value, naming
+from unjam.files import INVALID_DATA_ERRORS, atomic_write, parse_json, to_json
+from unjam.measures import gain
+from unjam.measures.feasibility import FEASIBLE, overall_feasibility
+from unjam.measures.statistics import Estimate, estimate_crossed
+from unjam.parameters import STRICT, build_dataclass, parameter_dataclass
+from unjam.physics.arrays import Floats
+from unjam.road_family import FAMILY
+
+if TYPE_CHECKING:  # imported late, so that commands start quickly
+    import pandas as pd
+
+FILE_FORMAT = 1
+MAX_FILE_BYTES = 4 * 2**20
+"""maximum size of a file; one with all roads has 200 kB"""
+MAX_LABEL_CHARACTERS = 500
+"""of the name of a driver"""
+DIGITS = 7
+"""significant digits of stored metrics"""
+MAX_RELATIVE_DIFFERENCE = 1e-4
+"""allowed relative difference to reference values of the human baseline"""
+PARTS = {"all roads": ("training", "combination", "axis"), "training": ("training",), "unseen": ("combination", "axis")}
+"""parts of the family by the name of their mean"""
+COUNT, MAX_VALUE = len(FAMILY_TEST_SEEDS), 1e9
+"""number of test seeds, and the largest allowed number in a file"""
+Column = list[StrictFloat | StrictInt | StrictBool | StrictStr | None]
+Columns = dict[str, Annotated[Column, Field(min_length=COUNT, max_length=COUNT)]]
+"""metrics by name, a value for each test seed"""
+
+
+@parameter_dataclass(frozen=True, config=STRICT)
+class RoadRecord:
+    """The episodes of the human baseline and of the driver on one road."""
+
+    backend: StrictStr
+    """which simulator drove the driver's episodes"""
+    baseline: Columns
+    driver: Columns
+    """empty if it cannot drive on this road: it then counts as the human baseline"""
+    note: StrictStr = ""
+    """why it cannot drive there"""
+
+
+@parameter_dataclass(frozen=True, config=STRICT)
+class BenchmarkResult:
+    """The result of one driver in a suite: gain, feasibility and the worst road follow from the rows of its roads."""
+
+    suite: StrictStr
+    driver: Annotated[StrictStr, Field(min_length=1, max_length=MAX_LABEL_CHARACTERS)]
+    sha256: StrictStr | None
+    """hash of the driver: its controller file, or else its parameters, code and weights; None: a Python object"""
+    training_steps: StrictInt | None
+    """environment steps of its training or tuning, as its file or its author says; None: unknown"""
+    manifest: dict[str, Any] = field(repr=False)
+    """versions of unjam and SUMO, machine, command"""
+    roads: dict[str, RoadRecord] = field(default_factory=dict, repr=False)
+    """finished roads by name"""
+    format: StrictInt = FILE_FORMAT
+
+    @property
+    def missing_roads(self) -> list[str]:
+        """Roads of the suite that are not finished."""
+        return [name for name in find_suite(self.suite).roads if name not in self.roads]
+
+    @cached_property
+    def _gains(self) -> dict[str, tuple[Estimate, Floats, str]]:
+        """For each road the gain, the gain by seed, and the verdict of the feasibility check."""
+        found: dict[str, tuple[Estimate, Floats, str]] = {}
+        for name, road in self.roads.items():
+            baseline, reference = _rows(road.baseline), references()[name]["performance"]
+            rows = _rows(road.driver) if road.driver else baseline
+            verdict = overall_feasibility(rows, baseline) if road.driver else f"not driven: {road.note}"
+            arguments = rows, baseline, reference
+            found[name] = gain.normalized_gain(*arguments), gain.gain_by_seed(*arguments), verdict
+        return found
+
+    def mean_gain(self, part: str = "all roads") -> Estimate:
+        """Return the mean gain over the finished roads of one of `PARTS`, with its 95 % CI over roads and seeds.
+
+        Roads and seeds are crossed random effects (`estimate_crossed`).
+        """
+        own = [seeds for name, (_, seeds, _) in self._gains.items() if FAMILY[name].part in PARTS[part]]
+        return estimate_crossed(own, allows_bimodal=True)
+
+    @property
+    def worst_road(self) -> tuple[str, float]:
+        """The road with the smallest gain, and this gain."""
+        return min(self.gains().items(), key=lambda pair: pair[1])
+
+    @property
+    def feasible_count(self) -> int:
+        """Number of roads on which no episode violates a limit; those without CAVs violate none."""
+        return sum(verdict in ("", FEASIBLE) for *_, verdict in self._gains.values())
+
+    def gains(self) -> dict[str, float]:
+        """Return the gain by finished road."""
+        return {name: each.mean for name, (each, *_) in self._gains.items()}
+
+    def road_rows(self) -> list[dict[str, Any]]:
+        """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend; then the means."""
+        rows: list[dict[str, Any]] = [
+            {"road": name, "part": FAMILY[name].part, **_interval(each), "feasible": verdict}
+            | {"backend": self.roads[name].backend, "expert": references()[name]["expert"]}
+            for name, (each, _, verdict) in self._gains.items()
+        ]
+        empty = {"part": "", "feasible": "", "backend": "", "expert": ""}
+        return rows + [{**empty, "road": f"mean, {part}", **_interval(self.mean_gain(part))} for part in PARTS]
+
+    def table(self) -> "pd.DataFrame":
+        """Return `road_rows` as a table."""
+        import pandas as pd
+
+        return pd.DataFrame(self.road_rows()).set_index("road")
+
+    def summary(self) -> dict[str, Any]:
+        """Return what follows from the rows, as the file has it."""
+        return {"gains": self.road_rows(), "worst_road": self.worst_road, "feasible_roads": self.feasible_count}
+
+    def document(self) -> dict[str, Any]:
+        """Return the content of the file, a JSON object; with a summary if all roads are finished."""
+        content = asdict(self) | {"seeds": FAMILY_TEST_SEEDS}
+        return content if self.missing_roads else {"summary": self.summary(), **content}
+
+    def check_comparable(self) -> None:
+        """Raise `InputError` if roads are missing, or the human baseline is not that of the suite."""
+        if self.missing_roads:
+            count, first = len(self.missing_roads), self.missing_roads[0]
+            raise InputError(f"roads: {count} are missing ({first}, ...); allowed: a finished benchmark")
+        for name, road in self.roads.items():
+            found = [gain.performance(row) for row in _rows(road.baseline)]
+            for value, expected in zip(found, references()[name]["baseline"], strict=True):
+                if not isclose(value, expected, rel_tol=MAX_RELATIVE_DIFFERENCE):
+                    versions = f"unjam {self.manifest.get('unjam')!s:.20}, backend {road.backend:.40}"
+                    reason = f"performance of the human baseline ({versions})"
+                    raise invalid_value(f"{name}: {reason}", round(value, 4), f"{expected:.4f}, as in {self.suite}")
+
+
+def to_columns(rows: gain.EpisodeRows) -> dict[str, list[Any]]:
+    """Return rows of metrics as columns for the file, in seven significant digits; NaN becomes null."""
+
+    def stored(value: Any) -> Any:
+        return (float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None) if type(value) is float else value
+
+    return {name: [stored(row[name]) for row in rows] for name in FAMILY_METRICS[1:] if rows}
+
+
+def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
+    """Return the rows of stored columns."""
+    seeds, values = iter(FAMILY_TEST_SEEDS), zip(*columns.values(), strict=True)
+    rows = (dict(zip(columns, row, strict=True)) for row in values)
+    return [{"seed": next(seeds)} | {name: nan if each is None else each for name, each in row.items()} for row in rows]
+
+
+def _interval(value: Estimate) -> dict[str, float]:
+    return {"gain": value.mean, "low": value.low, "high": value.high}
+
+
+def write_result(path: Path, result: BenchmarkResult) -> None:
+    """Write a result as a file, with one line for each road."""
+    document = result.document()
+    roads = document.pop("roads")
+    lines = ",\n".join(f"{to_json(name)}: {to_json(road)}" for name, road in roads.items())
+    head = ",\n".join(f"{to_json(key)}: {to_json(value)}" for key, value in document.items())
+    atomic_write(path, f'{{{head},\n"roads": {{\n{lines}\n}}}}\n')
+
+
+def read_result(path: Path) -> BenchmarkResult:
+    """Return the result in a file, which may come from a stranger: nothing in it is executed.
+
+    Raise `InputError` if it is not a result of a suite of this version, or contradicts itself.
+    """
+    with naming(f"{path}: "):
+        try:
+            if not path.is_file() or path.stat().st_size > MAX_FILE_BYTES:
+                raise invalid_value("file", path.name, f"a file of `unjam benchmark`, at most {MAX_FILE_BYTES:,} bytes")
+            content = parse_json(path.read_bytes())
+            if not isinstance(content, dict) or content.get("format") != FILE_FORMAT:
+                raise ValueError(f"format: it is not {FILE_FORMAT}")
+            seeds, summary = content.pop("seeds", None), content.pop("summary", None)
+        except INVALID_DATA_ERRORS as error:
+            raise InputError(f"it is not a result of `unjam benchmark`: {error}") from None
+        result = build_dataclass(BenchmarkResult, content, "result")
+        _check_roads(result, find_suite(result.suite))
+        if seeds != list(map(list, FAMILY_TEST_SEEDS)):
+            raise InputError(f"seeds: they are not those of {result.suite}")
+        expected = None if result.missing_roads else parse_json(to_json(result.summary()))
+        if difference := first_difference(expected, summary, MAX_RELATIVE_DIFFERENCE):
+            name, computed, found = difference
+            allowed = f"{short_text(computed)}, which follows from the rows"
+            raise InputError(f"summary.{name}: {short_text(found)} is not allowed; allowed: {allowed}")
+        return result
+
+
+def _check_roads(result: BenchmarkResult, suite: Suite) -> None:
+    """Raise `InputError` for an unknown road, or rows without metrics or with texts in place of numbers."""
+    for name, road in result.roads.items():
+        if name not in suite.roads:
+            raise InputError(f"roads: {name[:50]!r} is not in {suite.name}")
+        for columns in (road.baseline, road.driver) if road.driver else (road.baseline,):
+            if wrong := sorted(columns.keys() ^ set(FAMILY_METRICS[1:])):
+                raise InputError(f"roads.{name}: the metric {wrong[0]:.50} is missing or unknown")
+            for key, values in columns.items():
+                is_number = [not isinstance(each, str) and abs(each or 0) <= MAX_VALUE for each in values]
+                if any(is_number) if key == "status" else not all(is_number):
+                    raise invalid_value(f"roads.{name}.{key}", values[0], "texts" if key == "status" else "numbers")

@@ -1,0 +1,186 @@
+"""Run a benchmark: the human baseline and a driver on the test seeds of each road of a suite."""
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from safetensors.numpy import save
+
+from unjam.benchmarks.episodes import FAMILY_METRICS, FAMILY_TEST_SEEDS, make_tasks
+from unjam.benchmarks.result import (
+    MAX_LABEL_CHARACTERS,
+    BenchmarkResult,
+    RoadRecord,
+    read_result,
+    to_columns,
+    write_result,
+)
+from unjam.benchmarks.suites import DEFAULT_SUITE, find_suite
+from unjam.controller import DEFAULT_DRIVER, controller_hash, controller_path, make_driver
+from unjam.controller.file import read_controller, sha256_of
+from unjam.drivers.driver import Driver
+from unjam.drivers.registry import driver_recipe, is_serializable, user_code_recipes
+from unjam.drivers.user_driver import DriverLike, as_driver
+from unjam.errors import InputError, invalid_value, one_line
+from unjam.files import make_folder, to_json
+from unjam.manifest import manifest, without_folders
+from unjam.measures.gain import EpisodeRows
+from unjam.measures.metric_table import HUMAN_LABEL
+from unjam.measures.metrics import measure
+from unjam.road_family import FAMILY_PREFIX
+from unjam.scenarios import make_scenario
+from unjam.scenarios.scenario import Scenario
+from unjam.training.evaluate import raise_failure
+from unjam.worlds.backend import check_support, open_backend
+from unjam.worlds.batch.run import run_batches
+from unjam.worlds.batch.support import unsupported_reason
+from unjam.worlds.episode import check_can_drive, run_episode
+from unjam.worlds.record import Episode
+from unjam.worlds.worker_pool import WorkerPool
+
+EXACT_BACKEND = "exact"
+"""backend of benchmarks: the batch where its episodes are those of SUMO, else SUMO"""
+
+
+def benchmark(
+    driver: str | DriverLike = DEFAULT_DRIVER,
+    suite: str = DEFAULT_SUITE,
+    out: str | Path | None = None,
+    workers: int | None = None,
+    backend: str = EXACT_BACKEND,
+    training_steps: int | None = None,
+    progress: Callable[[str], object] = lambda line: None,
+) -> BenchmarkResult:
+    """Drive the human baseline and a driver on the test seeds of each road of a suite, and return gains and rows.
+
+    Args:
+        driver: a name as in `drive`, or a Python object, which drives in this process.
+        suite: `all-roads-v1`, `closed-roads-v1` or `motorways-v1`.
+        out: file for the result, written after each road; a second call continues with the missing roads.
+        workers: processes; all cores by default. The result does not depend on it.
+        backend: `exact`: the batch on rings, for drivers without user code, and SUMO elsewhere; or the simulator of all
+            episodes: `sumo`, `batch` or `path.py:name`.
+        training_steps: environment steps that made the driver, unless its file says so.
+        progress: called with a line after each road.
+
+    Raises:
+        InputError: an argument is wrong, the driver fails or can drive on no road, or `out` has another result.
+    """
+    roads = {name: make_scenario(f"{FAMILY_PREFIX}{name}") for name in find_suite(suite).roads}
+    if workers is not None and workers < 1:
+        raise invalid_value("workers", workers, ">= 1")
+    drivers, reasons = _make_drivers(driver, roads)
+    if backend != EXACT_BACKEND:
+        with open_backend(backend) as simulator:
+            check_support(simulator, *roads.values())
+    label, first = driver if isinstance(driver, str) else "", next(iter(drivers.values()))
+    origin = manifest()
+    result = BenchmarkResult(
+        suite=suite,
+        driver=one_line(without_folders([label])[0] or first.describe(), MAX_LABEL_CHARACTERS),
+        sha256=_driver_hash(label, first),
+        training_steps=_recorded_steps(label) or training_steps,
+        manifest={**origin, "command": without_folders(origin["command"]), "backend": backend},
+    )
+    path = None if out is None else Path(out)
+    if path is not None:
+        make_folder(path.parent)
+        result = _stored_result(path, result) if os.path.lexists(path) else result
+    with WorkerPool(workers or os.cpu_count() or 1) as pool:
+        for number, name in enumerate(result.missing_roads, len(result.roads) + 1):
+            scenario = roads[name]
+            human = make_driver(HUMAN_LABEL, scenario.control_step)
+            used, rows = human_used, baseline = _drive_road(scenario, human, backend, pool)
+            if (own := drivers.get(name)) != human:
+                used, rows = _drive_road(scenario, own, backend, pool) if own else (human_used, [])
+            record = RoadRecord(used, to_columns(baseline), to_columns(rows), one_line(reasons.get(name, "")))
+            result = replace(result, roads={**result.roads, name: record})
+            if path is not None:
+                write_result(path, result)
+            row = result.road_rows()[len(result.roads) - 1]
+            progress(f"{number} of {len(roads)}: {name}: gain {row['gain']:.2f}, {row['feasible']}")
+    return result
+
+
+def _make_drivers(
+    driver: str | DriverLike, roads: dict[str, Scenario]
+) -> tuple[dict[str, Driver], dict[str, InputError]]:
+    """Return the driver of each road, and for others the reason why it cannot drive there; `InputError` without any."""
+    drivers, reasons = dict[str, Driver](), dict[str, InputError]()
+    for name, road in roads.items():
+        try:
+            step = road.control_step
+            made = make_driver(driver, step) if isinstance(driver, str) else as_driver(driver, step)
+            check_can_drive(made, road)
+            drivers[name] = made
+        except InputError as error:
+            reasons[name] = error
+    if not drivers:
+        raise next(iter(reasons.values()))
+    return drivers, reasons
+
+
+def _drive_road(scenario: Scenario, driver: Driver, backend: str, pool: WorkerPool) -> tuple[str, EpisodeRows]:
+    """Return the backend that was used, and a row of metrics for each test seed; raise the first failure."""
+    is_exact = backend == EXACT_BACKEND
+    simulator = "sumo" if is_exact else backend
+    tasks = make_tasks(scenario, driver, FAMILY_TEST_SEEDS, simulator)
+    # Code of users may compute with all rows at once, which are CAVs of different roads in a batch.
+    if is_exact and not unsupported_reason(scenario) and _is_free_of_user_code(driver):
+        return "batch", [_measure_episode(*each) for each in enumerate(run_batches(tasks))]
+    if tasks[0].is_serializable:
+        return simulator, pool.run_and_map(tasks, _measure_episode)
+    return simulator, [_measure_episode(0, run_episode(**vars(task))) for task in tasks]
+
+
+def _measure_episode(index: int, episode: Episode) -> dict[str, Any]:
+    row = measure(episode)
+    raise_failure([row])
+    return {name: row[name] for name in FAMILY_METRICS}
+
+
+def _is_free_of_user_code(driver: Driver) -> bool:
+    return is_serializable(driver) and not user_code_recipes(driver_recipe(driver)[0])
+
+
+def _driver_hash(label: str, driver: Driver) -> str | None:
+    """Return the SHA-256 of a controller's file, else of the recipe, code and weights; None for a Python object."""
+    if found := label and controller_hash(label):
+        return found
+    if not is_serializable(driver):
+        return None
+    recipe, arrays = driver_recipe(driver)
+    for part in user_code_recipes(recipe):  # the hash of the code is there, too
+        part["path"] = Path(part["path"]).name
+    return sha256_of(to_json(recipe).encode() + save(arrays))
+
+
+def _recorded_steps(label: str) -> int | None:
+    """Return the environment steps that the file of a controller records, of its training or tuning."""
+    path = controller_path(label) if label else None
+    if path is None:
+        return None
+    content = read_controller(path).manifest
+    tuning = content.get("tuning", {})
+    return content.get("environment_steps") or tuning.get("environment_steps", 0) + tuning.get("batch_steps", 0) or None
+
+
+def _stored_result(path: Path, new: BenchmarkResult) -> BenchmarkResult:
+    """Return the result in a file, to be continued; raise `InputError` unless it has the same driver and versions."""
+    stored = read_result(path)
+
+    def identity(result: BenchmarkResult) -> dict[str, Any]:
+        made = result.manifest
+        sumo = (made.get("packages") or {}).get("eclipse-sumo")
+        names = {"suite": result.suite, "driver": result.driver, "hash of the driver": result.sha256}
+        names |= {"training steps": result.training_steps, "backend": made.get("backend")}
+        return names | {"unjam": made.get("unjam"), "SUMO": sumo}
+
+    if new.sha256 is None:
+        raise invalid_value("out", str(path), "a new file: it is unknown whether a Python object has changed")
+    for (key, expected), found in zip(identity(new).items(), identity(stored).values(), strict=True):
+        if found != expected:
+            raise invalid_value(f"out: {path}: {key}", found, f"{expected!r}, to continue it, or a new file")
+    return stored

@@ -1,0 +1,122 @@
+"""Running a benchmark: seeds, backends, resumption and refusals."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import unjam
+from unjam.benchmarks.result import read_result
+from unjam.benchmarks.suites import SUITES, Suite
+from unjam.errors import InputError
+from unjam.scenarios import make_scenario
+
+ROADS = "ring-22-no-warm-up", "figure-eight-14"
+IDLE = """
+def idle(state):
+    assert len(state.speed) == 1, "rows of one road"
+    return 0.0 * state.speed
+"""
+
+
+@pytest.fixture
+def suite(monkeypatch: pytest.MonkeyPatch) -> str:
+    """A suite of two roads whose episodes have three seconds."""
+    for name, roads in (("short", ROADS), ("ring", ROADS[:1]), ("mixed", (ROADS[0], "one-lane-10"))):
+        monkeypatch.setitem(SUITES, name, Suite(name, "", roads))
+    short = lambda name: replace(make_scenario(name), horizon=30)  # noqa: E731
+    monkeypatch.setattr("unjam.benchmarks.run.make_scenario", short)
+    return "short"
+
+
+def test_rings_run_in_batches_and_figure_eights_in_sumo(suite: str, tmp_path: Path) -> None:
+    result = unjam.benchmark("unjam:ring-tuned", suite, tmp_path / "a.json", workers=1)
+    assert [road.backend for road in result.roads.values()] == ["batch", "sumo"]
+    assert result.training_steps == 1_992_000
+    assert result.sha256 is not None
+    assert list(result.table().index) == [*ROADS, "mean, all roads", "mean, training", "mean, unseen"]
+    assert read_result(tmp_path / "a.json") == result
+
+
+def test_a_second_call_drives_only_the_missing_roads(
+    suite: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, lines = tmp_path / "a.json", list[str]()
+
+    def stop(line: str) -> None:
+        lines.append(line)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        unjam.benchmark("pi", suite, file, workers=1, progress=stop)
+    assert read_result(file).missing_roads == [ROADS[1]]
+    assert "summary" not in json.loads(file.read_text())
+    first = read_result(file).roads[ROADS[0]]
+    result = unjam.benchmark("pi", suite, file, workers=1, progress=lines.append)
+    assert [line.partition(": gain")[0] for line in lines] == [f"1 of 2: {ROADS[0]}", f"2 of 2: {ROADS[1]}"]
+    assert result.roads[ROADS[0]] == first
+    assert not result.missing_roads
+    monkeypatch.setattr("unjam.benchmarks.run._drive_road", None)  # nothing is driven
+    assert unjam.benchmark("pi", suite, file) == result
+
+
+@pytest.mark.long
+def test_code_of_users_drives_one_road_at_a_time(suite: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(IDLE)
+    named = unjam.benchmark("mine.py:idle", "ring", workers=1)
+    namespace: dict[str, Any] = {}
+    exec(IDLE, namespace)
+    given = unjam.benchmark(namespace["idle"], "ring", workers=1)
+    assert [each.roads[ROADS[0]].backend for each in (named, given)] == ["sumo", "sumo"]
+    assert named.roads[ROADS[0]].driver == given.roads[ROADS[0]].driver
+    assert (named.driver, given.sha256) == ("mine.py:idle", None)
+    (tmp_path / "other").mkdir()
+    Path("other/mine.py").write_text(IDLE)
+    assert unjam.benchmark("other/mine.py:idle", "ring", workers=1).sha256 == named.sha256
+    Path("given.json").write_text("")
+    with pytest.raises(InputError, match=r"given\.json"):
+        unjam.benchmark(namespace["idle"], "ring", "given.json")
+
+
+@pytest.mark.long
+def test_a_driver_that_cannot_drive_on_a_road_counts_as_the_human_baseline_there(suite: str) -> None:
+    result = unjam.benchmark("unjam:ring-best", "mixed", workers=1)
+    ring, motorway = result.road_rows()[:2]
+    assert motorway["gain"] == motorway["low"] == motorway["high"] == 0.0
+    assert motorway["feasible"].startswith("not driven: ")
+    assert not ring["feasible"].startswith("not driven: ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"driver": "pie"}, "driver: 'pie' is not allowed.*did you mean 'pi'"),
+        ({"suite": "short-v2"}, "suite: 'short-v2' is not allowed; allowed: all-roads-v1"),
+        ({"workers": 0}, "workers: 0 is not allowed; allowed: >= 1"),
+        ({"backend": "sumi"}, "backend: 'sumi' is not allowed"),
+        ({"driver": "unjam:on-ramp-best"}, "it is not allowed on ring"),
+        ({"driver": lambda state: math.nan * state.speed}, "finite"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_one_line(suite: str, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(unjam.errors.UnjamError, match=message) as error:
+        unjam.benchmark(**{"driver": "pi", "suite": "ring", "workers": 1, **arguments})
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_of_another_driver_or_suite_is_not_overwritten(suite: str, tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    unjam.benchmark("pi", "ring", file, workers=1)
+    before = file.read_bytes()
+    for driver, name, message in (
+        ("pi", suite, "suite: 'ring'"),
+        ("idm", "ring", "driver: 'pi'"),
+        ("pi:window=10", "ring", "driver: 'pi'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            unjam.benchmark(driver, name, file, workers=1)
+    assert file.read_bytes() == before

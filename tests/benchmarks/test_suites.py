@@ -1,0 +1,91 @@
+"""Suites: fixed roads, references from the study, and the roads as scenarios and environments."""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import unjam
+from unjam.benchmarks.episodes import FAMILY_TEST_SEEDS, drive_by_label, run_in_batches
+from unjam.benchmarks.suites import SUITES, find_suite, references
+from unjam.errors import InputError
+from unjam.measures.gain import MIN_REFERENCE_GAIN, performance
+from unjam.road_family import FAMILY
+from unjam.scenarios import make_scenario
+from unjam.worlds.worker_pool import WorkerPool
+from unjam_paper.all_roads import suite_references
+
+RESULTS = Path(__file__).parents[2] / "results/all-roads.json"
+
+
+def test_references_are_the_rows_of_the_study() -> None:
+    assert references() == suite_references(RESULTS)["roads"]
+    assert set(references()) == set(FAMILY)
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_a_suite_has_training_and_unseen_roads_of_the_family(name: str) -> None:
+    parts = [FAMILY[road].part for road in find_suite(name).roads]
+    assert 0 < parts.count("training") < len(parts)
+
+
+@pytest.mark.parametrize("name", ["closed-roads-v1", "motorways-v1"])
+def test_the_best_expert_gains_on_each_road_of_the_smaller_suites(name: str) -> None:
+    for road in find_suite(name).roads:
+        best, human = (float(np.mean(references()[road][key])) for key in ("performance", "baseline"))
+        assert best - human > MIN_REFERENCE_GAIN * abs(human)
+        assert make_scenario(f"family/{road}").is_closed == (name == "closed-roads-v1")
+
+
+def test_an_unknown_suite_is_refused_with_the_names() -> None:
+    with pytest.raises(InputError, match="suite: 'all-roads' is not allowed; allowed: all-roads-v1, closed"):
+        find_suite("all-roads")
+
+
+@pytest.mark.parametrize("name", FAMILY)
+def test_each_road_is_a_scenario_and_an_environment(name: str) -> None:
+    assert gymnasium.spec(f"unjam/{name}-v1").kwargs == {"scenario": f"family/{name}", "cavs": 1}
+    road = make_scenario(f"family/{name}", {"horizon": 7})
+    assert road == make_scenario(FAMILY[name].scenario, {**FAMILY[name].options, "horizon": 7})
+
+
+def test_an_environment_of_a_road_with_several_cavs_has_one() -> None:
+    environment = gymnasium.make("unjam/ring-33-growing-3-cavs-v1", warmup=10)
+    try:
+        environment.reset(seed=3)
+        assert len(environment.get_wrapper_attr("_road").world.speeds) == 33
+        assert len(environment.get_wrapper_attr("_road").world.cav_ids) == 1
+    finally:
+        environment.close()
+
+
+def test_an_unknown_road_of_the_family_has_a_hint() -> None:
+    with pytest.raises(InputError, match=r"'family/ring-22-grwn' is not allowed.*did you mean 'family/ring-22-grown'"):
+        make_scenario("family/ring-22-grwn")
+
+
+def test_test_seeds_are_public_and_reserved() -> None:
+    assert unjam.held_out_seeds(10) == FAMILY_TEST_SEEDS
+    environment = gymnasium.make("unjam/Ring-v0", horizon=5, warmup=0)
+    with pytest.warns(UserWarning, match="seed=1000039 is reserved for tests"):
+        environment.reset(seed=unjam.held_out_seeds(1)[0][0])
+    environment.close()
+    with pytest.raises(InputError, match="seed"):
+        unjam.load_config(changes={"seed": unjam.held_out_seeds(1)[0][0]})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ring-22-no-warm-up", "figure-eight-12", "one-lane-10"])
+def test_the_references_of_a_road_can_be_measured_again(name: str) -> None:
+    reference = references()[name]
+    with WorkerPool(2) as pool:
+        drivers = {"human": "human", "best": reference["expert"]}
+        rows = drive_by_label(
+            make_scenario(f"family/{name}"), drivers, FAMILY_TEST_SEEDS, lambda tasks: run_in_batches(pool, tasks)
+        )
+    found = {label: list(map(performance, own)) for label, own in rows.items()}
+    assert found == {
+        "human": pytest.approx(reference["baseline"], rel=1e-9),
+        "best": pytest.approx(reference["performance"], rel=1e-9),
+    }
