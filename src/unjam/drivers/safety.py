@@ -281,7 +281,7 @@ def _steps_to_standstill(speed: Array, change: float) -> int:
     if type(speed) is not float:
         torch = sys.modules.get("torch")
         is_traced = torch is not None and torch.compiler.is_compiling()
-        speed = MAX_TRACED_SPEED if is_traced else float(speed.max()) if len(speed) else 0.0
+        speed = MAX_TRACED_SPEED if is_traced else speed.max().item() if len(speed) else 0.0
     return int(speed / change) + 1
 
 
@@ -293,6 +293,11 @@ class CAVActuation:
         self._limit, self._actuator, self._step = safety.limit, actuator, step
         self._has_lag = not actuator.is_instant
         self._states: dict[str, ActuatorState] = {}
+
+    def detach(self) -> None:
+        """Let no gradients of torch flow through the states so far."""
+        for name, (acceleration, pending) in self._states.items():
+            self._states[name] = ActuatorState(acceleration.detach(), tuple(each.detach() for each in pending))
 
     def apply(self, name: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
         """Return the filtered command for a desired acceleration, and the acceleration in this step [m/s2].

@@ -55,6 +55,10 @@ class BufferedWindow:
         buffer.filled_steps += 1
         return BufferedWindow(buffer, self.start + 1, self.steps), buffer.speeds[self.start]
 
+    def detach(self) -> "BufferedWindow":
+        """Return a copy without gradients."""
+        return BufferedWindow.from_speeds(self.buffer.speeds[self.start : self.start + self.steps].detach())
+
 
 @dataclass(frozen=True)
 class CircularWindow:

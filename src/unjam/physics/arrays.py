@@ -78,6 +78,11 @@ def square_root(array: Array) -> Array:
     return array.rsqrt().reciprocal()
 
 
+def as_indices(array: Array) -> Array:
+    """Return whole numbers as integers, without a gradient."""
+    return array.astype(np.int64) if isinstance(array, np.ndarray) else array.long()
+
+
 def as_column(array: Array) -> Array:
     """Return an array of shape (n,) as (n, 1); a float as a tuple of one."""
     return (array,) if type(array) is float else array[..., None]

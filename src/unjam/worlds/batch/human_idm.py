@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
+from unjam.physics.arrays import Array, as_indices, clamp_max, clamp_min, namespace
 from unjam.physics.idm import IDMArrays, IDMParameters, fast_power, idm_acceleration, stack_idm_parameters
 from unjam.physics.kinematics import next_speed, stopping_distance
 from unjam.scenarios.ring import RING_EDGES
@@ -79,7 +79,7 @@ def leaders(
     sees, seen_length = distance > 0.0, 0.0 * loop_length
     while bool(sees.any()):
         lane = xp.where(lane == RING_EDGES - 1.0, 0.0, lane + 1.0)
-        index = xp.asarray(lane, dtype=xp.int64)
+        index = as_indices(lane)
         front, leader_speed = fronts[index, columns], speeds[index, columns]
         # A vehicle with its rear bumper on a lane is on that lane, too.
         is_occupied = sees & (front < lane_length + VEHICLE_LENGTH)
