@@ -31,11 +31,13 @@ if TYPE_CHECKING:
     from unjam.drivers import Driver, LocalState, check_driver
     from unjam.environments.pettingzoo_env import parallel_env
     from unjam.measures.metrics import measure
+    from unjam.models.differentiable_rings import DifferentiableRings
     from unjam.resource_limits import verify_controller, write_report
     from unjam.scenarios import make_scenario
     from unjam.training.config import load_config
     from unjam.training.evaluate import drive
     from unjam.training.export import export_controller
+    from unjam.training.learned_model import load_world_model
     from unjam.training.runs import list_runs
     from unjam.training.train import train
     from unjam.trust import trusting_code
@@ -49,11 +51,13 @@ _LAZY_IMPORTS = {
         "unjam.drivers": "Driver LocalState check_driver",
         "unjam.environments.pettingzoo_env": "parallel_env",
         "unjam.measures.metrics": "measure",
+        "unjam.models.differentiable_rings": "DifferentiableRings",
         "unjam.resource_limits": "verify_controller write_report",
         "unjam.scenarios": "make_scenario",
         "unjam.training.config": "load_config",
         "unjam.training.evaluate": "drive",
         "unjam.training.export": "export_controller",
+        "unjam.training.learned_model": "load_world_model",
         "unjam.training.runs": "list_runs",
         "unjam.training.train": "train",
         "unjam.trust": "trusting_code",
@@ -64,9 +68,9 @@ _LAZY_IMPORTS = {
 
 register_environments()
 
-__all__ = ["Driver", "LocalState", "check_driver", "drive", "export_controller", "list_runs", "load_config"]
-__all__ += ["load_controller", "make_driver", "make_scenario", "measure", "parallel_env", "run_episode", "train"]
-__all__ += ["trusting_code", "verify_controller", "write_report"]
+__all__ = ["DifferentiableRings", "Driver", "LocalState", "check_driver", "drive", "export_controller", "list_runs"]
+__all__ += ["load_config", "load_controller", "load_world_model", "make_driver", "make_scenario", "measure"]
+__all__ += ["parallel_env", "run_episode", "train", "trusting_code", "verify_controller", "write_report"]
 
 
 def __getattr__(name: str) -> Any:

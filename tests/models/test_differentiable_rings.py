@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from unjam.drivers import PISaturation
+from unjam.drivers.driver import Memory
 from unjam.drivers.safety import Actuator, FollowingState, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.errors import InputError
@@ -42,13 +43,12 @@ def assert_gradient_is_that_of_differences(function: Callable[[Tensor], Tensor],
 
 
 def follow_with_bias(scenario: Ring, bias: Tensor, **options: Any) -> Tensor:
-    """The sum of final speeds and of rewards of rings, on which CAVs follow, and each ring has a bias in each second."""
+    """The sum of final speeds and rewards of rings; CAVs follow, with a bias for each ring and second."""
     rings, total = DifferentiableRings(scenario, range(bias.shape[1]), **options), torch.zeros((), dtype=bias.dtype)
     for step in range(10 * len(bias)):
         state = rings.local_state()
         wanted = 0.3 * (state.leader_speed - state.speed) + 0.02 * (state.leader_gap - 2.0 * state.speed)
-        terms = rings.step(wanted + bias[step // 10].repeat(scenario.cavs))
-        total = total + sum(terms.values()).sum()
+        total = total + rings.step(wanted + bias[step // 10].repeat(scenario.cavs)).sum()
     return total + rings.speeds.sum()
 
 
@@ -83,8 +83,8 @@ def test_gradients_reach_the_first_state(reward: str) -> None:
     def total(motion: Tensor) -> Tensor:
         rings = DifferentiableRings(SMALL, [0, 1], reward=reward)
         rings.set_state(*motion)
-        terms = [sum(rings.step(0.2 * (rings.local_state().leader_speed - 2.0)).values()) for _ in range(20)]
-        return torch.stack(terms).sum() + rings.speeds.sum()
+        rewards = [rings.step(0.2 * (rings.local_state().leader_speed - 2.0)) for _ in range(20)]
+        return torch.stack(rewards).sum() + rings.speeds.sum()
 
     assert_gradient_is_that_of_differences(total, motion, 1e-4)
 
@@ -149,7 +149,7 @@ def test_gradients_are_finite_at_standstill_and_in_contact(reward: str, actuator
     command = torch.ones(2, dtype=torch.float64, requires_grad=True)
     total = torch.zeros((), dtype=torch.float64)
     for step in range(30):
-        total = total + sum(rings.step(command if step < 25 else -command).values()).sum()
+        total = total + rings.step(command if step < 25 else -command).sum()
     assert bool(rings.crashed_roads.any()) != is_filtered
     gradients = torch.autograd.grad(total + rings.speeds.sum() + rings.gaps[cav].sum(), (command, speeds))
     assert all(bool(each.isfinite().all()) for each in gradients)
@@ -159,17 +159,19 @@ def test_gradients_are_finite_at_standstill_and_in_contact(reward: str, actuator
 def test_after_detach_no_gradient_flows_to_earlier_steps() -> None:
     road = replace(SMALL, actuator=LAGGING)
     rings, driver = DifferentiableRings(road, [0, 1]), PISaturation(window=1.0)
-    memory, before = rings.initial_memory(driver), torch.zeros(2, dtype=torch.float64, requires_grad=True)
-    for part in ("first", "second"):
+    memory, bias = rings.initial_memory(driver), torch.zeros(2, dtype=torch.float64, requires_grad=True)
+
+    def drive(memory: Memory) -> tuple[Tensor, Memory]:
         for _ in range(15):
             acceleration, memory = driver.act(rings.local_state(), memory)
-            terms = rings.step(acceleration + before)
-        if part == "first":
-            assert sum(terms.values()).requires_grad
-            memory, before = rings.detach(memory), torch.zeros(2, dtype=torch.float64)
-            acceleration, _ = driver.act(rings.local_state(), memory)
-            assert not acceleration.requires_grad
-    assert not any(each.requires_grad for each in (rings.speeds, rings.positions, rings.gaps, *terms.values()))
+            reward = rings.step(acceleration + bias)
+        return reward, memory
+
+    reward, memory = drive(memory)
+    assert reward.requires_grad
+    memory, bias = rings.detach(memory), torch.zeros(2, dtype=torch.float64)
+    reward, _ = drive(memory)
+    assert not any(each.requires_grad for each in (rings.speeds, rings.positions, rings.gaps, reward))
 
 
 @pytest.mark.parametrize(
@@ -182,7 +184,7 @@ def test_an_episode_is_that_of_a_batch_with_rewards(changes: dict[str, Any]) -> 
     with torch.no_grad():
         while not rings.has_ended:
             acceleration, memory = driver.act(rings.local_state(), memory)
-            rewards.append(sum(rings.step(acceleration).values()))
+            rewards.append(rings.step(acceleration))
             speeds.append(rings.speeds)
     episodes = run_batch([EpisodeTask(road, driver, seed) for seed in seeds])
     for ring, episode in enumerate(episodes):
@@ -196,7 +198,8 @@ def test_a_ring_counts_until_its_collision() -> None:
     command = torch.tensor([1.0, 0.0], dtype=torch.float64)
     while not rings.crashed_roads[0]:
         rings.step(command)
-    terms = rings.step(command)
+    rings.step(command)
+    terms = rings.reward_terms
     assert rings.crashed_roads.tolist() == [True, False]
     assert terms["speed"][0] == 0.0
     assert terms["speed"][1] > 0.0

@@ -1,8 +1,9 @@
 """Rings in torch through which gradients flow: from rewards and states back to the CAVs' accelerations."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import SupportsIndex, cast
+from types import MappingProxyType
+from typing import SupportsIndex
 
 import torch
 from torch import Tensor
@@ -32,6 +33,9 @@ class DifferentiableRings(RingBatch):
     CAVs observe: tensors of shape (CAVs * W,), with the first CAV of each ring, then the second one, and so on.
     """
 
+    reward_terms: Mapping[str, Tensor] = MappingProxyType({})
+    """terms of the rewards of the last step by name, shape (W,)"""
+
     def __init__(
         self,
         scenario: ScenarioLike,
@@ -53,7 +57,7 @@ class DifferentiableRings(RingBatch):
                 the vehicle ahead, and not also the last one on the next lane of SUMO's ring, which changes little.
 
         Raises:
-            InputError: there are no seeds, the scenario is not a ring that a batch supports, or its sensors have errors.
+            InputError: there are no seeds, the scenario is not a ring that a batch supports, or sensors have errors.
             MissingPartError: the device is not available.
         """
         check_device(device)
@@ -109,24 +113,20 @@ class DifferentiableRings(RingBatch):
         memory = memory if self._history is None else driver.recall(memory, self._history)
         return map_leaves(self._to_array, memory)
 
-    def step(self, acceleration: Tensor) -> dict[str, Tensor]:
-        """Simulate one control step, and return the terms of the reward by name, shape (W,).
+    def step(self, acceleration: Tensor) -> Tensor:
+        """Simulate one control step, and return the reward of each ring, shape (W,); `reward_terms` are its terms.
 
         `acceleration` [m/s2], shape (CAVs * W,), is limited to the scenario's limits, and then by the safety filter.
-        After a collision, `crashed_roads`, the terms of a ring are zero.
+        After a collision, `crashed_roads`, the rewards of a ring are zero.
         """
         was_running = self._is_running
         self.advance(Command(acceleration))
         state = self.exact_state()
-        accelerations, gaps, speeds = (
-            self._by_ring(each)
-            for each in (self.limits.clip(acceleration), time_gap(state.leader_gap, state.speed), state.speed)
-        )
+        by_cav = self.limits.clip(acceleration), time_gap(state.leader_gap, state.speed), state.speed
+        accelerations, gaps, speeds = (values.reshape(self._shape).T for values in by_cav)
         outcome = Outcome(self.speeds.T, accelerations, gaps, self.crashed_roads, 0.0 * was_running, speeds)
-        return {name: values * was_running for name, values in self._reward(outcome).items()}
-
-    def _by_ring(self, values: Tensor) -> Tensor:
-        return values.reshape(self._shape).T
+        self.reward_terms = {name: values * was_running for name, values in self._reward(outcome).items()}
+        return torch.stack([*self.reward_terms.values()]).sum(0)
 
     def detach(self, memory: Memory | None = None) -> Memory:
         """Let no gradients flow to earlier steps from here on; return the driver's `memory` without them, too."""
