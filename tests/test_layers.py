@@ -44,7 +44,7 @@ ALLOWED = {
 LAZY = {
     "__init__": {
         *("controller", "drivers", "environments", "errors", "kernels", "resource_limits", "measures", "scenarios"),
-        *("training", "trust", "worlds"),
+        *("models", "training", "trust", "worlds"),
     },
     "__main__": {"cli"},
     "resource_limits": {"child_processes", "controller", "errors", "trust"},

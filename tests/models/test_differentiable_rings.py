@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -192,6 +193,17 @@ def test_an_episode_is_that_of_a_batch_with_rewards(changes: dict[str, Any]) -> 
         assert np.abs(episode.speeds - torch.stack(speeds)[..., ring].numpy()).max() < 1e-9
 
 
+def test_rings_with_a_noise_generator_have_a_warm_up_too() -> None:
+    road, driver, generator = replace(SMALL, warmup=20), PISaturation(window=5.0), torch.Generator().manual_seed(0)
+    rings = DifferentiableRings(road, [0, 1], dtype=torch.float32, generator=generator)
+    memory = rings.initial_memory(driver)
+    assert not rings.speeds.requires_grad
+    assert rings.speeds.dtype == memory["total"].dtype == torch.float32
+    assert memory["count"].tolist() == [20.0, 20.0]
+    assert rings.speeds.min() > 0.0
+    assert rings.step(driver.act(rings.local_state(), memory)[0]).shape == (2,)
+
+
 def test_a_ring_counts_until_its_collision() -> None:
     road = replace(SMALL, safety=SafetyFilter(active=False), actuation="raw")
     rings = DifferentiableRings(road, [0, 1], reward="eq16")
@@ -226,3 +238,12 @@ def test_a_state_of_another_shape_is_refused() -> None:
     rings = DifferentiableRings(SMALL, [0])
     with pytest.raises(InputError, match=r"speeds: shape: \(6,\) is not allowed"):
         rings.set_state(torch.zeros(6), rings.positions)
+
+
+def test_the_example_of_the_documentation_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (Path(__file__).parents[2] / "docs/differentiable.md").read_text()
+    code = page.partition("```python\n")[2].partition("```")[0]
+    exec(compile(code, "differentiable.md", "exec"), {})
+    gradient, *others = capsys.readouterr().out.split(maxsplit=1)
+    assert float(gradient) != 0.0
+    assert others == ["torch.Size([22, 16]) False\n"]

@@ -137,3 +137,11 @@ def test_folders_without_a_model_are_refused_in_one_line(run: Path, tmp_path: Pa
     refuse(other, "checkpoint: all 2 under .* are damaged")
     shutil.rmtree(other / "checkpoint")
     refuse(other, "has no checkpoint yet")
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_the_example_of_the_documentation_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[2] / "docs/virtual.md").read_text()
+    code = page.partition("## Drive in the learned model")[2].partition("```python\n")[2].partition("```")[0]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "virtual.md", "exec"), {"__name__": "example"})

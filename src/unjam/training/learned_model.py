@@ -88,7 +88,7 @@ class LearnedModel:
 
     def set_state(self, state: ModelState) -> None:
         """Continue from a state; raise `InputError` if its parts do not fit together."""
-        rows, size = len(state.observed.speed), self._state_size
+        rows, size = len(state.observed.speed), len(self.world_model.scenario.drawn_ranges)
         for name, values, shape in (
             *((name, each, (rows,)) for name, each in state.observed._asdict().items() if each is not None),
             ("drawn_values", state.drawn_values, (rows, size)),
@@ -98,10 +98,6 @@ class LearnedModel:
                 raise invalid_value(f"state: shape of {name}", tuple(values.shape), str(shape))
         self._generator.set_state(state.generator_state)
         self._state = state
-
-    @property
-    def _state_size(self) -> int:
-        return len(self.world_model.scenario.drawn_ranges)
 
     def step(self, acceleration: Tensor) -> ModelTransition:
         """Make one control step under `acceleration` [m/s2], shape (n,), within the limits and the safety filter.
