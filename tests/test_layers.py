@@ -45,7 +45,7 @@ ALLOWED = {
 LAZY = {
     "__init__": {
         *("controller", "drivers", "environments", "errors", "kernels", "resource_limits", "measures", "scenarios"),
-        *("benchmarks", "seeds", "training", "trust", "worlds"),
+        *("benchmarks", "models", "seeds", "training", "trust", "worlds"),
     },
     "__main__": {"cli"},
     "resource_limits": {"child_processes", "controller", "errors", "trust"},

@@ -36,12 +36,14 @@ if TYPE_CHECKING:
     from unjam.drivers import Driver, LocalState, check_driver
     from unjam.environments.pettingzoo_env import parallel_env
     from unjam.measures.metrics import measure
+    from unjam.models.differentiable_rings import DifferentiableRings
     from unjam.resource_limits import verify_controller, write_report
     from unjam.scenarios import make_scenario
     from unjam.seeds import held_out_seeds
     from unjam.training.config import load_config
     from unjam.training.evaluate import drive
     from unjam.training.export import export_controller
+    from unjam.training.learned_model import load_world_model
     from unjam.training.runs import list_runs
     from unjam.training.train import train
     from unjam.trust import trusting_code
@@ -56,12 +58,14 @@ _LAZY_IMPORTS = {
         "unjam.drivers": "Driver LocalState check_driver",
         "unjam.environments.pettingzoo_env": "parallel_env",
         "unjam.measures.metrics": "measure",
+        "unjam.models.differentiable_rings": "DifferentiableRings",
         "unjam.resource_limits": "verify_controller write_report",
         "unjam.scenarios": "make_scenario",
         "unjam.seeds": "held_out_seeds",
         "unjam.training.config": "load_config",
         "unjam.training.evaluate": "drive",
         "unjam.training.export": "export_controller",
+        "unjam.training.learned_model": "load_world_model",
         "unjam.training.runs": "list_runs",
         "unjam.training.train": "train",
         "unjam.trust": "trusting_code",
@@ -72,9 +76,10 @@ _LAZY_IMPORTS = {
 
 register_environments()
 
-__all__ = ["Driver", "LocalState", "benchmark", "check_driver", "drive", "export_controller", "held_out_seeds"]
-__all__ += ["list_runs", "load_config", "load_controller", "make_driver", "make_scenario", "measure", "parallel_env"]
-__all__ += ["run_episode", "train", "trusting_code", "verify_controller", "write_report"]
+__all__ = ["DifferentiableRings", "Driver", "LocalState", "benchmark", "check_driver", "drive", "export_controller"]
+__all__ += ["held_out_seeds", "list_runs", "load_config", "load_controller", "load_world_model", "make_driver"]
+__all__ += ["make_scenario", "measure", "parallel_env", "run_episode", "train", "trusting_code", "verify_controller"]
+__all__ += ["write_report"]
 
 
 def __getattr__(name: str) -> Any:

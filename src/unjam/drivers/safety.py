@@ -281,7 +281,7 @@ def _steps_to_standstill(speed: Array, change: float) -> int:
     if type(speed) is not float:
         torch = sys.modules.get("torch")
         is_traced = torch is not None and torch.compiler.is_compiling()
-        speed = MAX_TRACED_SPEED if is_traced else float(speed.max()) if len(speed) else 0.0
+        speed = MAX_TRACED_SPEED if is_traced else speed.max().item() if len(speed) else 0.0
     return int(speed / change) + 1
 
 
@@ -299,6 +299,11 @@ class CAVActuation:
         for name, state in self._states.items():
             initial = self._actuator.initial_state(state.acceleration, self._step)
             self._states[name] = replace_columns(state, rows, initial, rows)
+
+    def detach(self) -> None:
+        """Let no gradients of torch flow through the states so far."""
+        for name, (acceleration, pending) in self._states.items():
+            self._states[name] = ActuatorState(acceleration.detach(), tuple(each.detach() for each in pending))
 
     def apply(self, name: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
         """Return the filtered command for a desired acceleration, and the acceleration in this step [m/s2].

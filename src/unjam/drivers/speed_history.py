@@ -60,6 +60,10 @@ class BufferedWindow:
         own, other = (each.buffer.speeds[each.start : each.start + each.steps] for each in (self, source))
         return BufferedWindow.from_speeds(replace_columns(own, rows, other, source_rows))
 
+    def detach(self) -> "BufferedWindow":
+        """Return a copy without gradients."""
+        return BufferedWindow.from_speeds(self.buffer.speeds[self.start : self.start + self.steps].detach())
+
 
 @dataclass(frozen=True)
 class CircularWindow:

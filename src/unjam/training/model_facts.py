@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -53,14 +53,18 @@ def update_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
 
     Raise `InputError` if the run has no model that is measured, or no checkpoint yet.
     """
-    if reason := no_facts_reason(folder, config):
-        raise InputError(f"run: {str(folder)!r} {reason}")
+    _check_has_facts(folder, config)
     facts, progress = read_model_facts(folder), read_progress(folder)
     if facts is None or not progress or facts.get("iteration") != progress[-1]["iteration"]:
         write_model_facts(folder, config)
         facts = read_model_facts(folder)
     assert facts is not None
     return facts
+
+
+def _check_has_facts(folder: Path, config: RunConfig) -> None:
+    if reason := no_facts_reason(folder, config):
+        raise InputError(f"run: {str(folder)!r} {reason}")
 
 
 def no_facts_reason(folder: Path, config: RunConfig) -> str:
@@ -81,20 +85,41 @@ def write_model_facts(folder: Path, config: RunConfig) -> None:
 
 def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
     """Return the facts about the model in a run's newest checkpoint, to four digits; else raise `InputError`."""
+    return trained_model_facts(read_trained_model(folder, config))
+
+
+class TrainedModel(NamedTuple):
+    """The model in the newest checkpoint of a run, with the newest row of the run's progress."""
+
+    rollouts: ModelRollouts
+    config: RunConfig
+    progress_row: dict[str, Any]
+
+
+def read_trained_model(folder: Path, config: RunConfig) -> TrainedModel:
+    """Return the model of a run on the CPU; raise `InputError` if it has none, or no valid checkpoint."""
+    _check_has_facts(folder, config)
     checkpoint, progress = load_checkpoint(folder / "checkpoint"), read_progress(folder)
     if checkpoint is None or not progress:
         raise InputError(f"run: {str(folder)!r} has no checkpoint yet{resume_hint(folder)}")
-    torch.set_num_threads(1)  # small networks are slower with more threads
     state, tensors = checkpoint
     settings = replace(config.model, device="cpu")
     spec = AgentSpec(config.make_tasks(), config.policy, settings, config.learner.gamma, config.seed)
     rollouts = ModelRollouts(spec)
     rollouts.restore(state["algorithm"][rollouts.name], tensors_with_prefix(f"algorithm/{rollouts.name}/", tensors))
-    facts = {"iteration": state["iteration"], "base": settings.base, "members": settings.members}
+    return TrainedModel(rollouts, config, {**progress[-1], "iteration": state["iteration"]})
+
+
+def trained_model_facts(trained: TrainedModel) -> dict[str, Any]:
+    """Return the facts about a model, to four digits."""
+    rollouts, config, progress_row = trained
+    torch.set_num_threads(1)  # small networks are slower with more threads
+    settings = rollouts.spec.model
+    facts = {"iteration": progress_row["iteration"], "base": settings.base, "members": settings.members}
     if settings.kind == "road":
         run = partial(_run_episode, config.backend)
         return _round_values(facts | cast(WholeRoadModel[Any], rollouts.world_model).waves(run))
-    return _round_values(facts | _row_facts(rollouts, config, progress[-1]))
+    return _round_values(facts | _row_facts(rollouts, config, progress_row))
 
 
 def _run_episode(backend: str, task: EpisodeTask) -> Episode:

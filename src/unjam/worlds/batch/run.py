@@ -49,14 +49,17 @@ def start_batch_drive(
     world.measured_fields = driver.requirements().measured_fields
     has_fixed_rows = world.cav_count > 0  # otherwise CAVs enter later
     if memory is None and has_fixed_rows:  # the driver of each CAV of a ring does not depend on the other rings
-        rings = len(world.roads)
-        ring_memory = driver.initial_memory(world.cav_count // rings)
-        memory = map_leaves(lambda values: np.repeat(values, rings, axis=0), ring_memory)
+        memory = initial_batch_memory(driver, len(world.roads), world.cav_count)
     loop = DriveLoop(world, driver, explore, memory)
     loop.memory = map_leaves(to_array, loop.memory)
     if has_fixed_rows and driver.action_repeat > 1 and RESIDUAL_AGE_KEY in loop.memory:
         loop.memory[RESIDUAL_AGE_KEY] = 0.0  # equal for all rows: no network is called while residuals are held
     return loop
+
+
+def initial_batch_memory(driver: Driver, roads: int, cavs: int) -> Memory:
+    """Return the initial memory of a driver of all CAVs of a batch, whose roads have equal numbers of CAVs."""
+    return map_leaves(lambda values: np.repeat(values, roads, axis=0), driver.initial_memory(cavs // roads))
 
 
 def run_batch(

@@ -1,0 +1,134 @@
+"""Rings in torch through which gradients flow: from rewards and states back to the CAVs' accelerations."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from types import MappingProxyType
+from typing import SupportsIndex
+
+import torch
+from torch import Tensor
+
+from unjam.drivers.command import Command
+from unjam.drivers.driver import Driver, Memory
+from unjam.errors import InputError, invalid_value
+from unjam.models.rollouts import check_device
+from unjam.models.settings import Device
+from unjam.physics.arrays import Array
+from unjam.physics.kinematics import gap_on_loop
+from unjam.scenarios import ScenarioLike, make_scenario
+from unjam.scenarios.ring import Ring
+from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.tree import map_leaves
+from unjam.worlds.batch.ring.world import RingBatch
+from unjam.worlds.batch.run import initial_batch_memory, warm_up_states
+from unjam.worlds.batch.support import unsupported_reason
+from unjam.worlds.episode import as_seed
+from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap
+
+
+class DifferentiableRings(RingBatch):
+    """W rings that torch steps together, and through which autograd computes gradients.
+
+    The episodes are those of `run_episode` with the same seeds, except for rounding. `local_state()` returns what the
+    CAVs observe: tensors of shape (CAVs * W,), with the first CAV of each ring, then the second one, and so on.
+    """
+
+    reward_terms: Mapping[str, Tensor] = MappingProxyType({})
+    """terms of the rewards of the last step by name, shape (W,)"""
+
+    def __init__(
+        self,
+        scenario: ScenarioLike,
+        seeds: Sequence[SupportsIndex | Sequence[int]],
+        device: Device = "cpu",
+        dtype: torch.dtype = torch.float64,
+        reward: RewardLike = "",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        """Start an episode on each ring, after its warm-up.
+
+        Args:
+            scenario: a ring, its class, or its name.
+            seeds: one for each ring, as for `run_episode`; it also draws the length.
+            device: of all tensors.
+            dtype: of all tensors; in `torch.float32` episodes differ from those of `run_episode` after some minutes.
+            reward: a name, or a function of an `Outcome` of tensors; empty: that of the scenario.
+            generator: draws the human drivers' noise, for speed, instead of the seeds. Human drivers then follow only
+                the vehicle ahead, and not also the last one on the next lane of SUMO's ring, which changes little.
+
+        Raises:
+            InputError: there are no seeds, the scenario is not a ring that a batch supports, or sensors have errors.
+            MissingPartError: the device is not available.
+        """
+        check_device(device)
+        road, numbers = make_scenario(scenario), [as_seed(seed) for seed in seeds]
+        if not numbers:
+            raise invalid_value("seeds", seeds, "one or more")
+        if not isinstance(road, Ring):
+            raise invalid_value("scenario", road.title, "a ring")
+        if reason := unsupported_reason(road):
+            raise InputError(f"scenario: {reason}")
+        if not road.sensors.is_exact:
+            raise InputError("sensors: errors have no gradient; allowed: exact sensors")
+        draw = generator and partial(_draw_normal, generator, dtype, device)
+        to_tensor = partial(torch.as_tensor, dtype=dtype, device=device)
+        super().__init__([road] * len(numbers), numbers, to_tensor, keep_record=False, draw=draw)
+        self._reward = make_reward(reward or road.reward)
+        if road.warmup and generator is None:
+            self.warm_up_states = warm_up_states([(road, seed, frozenset()) for seed in numbers], ())
+        with torch.no_grad():
+            self._history = self.start(is_controlled=True)
+
+    @property
+    def positions(self) -> Tensor:
+        """Front bumpers of all vehicles along the road [m], not wrapped, shape (vehicles, W)."""
+        return self._position
+
+    @property
+    def gaps(self) -> Tensor:
+        """Gaps of all vehicles to the vehicle ahead [m], shape (vehicles, W)."""
+        return self._gap
+
+    @property
+    def loop_lengths(self) -> Tensor:
+        """Lengths of the rings [m], shape (W,)."""
+        return self._loop_lengths
+
+    def set_state(self, speeds: Tensor, positions: Tensor) -> None:
+        """Move all vehicles [m/s, m], shapes as of `speeds` and `positions`; gradients flow back to both."""
+        for name, values in (("speeds", speeds), ("positions", positions)):
+            if values.shape != self._position.shape:
+                raise invalid_value(f"{name}: shape", tuple(values.shape), str(tuple(self._position.shape)))
+        self._speed, self._position = torch.cat([speeds, speeds[:1]]), positions
+        self._gap = gap_on_loop(positions, positions.roll(-1, 0), self._loop_lengths, VEHICLE_LENGTH)
+
+    def initial_memory(self, driver: Driver) -> Memory:
+        """Return the memory, as tensors, with which a driver begins to drive all CAVs after the warm-up."""
+        memory = initial_batch_memory(driver, len(self.roads), self.cav_count)
+        memory = memory if self._history is None else driver.recall(memory, self._history)
+        return map_leaves(self._to_array, memory)
+
+    def step(self, acceleration: Tensor) -> Tensor:
+        """Simulate one control step, and return the reward of each ring, shape (W,); `reward_terms` are its terms.
+
+        `acceleration` [m/s2], shape (CAVs * W,), is limited to the scenario's limits, and then by the safety filter.
+        After a collision, `crashed_roads`, the rewards of a ring are zero.
+        """
+        was_running = self._is_running
+        self.advance(Command(acceleration))
+        state = self.exact_state()
+        by_cav = self.limits.clip(acceleration), time_gap(state.leader_gap, state.speed), state.speed
+        accelerations, gaps, speeds = (values.reshape(self._shape).T for values in by_cav)
+        outcome = Outcome(self.speeds.T, accelerations, gaps, self.crashed_roads, 0.0 * was_running, speeds)
+        self.reward_terms = {name: values * was_running for name, values in self._reward(outcome).items()}
+        return torch.stack([*self.reward_terms.values()]).sum(0)
+
+    def detach(self, memory: Memory | None = None) -> Memory:
+        """Let no gradients flow to earlier steps from here on; return the driver's `memory` without them, too."""
+        self._speed, self._position, self._gap = (each.detach() for each in (self._speed, self._position, self._gap))
+        self._actuation.detach()
+        return map_leaves(lambda values: values.detach(), memory or {})
+
+
+def _draw_normal(generator: torch.Generator, dtype: torch.dtype, device: Device, shape: tuple[int, ...]) -> Array:
+    return torch.randn(shape, generator=generator, dtype=dtype, device=device)

@@ -1,0 +1,156 @@
+"""The learned model of a run as a world for users: n rows, each a CAV with its leader and follower, in steps."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from unjam.drivers.local_state import LocalState
+from unjam.drivers.user_driver import DriverLike, as_driver
+from unjam.errors import InputError, invalid_value
+from unjam.models.ensemble import torch_generator
+from unjam.models.environment_data import StartIndices
+from unjam.models.rollouts import ModelDynamics, ModelTransition, draw_starts, tensor_driver, tensor_memory, to_device
+from unjam.models.row_world_model import RowWorldModel
+from unjam.training.model_facts import TrainedModel, read_trained_model, trained_model_facts
+from unjam.training.run_folder import read_config
+from unjam.worlds.episode import check_can_drive
+
+DEVICE = "cpu"
+
+
+class ModelState(NamedTuple):
+    """State of n rows of a learned model, from which they continue in the same way; tensors in single precision."""
+
+    observed: LocalState
+    """what the CAVs observe, shape (n,)"""
+    drawn_values: Tensor
+    """scaled values that their episodes drew, shape (n, m)"""
+    is_running: Tensor
+    """1 before a collision, else 0, shape (n,)"""
+    generator_state: Tensor
+    """of the model's random numbers"""
+
+
+class ModelTrajectories(NamedTuple):
+    """What n rows did in H control steps of a learned model; tensors."""
+
+    states: LocalState
+    """shape (n, H + 1)"""
+    rewards: Tensor
+    """zero after a collision, shape (n, H)"""
+    crashed: Tensor
+    """whether there was a collision, shape (n,)"""
+
+
+class LearnedModel:
+    """The learned model of a run, from `unjam.load_world_model`; it starts with one row.
+
+    In each step, a random network of the ensemble corrects the base for each row, and noise as large as the model's
+    errors is added, as in training. Steps are differentiable in the accelerations and in the state.
+    """
+
+    def __init__(self, trained: TrainedModel) -> None:
+        """Take the model in a checkpoint."""
+        self._trained, model = trained, trained.rollouts.world_model
+        assert isinstance(model, RowWorldModel)
+        self.world_model = model
+        self._generator = torch_generator((0,), DEVICE)
+        reward, has_noise = model.task.reward, model.settings.add_noise
+        self._dynamics = ModelDynamics(model.ensemble, model.scenario, reward, self._generator, has_noise)
+        self.reset(1)
+
+    def reset(self, rows: int, seed: int = 0, episode_starts_only: bool = False) -> LocalState:
+        """Set `rows` random recorded states, and the random numbers by `seed`; return the states.
+
+        With `episode_starts_only`, they are first states of recorded episodes. Raise `InputError` without any rows.
+        """
+        if rows < 1:
+            raise invalid_value("rows", rows, ">= 1")
+        data = self.world_model.data
+        return self.reset_at(draw_starts(data, rows, 1, (seed, 0), episode_starts_only=episode_starts_only), seed)
+
+    def reset_at(self, start_indices: StartIndices, seed: int = 0) -> LocalState:
+        """Set the recorded states of (recording, control step), shape (n, 2), as `reset` does with random ones."""
+        data = self.world_model.data
+        drawn = np.stack([data.recordings[index].drawn_values for index in start_indices[:, 0]])
+        observed = data.states_at(start_indices).map(lambda values: to_device(values, DEVICE))
+        generator_state = torch_generator((seed,), DEVICE).get_state()
+        running = torch.ones_like(observed.speed)
+        self.set_state(ModelState(observed, to_device(drawn, DEVICE), running, generator_state))
+        return observed
+
+    def state(self) -> ModelState:
+        """Return the present state, which later steps do not change."""
+        return self._state._replace(generator_state=self._generator.get_state())
+
+    def set_state(self, state: ModelState) -> None:
+        """Continue from a state; raise `InputError` if its parts do not fit together."""
+        rows, size = len(state.observed.speed), len(self.world_model.scenario.drawn_ranges)
+        for name, values, shape in (
+            *((name, each, (rows,)) for name, each in state.observed._asdict().items() if each is not None),
+            ("drawn_values", state.drawn_values, (rows, size)),
+            ("is_running", state.is_running, (rows,)),
+        ):
+            if tuple(values.shape) != shape:
+                raise invalid_value(f"state: shape of {name}", tuple(values.shape), str(shape))
+        self._generator.set_state(state.generator_state)
+        self._state = state
+
+    def step(self, acceleration: Tensor) -> ModelTransition:
+        """Make one control step under `acceleration` [m/s2], shape (n,), within the limits and the safety filter.
+
+        After its collision a row still moves, with the reward zero; `crashed` says whether it had one so far.
+        """
+        observed, drawn, is_running, _ = self._state
+        if tuple(acceleration.shape) != tuple(observed.speed.shape):
+            raise invalid_value("acceleration: shape", tuple(acceleration.shape), str(tuple(observed.speed.shape)))
+        limits = self.world_model.scenario.acceleration_limits
+        transition = self._dynamics.step(observed, limits.clip(acceleration.to(observed.speed)), drawn)
+        still_running = is_running * ~transition.crashed
+        self._state = self._state._replace(observed=transition.state, is_running=still_running)
+        return transition._replace(reward=transition.reward * is_running, crashed=still_running == 0.0)
+
+    @torch.no_grad()
+    def roll_out(self, driver: DriverLike, control_steps: int) -> ModelTrajectories:
+        """Let a driver drive all rows from the present state on; it remembers nothing of the time before.
+
+        Raise `InputError` if it needs what rows do not have, or returns a value that is not finite.
+        """
+        scenario, rows = self.world_model.scenario, len(self._state.observed.speed)
+        made = as_driver(driver, scenario.control_step)
+        check_can_drive(made, scenario)
+        made = tensor_driver(made, DEVICE)
+        memory = tensor_memory(made, made.initial_memory(rows), DEVICE)
+        states, rewards = [self._state.observed], []
+        for _ in range(control_steps):
+            acceleration, memory = made.act(states[-1], memory)
+            transition = self.step(acceleration)
+            states.append(transition.state)
+            rewards.append(transition.reward)
+        stacked = states[0].map(lambda *values: torch.stack(values, 1), *states[1:])
+        empty = self._state.is_running.new_zeros((rows, 0))
+        return ModelTrajectories(stacked, torch.stack(rewards, 1) if rewards else empty, self._state.is_running == 0.0)
+
+    def error_report(self) -> dict[str, Any]:
+        """Return how well the model agrees with episodes of which no network learned: the facts of `unjam model`.
+
+        `one_step` and `by_state` have root mean squared errors of a step; `replay` has those under recorded
+        accelerations by time; `bound` is the bound C of the paper by rollout length, or None.
+        """
+        return trained_model_facts(self._trained)
+
+
+def load_world_model(run: Path | str) -> LearnedModel:
+    """Return the learned model in the newest checkpoint of a run folder.
+
+    Raise `InputError` if it is no run folder, is damaged, has no checkpoint yet, or has no model of rows: its
+    `model.model_ratio` is 0, `model.kind` is `road`, its agent learns no model, or it has several tasks.
+    """
+    folder = Path(run)
+    config = read_config(folder)
+    if config.model.kind == "road" and config.model.model_ratio > 0:
+        raise InputError(f"run: {str(folder)!r} has a model of whole roads, model.kind 'road'; allowed: 'row'")
+    return LearnedModel(read_trained_model(folder, config))
