@@ -15,7 +15,7 @@ from torch import Tensor, nn
 import unjam
 from unjam.drivers.observation import local_observation
 from unjam.drivers.user_driver import as_driver
-from unjam.training.seeds import make_test_seeds
+from unjam.seeds import make_test_seeds
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.worker_pool import EpisodeTask
 

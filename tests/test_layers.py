@@ -334,7 +334,7 @@ CHANGES_THE_PROCESS = {
     "training/train": "for the length of a training, under a lock, and restored",
     "learners/algorithm": "within training/train",
     "training/model_facts": "within training/train, or in the command line",
-    "training/benchmark": "in the command line",
+    "training/speed": "in the command line",
     "following/networks": "in the command line",
     "unjam_paper/theory": "in the command line",
     "worlds/worker": "in a worker",

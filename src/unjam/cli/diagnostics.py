@@ -174,7 +174,7 @@ def bench_command(
     - unjam bench
     - unjam bench --device cuda
     """
-    from unjam.training.benchmark import benchmark_batches, benchmark_episodes
+    from unjam.training.speed import benchmark_batches, benchmark_episodes
 
     rates = benchmark_batches(device, err_console.print) if device else benchmark_episodes(rounds, err_console.print)
     if json:

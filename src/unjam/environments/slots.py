@@ -35,10 +35,12 @@ class SlottedRoadEnv(ParallelEnv[str, Any, Any]):
         self._cavs: dict[str, str] = {}
         """agent of the environment by occupied slot"""
         self._without_slot: set[str] = set()
-        self.observation_spaces, self.action_spaces = (
+        of_one_cav = self._road.observation_space, self._road.action_space
+        made: list[dict[str, spaces.Space[Any]]] = [
             {slot: spaces.Box(space.low, space.high, dtype=np.float32) for slot in self.possible_agents}
-            for space in (self._road.observation_space, self._road.action_space)
-        )
+            for space in of_one_cav
+        ]
+        self.observation_spaces, self.action_spaces = made
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Return the observation space of a slot: that of one CAV."""

@@ -26,7 +26,7 @@ from unjam.models.rollouts import to_device
 from unjam.physics.arrays import Array
 from unjam.scenarios import FigureEight, Ring
 from unjam.scenarios.population import Population, write_population
-from unjam.training.benchmark import make_benchmark_driver
+from unjam.training.speed import make_benchmark_driver
 from unjam.worlds.batch.noise import ArrayFactory, NoiseState
 from unjam.worlds.batch.ring.world import RingBatch, WarmUpState
 from unjam.worlds.batch.run import WARM_UP_CACHE, run_batch, run_batches, start_batch_drive, warm_up_states

@@ -8,7 +8,7 @@ from unjam.drivers import PISaturation
 from unjam.drivers.check import check_driver
 from unjam.errors import MissingPartError
 from unjam.training import benchmark
-from unjam.training.benchmark import benchmark_batches, benchmark_episodes, make_benchmark_driver
+from unjam.training.speed import benchmark_batches, benchmark_episodes, make_benchmark_driver
 
 
 @pytest.fixture
