@@ -1,5 +1,5 @@
-# make demo   sets everything up, trains a residual in a jam, and compares drivers on a motorway with the human baseline: a minute
-#             or two after the installation
+# make demo   sets everything up, trains a residual in a jam, and compares drivers with human drivers there: a minute or two after
+#             the installation
 # make test   fifteen tests of sixteen, in minutes; .ci/run adds the long ones, make test-all the slow ones, too
 # make check  lint, format, types; make docs builds the site; make bench measures speed
 #
@@ -22,7 +22,7 @@ export PYTHONDONTWRITEBYTECODE =
 
 demo: $(VENV)/.installed
 	$(BIN)/unjam train ring-jammed --preset demo
-	$(BIN)/unjam drive on-ramp -d human -d unjam:on-ramp-tuned --penetration-rate 0.05 --test-seeds -n 4
+	$(BIN)/unjam drive ring-jammed -d human -d pi -d unjam:ring-jammed-best --test-seeds -n 4
 
 # The tests of a file share what they have made
 SPREAD := -n 2 --dist loadfile --no-loadscope-reorder
