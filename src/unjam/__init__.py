@@ -4,8 +4,12 @@
     result = unjam.drive("ring-jammed", driver="pi", episodes=5, out="runs/first")
     print(result.mean["time_to_dissolve"], result.report)
 
-The import registers `unjam/Ring-v0` and other environments with Gymnasium.
-The same on the command line: `unjam --help`.
+The import registers the environments `unjam/Ring-v0`, `unjam/FigureEight-v0`, `unjam/Merge-v0`, `unjam/OnRamp-v0`,
+`unjam/Recorded-v0` and `unjam/UserNetwork-v0` (your own SUMO network) with Gymnasium; `parallel_env` has several CAVs.
+
+`drive` compares drivers, `train` learns a residual on an expert, `export_controller` makes a file of it that
+`verify_controller` checks and `load_controller` loads, `run_episode` and `measure` are for one episode.
+The same on the command line, with tuning, calibration and assessment of your own network: `unjam --help`.
 """
 
 import sys

@@ -6,7 +6,7 @@ best of them then drive on all settings of this half, and the best of these in b
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import cycle
+from itertools import cycle, product
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ from unjam_paper.motorway_tables import (
     FINAL_PART,
     HUMAN_PART,
     OPPONENT,
+    PACKAGED_PART,
     SENSING_PART,
     SENSITIVITY_PART,
     TEST_HUMAN_PART,
@@ -39,6 +40,7 @@ from unjam_paper.motorway_tables import (
     comparison_table,
     delay_change,
     no_harm_table,
+    packaged_table,
     parameter_effects_table,
     sensing_table,
     sensitivity_table,
@@ -62,6 +64,8 @@ FINALISTS = 4
 EPISODE_METRICS = (*HARM_METRICS, "vehicles", "human_braking_beyond_3_5")
 OTHER_SOURCES = ("vehicles", "detectors", "none")
 """sources of the speeds ahead, besides the CAVs of the main comparison"""
+PACKAGED_LAW, PACKAGED_SOURCES = "unjam:on-ramp-tuned", ("cavs", "vehicles")
+"""the motorway law of `unjam:best`, which was tuned for exact speeds of all vehicles ahead"""
 SENSING_SEEDS, CHANGE_SEEDS = 8, 10
 CHANGED_SETTING = 18
 """the setting of which one assumption at a time is changed"""
@@ -159,6 +163,14 @@ def measure_test(label: str, candidate: Candidate, rate: float, number: int, cou
     return [{"driver": label, **row} for row in run_jobs(jobs, workers)]
 
 
+def measure_packaged(source: str, workers: int) -> Table:
+    """Return one episode of the packaged law for motorways on each setting of the tuning half and penetration rate."""
+    candidate, (seed, *_) = Candidate(PACKAGED_LAW, {"roadside.source": source}), tuning_seeds(1)
+    pairs = product(SETTINGS[:SETTINGS_PER_HALF], BENCHMARK_RATES)
+    rows = run_jobs([(setting, candidate, rate, seed) for setting, rate in pairs], workers)
+    return [{"driver": source, **row} for row in rows]
+
+
 def measure_change(name: str, controller: Candidate, workers: int) -> dict[str, Table]:
     """Return the episodes of human traffic and of the controller on one setting with one changed assumption."""
     demand_factor, changes = CHANGES[name]
@@ -227,7 +239,8 @@ def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
         for source, each in sensing.items()
         for number in hard
     }
-    return parts | {f"{SENSITIVITY_PART}/{name}": (measure_change, (name, own)) for name in CHANGES}
+    parts |= {f"{SENSITIVITY_PART}/{name}": (measure_change, (name, own)) for name in CHANGES}
+    return parts | {f"{PACKAGED_PART}/{source}": (measure_packaged, (source,)) for source in PACKAGED_SOURCES}
 
 
 def tuned_drivers(first_rows: Table, finals: Table, human: Table) -> dict[str, Candidate]:
@@ -258,5 +271,6 @@ MOTORWAY_BENCHMARK = Study(
         "no-harm": no_harm_table,
         "sensing": sensing_table,
         "sensitivity": sensitivity_table,
+        "packaged": packaged_table,
     },
 )

@@ -19,7 +19,7 @@ from unjam_paper.results_file import read_part
 from unjam_paper.study import NO_VALUE_TEXT, Table
 
 HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
-SENSING_PART, SENSITIVITY_PART = "sensing", "sensitivity"
+SENSING_PART, SENSITIVITY_PART, PACKAGED_PART = "sensing", "sensitivity", "packaged"
 ACC_ALONE, CONTROLLER, OPPONENT = "ACC alone", "controller", "best opponent"
 """what is compared on the test half, besides human traffic"""
 COMPARED = HUMAN_LABEL, ACC_ALONE, OPPONENT
@@ -193,6 +193,22 @@ def sensitivity_table(folder: Path) -> pd.DataFrame:
         texts = (str(estimate_cell(human, 0)), str(estimate_cell(gains, 1, sign="+")))
         table.append({"changed": name, "human traffic [s]": texts[0], "change [s]": texts[1]})
     return pd.DataFrame(table)
+
+
+def packaged_table(folder: Path) -> pd.DataFrame:
+    """Return the change of delay with the packaged law for motorways, by the source of the speeds ahead.
+
+    One episode on each setting of the tuning half.
+    """
+    human, rows = read_part(folder, HUMAN_PART), _read_measured(folder, PACKAGED_PART) or []
+    episodes: dict[str, dict[float, Table]] = {}
+    for row in rows:
+        episodes.setdefault(row["driver"], {}).setdefault(row["penetration_rate"], []).append(row)
+    return pd.DataFrame(
+        {"source": source}
+        | {f"delay, {100 * rate:g} % CAVs": f"{100 * delay_change(each, human):+.0f} %" for rate, each in own.items()}
+        for source, own in episodes.items()
+    )
 
 
 def _read_measured(folder: Path, part: str) -> Any:

@@ -18,7 +18,6 @@ from unjam.worlds.batch.ring.recorded import RecordedBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam_paper.fuel_optimal_plan import PlanLimits
 
-GENERATION_SIZE, GENERATIONS = 32, 20
 ELITE_SHARE, KEPT_SHARE, SMALLEST_SPREAD = 0.2, 0.3, 0.03
 """share of candidates that define the next generation; share of the last distribution that stays; smallest standard
 deviation of a parameter, relative to its range"""
@@ -30,11 +29,19 @@ MARGIN = 0.5
 """by which limits are kept in the search [m]"""
 
 
+class SearchBudget(NamedTuple):
+    """Size of a search."""
+
+    generations: int = 20
+    size: int = 32
+    """candidates of a generation"""
+
+
 class RowScores(NamedTuple):
     """What candidates did on n roads; arrays of shape (candidates, n)."""
 
     fuel: Floats
-    """of the platoon by power per distance [ml/m]"""
+    """of the CAV and the vehicles behind it by power per distance [ml/m]"""
     mean_gap: Floats
     """of the CAV [m]"""
     max_gap: Floats
@@ -57,12 +64,13 @@ def measure_candidates(
     roads, candidates = len(scenarios), len(next(iter(parameters.values()))) if parameters else 1
     world = RecordedBatch(list(scenarios) * candidates, [(0,)] * (roads * candidates), keep_record=False)
     loop = start_batch_drive(world, with_parameter_rows(driver, parameters, roads) if parameters else driver)
-    step, before = scenarios[0].control_step, world.platoon_speeds
+    step, counted = scenarios[0].control_step, 1 + scenarios[0].vehicle_kinds[::-1].index("cav")
+    before = world.speeds[:counted]
     totals = np.zeros((4, roads * candidates))
     max_gap, min_time_gap = np.zeros(roads * candidates), np.full(roads * candidates, np.inf)
     is_running = np.array(world.is_running)
     for _ in loop:
-        speeds, gap = world.platoon_speeds, world.exact_state().leader_gap
+        speeds, gap = world.speeds[:counted], world.exact_state().leader_gap
         fuel = fuel_rate(speeds, (speeds - before) / step).sum(0)
         totals += is_running * np.stack([fuel, speeds.sum(0), gap, np.ones_like(gap)])
         max_gap = np.maximum(max_gap, gap * is_running)
@@ -76,7 +84,12 @@ def measure_candidates(
 
 
 def search_parameters(
-    scenarios: Sequence[Recorded], driver: Driver, space: Mapping[str, FloatDistribution], human: RowScores, seed: int
+    scenarios: Sequence[Recorded],
+    driver: Driver,
+    space: Mapping[str, FloatDistribution],
+    human: RowScores,
+    seed: int,
+    budget: SearchBudget,
 ) -> list[dict[str, Any]]:
     """Return the best candidate so far after each generation: its parameters, fuel relative to human drivers [%], gaps.
 
@@ -86,11 +99,11 @@ def search_parameters(
     mean, spread = np.full(len(space), 0.5), np.full(len(space), 0.35)
     best: dict[str, Any] = {"score": np.inf}
     history = list[dict[str, Any]]()
-    for generation in range(GENERATIONS):
+    for generation in range(budget.generations):
         if generation == 0:
-            points = generator.random((GENERATION_SIZE, len(space)))
+            points = generator.random((budget.size, len(space)))
         else:
-            points = np.clip(mean + spread * generator.standard_normal((GENERATION_SIZE, len(space))), 0.0, 1.0)
+            points = np.clip(mean + spread * generator.standard_normal((budget.size, len(space))), 0.0, 1.0)
         parameters = {
             name: _scale(points[:, column], distribution) for column, (name, distribution) in enumerate(space.items())
         }
@@ -104,7 +117,7 @@ def search_parameters(
             + TIME_GAP_PRICE * np.maximum(LIMITS.time_gap - time_gap, 0.0)
         )
         order = np.argsort(total)
-        elite = points[order[: round(ELITE_SHARE * GENERATION_SIZE)]]
+        elite = points[order[: round(ELITE_SHARE * budget.size)]]
         kept = KEPT_SHARE if generation else 0.0
         mean = kept * mean + (1.0 - kept) * elite.mean(0)
         spread = np.maximum(kept * spread + (1.0 - kept) * elite.std(0), SMALLEST_SPREAD)

@@ -33,7 +33,7 @@ from unjam.training.evaluate import raise_failure
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.fuel_optimal_plan import PlanLimits, PlannedDriver, plan_speeds
-from unjam_paper.parameter_search import measure_candidates, search_parameters
+from unjam_paper.parameter_search import SearchBudget, measure_candidates, search_parameters
 from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
 
@@ -70,7 +70,7 @@ DRIVE_METRICS = (
     *("min_time_gap", "share_short_time_gap", "time_behind_leader", "outflow_veh_per_h", "cav_max_braking"),
     *("mean_abs_jerk", "filter_override_share", "feasibility"),
 )
-SEARCH_SEED = 0
+SEARCH_SEED, SEARCH_BUDGET = 0, SearchBudget()
 PUBLISHED_LABEL, PLAN_LABEL = "published", "plan that knows the recording"
 SEARCH_PART, DRIVES_PART = "search", "training drives"
 
@@ -122,7 +122,9 @@ def tune_driver(folder: str, method: str, workers: int) -> Table:
     """Return the best candidates of a method after each generation, on the training drives."""
     scenarios = training_drives(Path(folder))
     human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
-    return search_parameters(scenarios, untuned_driver(method), SEARCH_SPACES[method], human, SEARCH_SEED)
+    return search_parameters(
+        scenarios, untuned_driver(method), SEARCH_SPACES[method], human, SEARCH_SEED, SEARCH_BUDGET
+    )
 
 
 def tuned_name(rows: Table, method: str) -> str:

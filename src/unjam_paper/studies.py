@@ -18,6 +18,7 @@ from unjam_paper.feasible import ENVELOPE, feasible_study, on_ramp_study
 from unjam_paper.figure_6 import FIGURE_6
 from unjam_paper.fuel import FUEL
 from unjam_paper.human_traffic import HUMAN_TRAFFIC_STUDY
+from unjam_paper.information_ahead import INFORMATION_AHEAD
 from unjam_paper.motorway_benchmark import MOTORWAY_BENCHMARK
 from unjam_paper.motorway_ensemble import MOTORWAY_ENSEMBLE
 from unjam_paper.recorded_roads import RECORDED_ROADS
@@ -104,6 +105,7 @@ STUDIES: dict[str, Study] = {
     "fuel": FUEL,
     "string-stability": STRING_STABILITY,
     "recorded-roads": RECORDED_ROADS,
+    "information-ahead": INFORMATION_AHEAD,
     "do-no-harm": DO_NO_HARM,
     "assess-examples": ASSESS_EXAMPLES,
     "all-roads": ALL_ROADS_STUDY,

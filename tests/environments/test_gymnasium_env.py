@@ -17,6 +17,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 import unjam
 from tests.worlds.sumo.user_networks import straight
 from unjam.drivers import IDM, Constant
+from unjam.drivers.observation import FEATURES
 from unjam.drivers.registry import driver_from_name
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError
@@ -352,3 +353,48 @@ def test_an_action_that_is_not_one_finite_number_is_refused_in_one_line(action: 
             single.step(action)
         with pytest.raises(InputError, match=r"^step: cav_"):
             several.step(dict.fromkeys(several.agents, action))
+
+
+def test_options_of_a_reset_change_the_scenario_for_this_episode() -> None:
+    with closing(RoadEnv("ring", length=250, horizon=40)) as environment:
+        options = {"length": 230, "safety.time_gap": 1.5, "horizon": 3}
+        assert environment.reset(seed=0, options=options)[1]["drawn_values"] == {"length": 230.0}
+        assert [environment.step(np.zeros(1))[3] for _ in range(3)] == [False, False, True]
+        assert environment.reset()[1]["drawn_values"] == {"length": 250.0}
+        assert [environment.step(np.zeros(1))[3] for _ in range(3)] == [False] * 3
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"lenght": 230}, "lenght: unknown name; did you mean 'length'?"),
+        ({"cavs": 2}, "reset: options: cavs: 2 is not allowed; allowed: 1, as in the constructor"),
+        ({"action_limit": 3}, "reset: options: action_limit: 3.0 is not allowed; allowed: 1.0, as in the constructor"),
+        ([230], "reset: options: [230] is not allowed; allowed: a dict of parameters"),
+    ],
+)
+def test_options_that_are_not_parameters_of_this_road_are_refused(options: Any, words: str) -> None:
+    with closing(RoadEnv("ring", **SHORT)) as environment:
+        environment.reset(seed=0)
+        with pytest.raises(InputError, match=re.escape(words)):
+            environment.reset(options=options)
+        environment.step(np.zeros(1))  # the episode goes on
+
+
+def test_documentation_names_all_environments_and_features() -> None:
+    for name in [*NAMES, OWN]:
+        assert name in (unjam.__doc__ or "")
+        assert name in (RoadEnv.__doc__ or "")
+    assert [name for name in FEATURES if f"``{name}``" not in (RoadEnv.__doc__ or "")] == []
+
+
+def test_an_expert_accelerates_exactly_as_in_an_episode() -> None:
+    changes: Any = {"horizon": 400}
+    (cav,) = run_episode(make_scenario("ring", changes), IDM(), (3,)).trajectories
+    found = []
+    with closing(RoadEnv("ring", expert="idm", **changes)) as environment:
+        environment.reset(seed=3)
+        for _ in range(400):
+            environment.step(np.zeros(1))
+            found.append(environment._road.world.last_applied_acceleration())
+    np.testing.assert_array_equal(found, cav.applied_acceleration)

@@ -175,12 +175,17 @@ def test_after_detach_no_gradient_flows_to_earlier_steps() -> None:
     assert not any(each.requires_grad for each in (rings.speeds, rings.positions, rings.gaps, reward))
 
 
+FILTERED = {"safety": SafetyFilter(time_gap=2.5), "steps_per_control_step": 2, "actuator": LAGGING}
+
+
 @pytest.mark.parametrize(
-    "changes", [{}, {"warmup": 100}, {"cavs": 2, "warmup": 20}], ids=["start", "warm-up", "two CAVs"]
+    ("changes", "is_filtered"),
+    [({}, False), (FILTERED, True), ({"warmup": 100}, False), ({"cavs": 2, "warmup": 20}, False)],
+    ids=["start", "filter acts", "warm-up", "two CAVs"],
 )
-def test_an_episode_is_that_of_a_batch_with_rewards(changes: dict[str, Any]) -> None:
-    road, driver, seeds = replace(SMALL, **changes), PISaturation(window=5.0), [(3, 1), (3, 2)]
-    rings = DifferentiableRings(road, seeds)
+def test_an_episode_is_that_of_a_batch_with_rewards(changes: dict[str, Any], is_filtered: bool) -> None:
+    road, seeds = replace(SMALL, **changes), [(3, 1), (3, 2)]
+    driver, rings = PISaturation(window=5.0, time_step=road.control_step), DifferentiableRings(road, seeds)
     memory, rewards, speeds = rings.initial_memory(driver), [], [rings.speeds]
     with torch.no_grad():
         while not rings.has_ended:
@@ -188,6 +193,7 @@ def test_an_episode_is_that_of_a_batch_with_rewards(changes: dict[str, Any]) -> 
             rewards.append(rings.step(acceleration))
             speeds.append(rings.speeds)
     episodes = run_batch([EpisodeTask(road, driver, seed) for seed in seeds])
+    assert is_filtered == any((each.filter_braking > 0.0).any() for one in episodes for each in one.trajectories)
     for ring, episode in enumerate(episodes):
         assert np.abs(episode.reward - torch.stack(rewards)[:, ring].numpy()).max() < 1e-9
         assert np.abs(episode.speeds - torch.stack(speeds)[..., ring].numpy()).max() < 1e-9

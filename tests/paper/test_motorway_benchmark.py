@@ -29,6 +29,7 @@ from unjam_paper.motorway_tables import (
     FINAL_PART,
     HUMAN_PART,
     OPPONENT,
+    PACKAGED_PART,
     SENSING_PART,
     SENSITIVITY_PART,
     TEST_HUMAN_PART,
@@ -37,6 +38,7 @@ from unjam_paper.motorway_tables import (
     comparison_table,
     delay_change,
     no_harm_table,
+    packaged_table,
     parameter_effects_table,
     sensing_table,
     sensitivity_table,
@@ -198,7 +200,23 @@ def test_each_changed_assumption_is_a_scenario_and_has_its_row(tmp_path: Path) -
     assert sensitivity_table(tmp_path)["changed"].tolist() == [*CHANGES]
 
 
+def test_the_packaged_law_is_compared_by_source_and_penetration_rate(tmp_path: Path) -> None:
+    write_part(tmp_path, HUMAN_PART, compared_rows("human", 3, 99.0, 0.0))
+    rows = [*compared_rows("cavs", 3, 109.0), *compared_rows("cavs", 3, 99.0, 0.1), *compared_rows("vehicles", 3, 49.0)]
+    write_part(tmp_path, PACKAGED_PART, rows)
+    table = packaged_table(tmp_path).set_index("source")
+    assert table["delay, 5 % CAVs"].to_dict() == {"cavs": "+10 %", "vehicles": "-50 %"}
+    assert table.loc["cavs", "delay, 10 % CAVs"] == "+0 %"
+
+
 def test_tables_are_empty_before_the_test_half_has_been_driven(tmp_path: Path) -> None:
     write_part(tmp_path, HUMAN_PART, human_rows())
-    for make_table in (comparison_table, summary_table, no_harm_table, sensing_table, sensitivity_table):
+    for make_table in (
+        comparison_table,
+        summary_table,
+        no_harm_table,
+        sensing_table,
+        sensitivity_table,
+        packaged_table,
+    ):
         assert make_table(tmp_path).empty

@@ -1,5 +1,6 @@
 """Controllers behind recorded vehicles: search of parameters, plans, and the study."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,17 @@ from tests.adapters.onnx_policies import linear, write
 from unjam.controller import make_driver
 from unjam.errors import InputError
 from unjam.physics.fuel import fuel_rate
-from unjam_paper import fuel_optimal_plan, parameter_search
+from unjam_paper import fuel_optimal_plan, information_ahead, recorded_roads
 from unjam_paper.fuel_optimal_plan import PlanLimits, plan_speeds
-from unjam_paper.parameter_search import measure_candidates
+from unjam_paper.information_ahead import (
+    FIXED_PARAMETERS,
+    INFORMATION_AHEAD,
+    InformedACC,
+    received_speeds,
+    roads_with_vehicles_between,
+    value_table,
+)
+from unjam_paper.parameter_search import SearchBudget, measure_candidates
 from unjam_paper.recorded_roads import (
     PLAN_LABEL,
     PUBLISHED_FILE,
@@ -81,8 +90,7 @@ def test_a_plan_saves_fuel_within_its_limits() -> None:
 
 
 def test_the_study_tunes_first_and_compares_all_drivers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parameter_search, "GENERATIONS", 5)
-    monkeypatch.setattr(parameter_search, "GENERATION_SIZE", 6)
+    monkeypatch.setattr(recorded_roads, "SEARCH_BUDGET", SearchBudget(5, 6))
     monkeypatch.setitem(fuel_optimal_plan.OPTIMIZER_OPTIONS, "maxiter", 20)
     study = folder / "recorded-roads"
     RECORDED_ROADS.run(StudyFolder(folder), 1, study, 1)
@@ -92,3 +100,43 @@ def test_the_study_tunes_first_and_compares_all_drivers(folder: Path, monkeypatc
     assert table["fuel of the platoon [%]"].tolist()[0] == "–"
     search = pd.read_csv(study / "search.csv")
     assert list(search["method"]) == ["smooth-acc", "acc"]
+
+
+def test_received_speeds_are_those_of_the_first_vehicle_after_the_latency(folder: Path) -> None:
+    scenarios = roads_with_vehicles_between(folder, 3)
+    now, late = received_speeds(scenarios, 0.0), received_speeds(scenarios, 2.0)
+    np.testing.assert_array_equal(late[20:], now)
+    np.testing.assert_array_equal(late[:20], np.tile(now[0], (20, 1)))
+    assert now[:, 0] == pytest.approx(15.0 + 4.0 * np.sin(STEP * np.arange(400) / 6.0))
+
+
+def test_each_candidate_receives_the_speeds_of_its_own_road(folder: Path) -> None:
+    scenarios = roads_with_vehicles_between(folder, 3)
+    driver = InformedACC(**FIXED_PARAMETERS, received_speeds=received_speeds(scenarios, 1.0))
+    weights = {"ahead_weight": np.array([0.0, 0.7])}
+    together = measure_candidates(scenarios, driver, weights)
+    without = measure_candidates(
+        scenarios, untuned_driver("smooth-acc"), {name: np.array([value]) for name, value in FIXED_PARAMETERS.items()}
+    )
+    np.testing.assert_allclose(together.fuel[0], without.fuel[0], rtol=1e-9)
+    for number, scenario in enumerate(scenarios):
+        own = InformedACC(**FIXED_PARAMETERS, ahead_weight=0.7, received_speeds=received_speeds([scenario], 1.0))
+        alone = measure_candidates([scenario], own)
+        np.testing.assert_allclose(together.fuel[1, number], alone.fuel[0, 0], rtol=1e-9)
+    assert abs(together.fuel[1] / together.fuel[0] - 1.0).max() > 1e-4
+
+
+def test_the_value_of_information_is_relative_to_none_at_the_same_distance(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(information_ahead, "VEHICLES_BETWEEN", (2,))
+    monkeypatch.setattr(information_ahead, "LATENCIES", (None, 1.0))
+    monkeypatch.setattr(information_ahead, "VALUE_BUDGET", SearchBudget(1, 6))
+    parts = INFORMATION_AHEAD.make_parts(StudyFolder(folder), 3)
+    assert [*parts] == ["value/2 None", "value/2 1.0"]
+    rows = [row for measure, arguments in parts.values() for row in measure(*arguments, 1)]
+    (folder / "value.json").write_text(json.dumps(rows))
+    table = value_table(folder)
+    assert table["latency [s]"].tolist() == ["nothing received", "1"]
+    difference = np.mean(np.subtract(rows[1]["by_drive"], rows[0]["by_drive"]))
+    assert float(str(table["difference to nothing received"][1]).split()[0]) == pytest.approx(difference, abs=0.01)

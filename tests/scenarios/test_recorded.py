@@ -6,9 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from unjam.drivers.car_following import IDM
 from unjam.errors import InputError
 from unjam.physics.idm import idm_acceleration
 from unjam.scenarios import Recorded, make_scenario, scenario_from_recipe, scenario_recipe
+from unjam.worlds.episode import run_episode
 
 TIMES = 0.1 * np.arange(900)
 
@@ -57,6 +59,16 @@ def test_parts_of_the_recordings_are_strata(tmp_path: Path) -> None:
         write_drive(tmp_path / f"{number}.csv")
     parts = [Recorded(recordings=str(tmp_path)).stratum(index, 4) for index in range(4)]
     assert [Path(part.recordings).name for part in parts] == ["0.csv", "1.csv", "2.csv", "3.csv"]
+
+
+@pytest.mark.parametrize("changes", [{}, {"begin": 60.0}, {"window": 30.0}, {"horizon": 50}, {"simulation_step": 0.05}])
+def test_no_episode_is_longer_than_the_scenario_says(tmp_path: Path, changes: dict[str, Any]) -> None:
+    for name, count in (("short", 300), ("long", 900)):
+        pd.DataFrame({"time": TIMES[:count], "speed": 10.0}).to_csv(tmp_path / f"{name}.csv", index=False)
+    scenario = Recorded(recordings=str(tmp_path / "long.csv"), **changes)
+    episode = run_episode(scenario, IDM(), 0, backend="batch")
+    assert episode.control_steps == scenario.max_episode_steps
+    assert replace(scenario, recordings=str(tmp_path)).max_episode_steps == scenario.max_episode_steps
 
 
 def test_a_window_longer_than_the_recording_is_refused(tmp_path: Path) -> None:

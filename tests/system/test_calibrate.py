@@ -33,7 +33,7 @@ def test_calibrate_writes_a_network_for_other_commands(unjam: Run, tmp_path: Pat
     drive = ("drive", "result/calibrated.sumocfg", "--penetration-rate", "0.2", "-d", "acc", "-n", 1, "--no-report")
     driven = unjam(*drive, "--json")
     assert driven.returncode == 0, driven.stderr
-    assert json.loads(driven.stdout)["episodes"][0]["status"] == "completed"
+    assert json.loads(driven.stdout)["drivers"][0]["episodes"][0]["status"] == "completed"
     again = unjam(*CALIBRATE, "--out", "result", "--json")  # continues, with the same result
     assert again.returncode == 0, again.stderr
     result = json.loads(again.stdout)

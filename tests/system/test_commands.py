@@ -98,7 +98,7 @@ def test_a_run_that_names_files_is_usable_in_a_process_with_another_working_fold
 @pytest.mark.slow
 def test_drive_prints_one_json_document(unjam: Run) -> None:
     command = ("drive", "ring", "--driver", "pi", "--episodes", 2, "--seed", 7, *SMALL, "--json")
-    found = document(unjam(*command, pictures=False))
+    (found,) = document(unjam(*command, pictures=False))["drivers"]
     assert (found["scenario"], found["driver"]) == ("ring", "pi")
     assert [row["seed"] for row in found["episodes"]] == [7, 8]
     for row in found["episodes"]:
@@ -139,7 +139,7 @@ def test_drive_does_not_depend_on_the_number_of_workers(unjam: Run) -> None:
 @pytest.mark.long
 def test_drive_with_the_users_own_driver_and_reward(unjam: Run, my_drivers: Path) -> None:
     command = ("drive", "ring", "-d", "mine.py:gentle", "--reward", "mine.py:calm", "-n", 1, *SMALL, "--json")
-    found = document(unjam(*command, pictures=False))
+    (found,) = document(unjam(*command, pictures=False))["drivers"]
     assert found["driver"] == "mine.py:gentle"
     assert found["mean"]["return"] > 0
 
@@ -286,7 +286,9 @@ def test_train_resume_drive_and_export(unjam: Run, tmp_path: Path) -> None:
     assert [row["environment_steps"] for row in progress] == [160, 320, 480]
 
     assert "A trained residual on pi".lower() in (run / "report.html").read_text().lower()
-    driven = document(unjam("drive", "ring", "--driver", "run", *SMALL, "-n", 1, "--json", pictures=False))
+    (driven,) = document(unjam("drive", "ring", "--driver", "run", *SMALL, "-n", 1, "--json", pictures=False))[
+        "drivers"
+    ]
     assert driven["episodes"][0]["status"] == "completed"
 
     exported = document(unjam("export", "run", "--out", "ring.unjam", "--json"))
@@ -304,7 +306,7 @@ def test_train_resume_drive_and_export(unjam: Run, tmp_path: Path) -> None:
     assert "ring.unjam: " in ran.stdout
     assert "note: ring.onnx is not the graph of this controller" in ran.stderr
     drive = ("drive", "ring", "--driver", "ring.unjam", *SMALL, "-n", 1, "--json")
-    repeated = document(unjam(*drive, pictures=False))
+    (repeated,) = document(unjam(*drive, pictures=False))["drivers"]
     assert repeated["mean"] == driven["mean"]
 
 
@@ -433,7 +435,8 @@ def test_calibrated_human_drivers_in_drive_train_and_evaluate(unjam: Run, tmp_pa
     assert (found["drivers"], found["population"]) == (2, "drivers.json")
     humans = ["--humans", "drivers.json"]
     driven = [
-        document(unjam("drive", "ring", "-d", "human", "-n", 1, *SMALL, *each, "--json")) for each in ([], humans)
+        document(unjam("drive", "ring", "-d", "human", "-n", 1, *SMALL, *each, "--json"))["drivers"][0]
+        for each in ([], humans)
     ]
     assert driven[0]["mean"]["mean_speed"] != driven[1]["mean"]["mean_speed"]
     ran = unjam(*TINY_RUN, "--steps", 160, "--out", "run", *humans, "--set", "model.base=population", "--json")

@@ -19,6 +19,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchmark, "RING_SIZES", {22: 200, 66: 100})
     monkeypatch.setattr(benchmark, "BATCH_VEHICLES", 2200)
     monkeypatch.setattr(benchmark, "STEPS_PER_ROUND", 20)
+    monkeypatch.setattr(benchmark, "VECTOR_ENVIRONMENTS", ((50, False),))
 
 
 @pytest.fixture(autouse=True)
@@ -57,6 +58,9 @@ def test_benchmark_has_rates_and_ratios_and_restores_cores() -> None:
     assert parts["learned model: 500 rollouts of 20 control steps"]["ratio"] > 2.0
     assert parts["batch of 100 rings of 22 vehicles"]["vehicles"] == 22
     assert {"figure-eight: run_episode", "merge: run_episode", "driving loop, ring of 66 vehicles"} <= parts.keys()
+    vector = parts["vector environment of 50 rings"]
+    assert vector["reference"] == "vector environment of 50 rings: batch alone"
+    assert parts["vector environment of 50 rings, compared with SUMO"]["ratio"] > 2.0
     assert (found["rounds"], messages) == (1, ["round 1 of 1"])
     assert cores is None or os.sched_getaffinity(0) == cores
 

@@ -243,3 +243,24 @@ def test_second_training_in_a_process_is_refused() -> None:
     for _ in range(2):
         with exclusive_random_state(), refused, exclusive_random_state():
             raise AssertionError
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_refused_training_leaves_no_folder(tmp_path: Path, exists: bool) -> None:
+    folder = tmp_path / "run"
+    (tmp_path / "bad.py").write_text("def broken(state): return state.speed * float('nan')")
+    if exists:
+        folder.mkdir()
+    with pytest.raises(InputError, match="acceleration of cav_0 is nan"):
+        train(replace(small_config(), expert=f"{tmp_path}/bad.py:broken"), folder)
+    assert not folder.exists()
+
+
+def test_a_result_prints_a_table_of_its_drivers(finished_training: Trained) -> None:
+    result = finished_training.result
+    head, columns, *rows, gain, controller = str(result).splitlines()
+    assert head == f"training run {result.folder}"
+    assert columns.split() == list(result.rows)
+    assert any(row.strip().startswith("mean speed [m/s]") for row in rows)
+    assert gain.startswith("return compared with the expert: ")
+    assert controller == f"controller: {result.controller}"

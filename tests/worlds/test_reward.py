@@ -13,11 +13,14 @@ from unjam.errors import InputError
 from unjam.worlds.reward import (
     CRASH_CLOSURE_STEPS,
     MIN_CRASH_BACKLOG,
+    REWARD_TERMS,
     REWARDS,
     Outcome,
     make_reward,
     released_reward,
+    step_reward_terms,
     time_gap,
+    validate_reward_terms,
 )
 
 
@@ -274,3 +277,24 @@ def test_fuel_is_saved_by_coasting_and_wasted_by_braking() -> None:
     assert reward(-3.0) == reward(-0.5)  # braking harder saves nothing more
     assert reward(0.0, 0.5) == pytest.approx(reward(0.0) - 0.05)
     assert reward(0.0, 7.0) == pytest.approx(reward(0.0) - 0.2)
+
+
+@given(outcome=outcomes())
+@pytest.mark.parametrize("name", [*REWARDS, *(f"eq16:{term}=0.5" for term in REWARD_TERMS)])
+def test_a_single_step_has_the_terms_of_a_row(outcome: Outcome, name: str) -> None:
+    reward, last = make_reward(name), len(outcome.speeds) - 1
+    one, row = (Outcome(*(values[part] for values in outcome)) for part in (last, slice(last, None)))
+    one = one._replace(has_crashed=bool(one.has_crashed), backlog=float(one.backlog))
+    if len(one.accelerations) == 1:  # as of a world with a single CAV
+        one = one._replace(
+            **{each: float(getattr(one, each)[0]) for each in ("accelerations", "time_gaps", "cav_speeds")}
+        )
+    expected = {term: values.item() for term, values in validate_reward_terms(reward, row).items()}
+    assert step_reward_terms(reward, one, 3, needs_rows=False) == expected
+    assert step_reward_terms(reward, one, 0, needs_rows=True) == expected
+
+
+def test_a_term_of_a_single_step_that_is_not_finite_is_refused() -> None:
+    step = Outcome(np.array([1.0]), 0.0, 1.0, False, 0.0, 1.0)
+    with pytest.raises(InputError, match="step 4: term 'bad' is nan; allowed: finite"):
+        step_reward_terms(lambda outcome: {"bad": outcome.backlog * np.nan}, step, 4, needs_rows=False)

@@ -78,7 +78,7 @@ def drive_command(
     if not driver:
         driver = ["human", DEFAULT_DRIVER]
         changes = (ACC_SETTINGS if scenario.endswith(".sumocfg") else {}) | changes
-    total = make_scenario(scenario, changes).horizon * episodes * len(driver)
+    total = make_scenario(scenario, changes).max_episode_steps * episodes * len(driver)
     folder = opt.new_folder(out, f"drive-{Path(scenario).stem}") if report else None
     with output.ProgressReporter(f"driving {Path(scenario).name}", "steps", total) as progress:
         options = workers, folder, progress.update, test_seeds, backend

@@ -12,7 +12,7 @@ from unjam.drivers.local_state import LocalState, ScaledInput
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements, RoadInterface, merge_requirements
 from unjam.errors import InputError
 from unjam.parameters import Subclassable
-from unjam.physics.arrays import Array
+from unjam.physics.arrays import Array, replace_entries
 from unjam.tree import leaves, map_leaves, named_parts
 
 Memory = dict[str, Any]
@@ -173,6 +173,17 @@ def label_with_parameters(name: str, parameters: dict[str, Any]) -> str:
 def scalar_memory(memory: Memory) -> Memory:
     """Return the memory of one CAV as plain numbers: floats, and Python's own arrays of floats."""
     return map_leaves(lambda rows: rows[0].item() if rows.ndim == 1 else array("d", rows[0]), memory)
+
+
+def replace_memory_rows(memory: Memory, rows: Any, source: Memory, source_rows: Any) -> Memory:
+    """Return `memory` with rows of `source`, a memory of the same driver, in place of some of its own."""
+
+    def replace_rows(values: Any, other: Any) -> Any:
+        if hasattr(values, "replace_rows"):  # a window of speeds
+            return values.replace_rows(rows, other, source_rows)
+        return replace_entries(values, rows, other, source_rows)
+
+    return map_leaves(replace_rows, memory, source)
 
 
 def carry_over_memory(memory: Memory, kept_rows: Any, new_memory: Memory, new_count: int) -> Memory:

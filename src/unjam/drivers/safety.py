@@ -8,13 +8,13 @@ brakes hard; otherwise it brakes as hard as necessary.
 
 import sys
 from math import exp
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from unjam.parameters import STRICT, NonNegative, Positive, Subclassable, parameter_dataclass
-from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
+from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, replace_columns
 from unjam.physics.kinematics import max_speed_to_stop, next_speed, stopping_distance
 
 
@@ -298,6 +298,12 @@ class CAVActuation:
         """Let no gradients of torch flow through the states so far."""
         for name, (acceleration, pending) in self._states.items():
             self._states[name] = ActuatorState(acceleration.detach(), tuple(each.detach() for each in pending))
+
+    def reset_rows(self, rows: Any) -> None:
+        """Let some of the vehicles with a common name start again, without acceleration and commands."""
+        for name, state in self._states.items():
+            initial = self._actuator.initial_state(state.acceleration, self._step)
+            self._states[name] = replace_columns(state, rows, initial, rows)
 
     def apply(self, name: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
         """Return the filtered command for a desired acceleration, and the acceleration in this step [m/s2].

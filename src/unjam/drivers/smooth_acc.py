@@ -75,11 +75,15 @@ class SmoothACC(FormulaDriver):
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the commanded speed, and the new memory."""
         mean = self._update_mean(memory["mean_leader_speed"], state.leader_speed)
+        return self.acceleration_from_mean(mean, state), {"mean_leader_speed": mean}
+
+    def acceleration_from_mean(self, mean: Array, state: LocalState) -> Array:
+        """Return the acceleration [m/s2] with a mean speed of the leader [m/s], shapes (n,)."""
         excess_gap = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
         catch_up = clip(self.gap_gain * excess_gap, -self.catch_up_speed, self.catch_up_speed)
         command = mean + self.leader_weight * (state.leader_speed - mean) + catch_up
         acceleration = (command - state.speed) / clamp_min(self.time_constant, self.time_step)
-        return self._within_limits(acceleration, state), {"mean_leader_speed": mean}
+        return self._within_limits(acceleration, state)
 
     def _within_limits(self, acceleration: Array, state: LocalState) -> Array:
         """Return accelerations within the own limits, beyond which only the gaps matter."""

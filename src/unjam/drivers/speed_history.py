@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from unjam.errors import invalid_value
-from unjam.physics.arrays import Array, clip, namespace
+from unjam.physics.arrays import Array, clip, namespace, replace_columns
 
 SpeedWindow = dict[str, Any]
 
@@ -58,6 +58,11 @@ class BufferedWindow:
     def detach(self) -> "BufferedWindow":
         """Return a copy without gradients."""
         return BufferedWindow.from_speeds(self.buffer.speeds[self.start : self.start + self.steps].detach())
+
+    def replace_rows(self, rows: Any, source: "BufferedWindow", source_rows: Any) -> "BufferedWindow":
+        """Return a window, in a new buffer, in which some rows are those of another window of as many steps."""
+        own, other = (each.buffer.speeds[each.start : each.start + each.steps] for each in (self, source))
+        return BufferedWindow.from_speeds(replace_columns(own, rows, other, source_rows))
 
 
 @dataclass(frozen=True)

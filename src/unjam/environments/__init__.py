@@ -17,4 +17,7 @@ def register_environments() -> None:
     """Register the environments with Gymnasium; their module is imported when one is made."""
     for name, arguments in ENVIRONMENT_ARGUMENTS.items():
         if name not in registry:
-            register(name, "unjam.environments.gymnasium_env:RoadEnv", kwargs=arguments)
+            single, vector = (
+                f"unjam.environments.{each}" for each in ("gymnasium_env:RoadEnv", "vector_env:RoadVectorEnv")
+            )
+            register(name, single, vector_entry_point=vector, kwargs=arguments)

@@ -2,18 +2,20 @@
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from copy import copy
+from math import isfinite
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from unjam.controller import make_expert
 from unjam.drivers.car_following import Constant
 from unjam.drivers.command import Command, Limits, as_numbers
-from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
+from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler, replace_memory_rows
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import (
     MAX_OBSERVATION,
@@ -30,12 +32,23 @@ from unjam.drivers.user_driver import DriverLike
 from unjam.drivers.wrappers import INNER_KEY
 from unjam.environments.threads import CopyableLock, synchronized
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
+from unjam.parameters import merge_changes, nest_keys
+from unjam.physics.arrays import clip, replace_entries
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
+from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend, open_world
-from unjam.worlds.drive import DriveLoop, naming_cav
+from unjam.worlds.drive import DriveLoop
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
-from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap, validate_reward_terms
+from unjam.worlds.reward import (
+    Outcome,
+    Reward,
+    RewardLike,
+    is_packaged_reward,
+    make_reward,
+    step_reward_terms,
+    time_gap,
+)
 from unjam.worlds.road_world import RoadWorld
 
 Observations = NDArray[np.float32]
@@ -44,9 +57,20 @@ Observations = NDArray[np.float32]
 def as_action(action: Any, name: str) -> float:
     """Return the action of one CAV as a number [m/s2]; raise `InputError` unless it is a single finite one."""
     values = as_numbers(action, f"step: {name}")
-    if values.size != 1 or not np.isfinite(values).all():
+    if values.size != 1 or not isfinite(number := values.item()):
         raise InputError(f"step: {name}: {action!r:.60} is not allowed; allowed: one finite number")
-    return values.item()
+    return number
+
+
+def episode_seed(seed: int, episode_count: int) -> tuple[int, ...]:
+    """Return the seed of an episode of an environment, after so many others since the one of `seed`."""
+    return (seed, episode_count) if episode_count else (seed,)
+
+
+def check_single_cav(scenario: Scenario) -> None:
+    """Raise `InputError` unless a scenario has one CAV."""
+    if getattr(scenario, "cavs", None) != 1:
+        raise InputError("cavs: several are not allowed here; allowed: 1; use unjam.parallel_env")
 
 
 class ExternalDriver(Driver):
@@ -57,7 +81,7 @@ class ExternalDriver(Driver):
         self.expert, self.features, self._limits = expert, features, limits
         self.inner_drivers = {INNER_KEY: expert}
         self.actions: Any = np.zeros(0)
-        """additions to the accelerations [m/s2], shape (CAVs,)"""
+        """additions to the accelerations [m/s2], shape (CAVs,), or a float in a world with `is_scalar`"""
 
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
         """Return those of the expert and of the features."""
@@ -65,8 +89,14 @@ class ExternalDriver(Driver):
             self.expert.requirements(road), *(feature(each).requirements for each in self.features)
         )
 
+    def replace_rows(self, rows: Any, source: "ExternalDriver", source_rows: Any) -> None:
+        """Let some CAVs go on with the last observation of CAVs of another driver of this kind."""
+        own, other = (each._expert_acceleration for each in (self, source))
+        self._expert_acceleration = replace_entries(own, rows, other, source_rows)
+        self._next_memory = replace_memory_rows(self._next_memory, rows, source._next_memory, source_rows)
+
     def observation(self, state: LocalState, memory: Memory) -> Any:
-        """Return the external observation, shape (CAVs, numbers), and store the expert's acceleration."""
+        """Return the external observation as `compute_observation`, and store the expert's acceleration."""
         acceleration, after = self.expert.act(state, memory[INNER_KEY])
         self._expert_acceleration, self._next_memory = self._limits.clip(acceleration), {INNER_KEY: after}
         inputs = FeatureInputs(state, self._expert_acceleration, self.expert, after)
@@ -74,15 +104,14 @@ class ExternalDriver(Driver):
 
     def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
         """Return the sum of the stored expert acceleration and the actions."""
-        if not len(state.speed):
+        if not isinstance(state.speed, float) and not len(state.speed):
             return Decision(Command(np.zeros(0)), np.zeros(0), np.zeros(0), None, memory)
         acceleration = self._limits.clip(self._expert_acceleration + self.actions)
         command = Command(acceleration, self.expert.time_gaps(state, memory[INNER_KEY]))
         return Decision(command, self._expert_acceleration, self.actions, None, self._next_memory)
 
 
-@dataclass(frozen=True)
-class RoadStepResult:
+class RoadStepResult(NamedTuple):
     """The result of one control step, with the CAVs that are on the road now."""
 
     cav_ids: list[str]
@@ -111,15 +140,16 @@ class RoadStepper:
         backend: BackendLike = "sumo",
     ) -> None:
         """Prepare a scenario, with arguments as `RoadEnv`; the first `reset` opens the backend."""
-        self.scenario = make_scenario(scenario, changes)
-        self._reward = make_reward(reward or self.scenario.reward)
+        self._base, self._changes = scenario, changes
+        self.scenario = self.episode_scenario = make_scenario(scenario, changes)
+        """that of the constructor; `episode_scenario` is that of the last reset, with its options"""
+        reward = reward or self.scenario.reward
+        self._reward, self._reward_needs_rows = make_reward(reward), not is_packaged_reward(reward)
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
         self._driver = ExternalDriver(driver, as_features(features), self.scenario.acceleration_limits)
-        check_can_drive(driver, self.scenario)
-        check_policy_inputs(self._driver.features, self.scenario, "features")
         self._backend = backend
         with open_backend(backend) as opened:
-            check_support(opened, self.scenario)
+            self._check_scenario(self.scenario, opened)
         self._opened: Backend | None = None
         self._world: RoadWorld | None = None
         self._backend_context, self._world_context = ExitStack(), ExitStack()
@@ -135,30 +165,51 @@ class RoadStepper:
         self.lock = CopyableLock()
         """held during calls of the environment"""
 
-    def reset(self, seed: int | None, generator: np.random.Generator) -> Observations:
+    def _check_scenario(self, scenario: Scenario, backend: Backend) -> None:
+        check_can_drive(self._driver.expert, scenario)
+        check_policy_inputs(self._driver.features, scenario, "features")
+        check_support(backend, scenario)
+
+    def _with_options(self, options: dict[str, Any], backend: Backend) -> Scenario:
+        """Return the scenario with other parameters for one episode; raise `InputError` if they are not allowed."""
+        if not isinstance(options, dict):
+            raise invalid_value("reset: options", options, "a dict of parameters of the scenario")
+        scenario = make_scenario(self._base, merge_changes(nest_keys(self._changes), nest_keys(options)))
+        for name in ("cavs", "action_limit"):
+            if (value := getattr(scenario, name, None)) != (fixed := getattr(self.scenario, name, None)):
+                raise invalid_value(f"reset: options: {name}", value, f"{fixed}, as in the constructor")
+        self._check_scenario(scenario, backend)
+        return scenario
+
+    def reset(
+        self, seed: int | None, generator: np.random.Generator, options: dict[str, Any] | None = None
+    ) -> Observations:
         """Start an episode, run its warm-up, and return the first observations.
 
         It is that of `seed`; without one, the next after that of the last seed, or one with a seed from `generator`.
+        `options` are changes to the parameters of the scenario, in addition to those of the constructor, for this
+        episode alone.
         """
+        if self._opened is None:
+            self._opened = self._backend_context.enter_context(open_backend(self._backend))
+        scenario = self._with_options(options, self._opened) if options else self.scenario
         if seed is not None:
             self._seed, self._episode_count = seed, 0
         if self._seed is None:
             self._seed = int(generator.integers(2**31))
-        numbers = (self._seed, self._episode_count) if self._episode_count else (self._seed,)
+        numbers = episode_seed(self._seed, self._episode_count)
         self._episode_count += 1
-        self._world = None  # also if the next one cannot be opened
-        self._world_context.close()
-        if self._opened is None:
-            self._opened = self._backend_context.enter_context(open_backend(self._backend))
-        fields = self._driver.requirements(self.scenario.interface).measured_fields
-        opening = open_world(self._opened, self.scenario, numbers, WorldOptions(fields))
+        self.end_episode()  # also if the next one cannot be opened
+        self.episode_scenario = scenario
+        needs = self._driver.requirements(scenario.interface)
+        world_options = WorldOptions(needs.measured_fields, accepts_floats=not needs.needs_arrays)
+        opening = open_world(self._opened, scenario, numbers, world_options)
         self._world = world = self._world_context.enter_context(opening)
         self._drive_loop = DriveLoop(world, self._driver)
         self._control_steps = iter(self._drive_loop)
         self._wait_for_cav()
         if not world.cav_ids:
-            steps = self.scenario.horizon
-            allowed = "allowed: a longer horizon, or more CAVs"
+            steps, allowed = scenario.horizon, "allowed: a longer horizon, or more CAVs"
             raise EpisodeError(f"reset: no CAV enters the road within the horizon, {steps} control steps; {allowed}")
         return self._observe()
 
@@ -168,28 +219,23 @@ class RoadStepper:
         Without CAVs on the road, the simulation continues until the next one enters.
         """
         world, before, last_observations = self.world, list(self.world.cav_ids), self._observations
-        self._driver.actions = np.asarray(actions, np.float64)
+        self._driver.actions = float(actions[0]) if world.is_scalar else np.asarray(actions, np.float64)
         if next(self._control_steps, None) is None:
             raise UnjamError("step: the episode is over; allowed: reset")
-        remaining = list(range(len(before)) if world.remaining_rows is None else world.remaining_rows)
-        state = world.exact_state()
-        outcome = Outcome(
-            np.array(world.speeds)[None],
-            world.last_applied_acceleration()[remaining][None],
-            time_gap(state.leader_gap, state.speed)[: len(remaining)][None],
-            np.array([world.has_crashed]),
-            np.array([float(world.backlog)]),
-            state.speed[: len(remaining)][None],
-        )
-        step = slice(world.control_steps - 1, world.control_steps)
-        if world.control_steps == 1:  # a constant of one number would be right for one step only
-            validate_reward_terms(self._reward, Outcome(*(np.repeat(values, 2, axis=0) for values in outcome)))
-        terms = {
-            name: float(value) for name, (value,) in validate_reward_terms(self._reward, outcome, step.start).items()
-        }
-        departed = {name: last_observations[row] for row, name in enumerate(before) if row not in remaining}
+        rows, state, accelerations = world.remaining_rows, world.exact_state(), world.last_applied_acceleration()
+        departed = {}
+        if rows is not None:
+            accelerations = accelerations[list(rows)]
+            departed = {name: last_observations[row] for row, name in enumerate(before) if row not in rows}
+        time_gaps, speed = time_gap(state.leader_gap, state.speed), state.speed
+        if not world.is_scalar:
+            time_gaps, speed = time_gaps[: len(accelerations)], speed[: len(accelerations)]
+        ends = bool(world.has_crashed), float(world.backlog)
+        outcome = Outcome(np.array(world.speeds), accelerations, time_gaps, *ends, speed)
+        terms = step_reward_terms(self._reward, outcome, world.control_steps - 1, self._reward_needs_rows)
         terminated = world.has_crashed
-        self._wait_for_cav()  # a crash of human drivers in the meantime ends the episode, but no CAV has caused it
+        if not world.cav_ids:
+            self._wait_for_cav()  # a crash of human drivers in the meantime ends the episode, but no CAV has caused it
         truncated = not terminated and (world.has_ended or not world.cav_ids)
         observations, reward = self._observe(), sum(terms.values())
         return RoadStepResult(list(world.cav_ids), observations, departed, reward, terms, terminated, truncated)
@@ -200,6 +246,15 @@ class RoadStepper:
         while world.expects_cavs and not (world.cav_ids or world.has_ended):
             next(self._control_steps)
 
+    def copy_driver(self) -> ExternalDriver:
+        """Return a driver with the same expert and features, for other CAVs."""
+        return copy(self._driver)
+
+    @property
+    def reward(self) -> Reward:
+        """The reward of control steps."""
+        return self._reward
+
     @property
     def world(self) -> RoadWorld:
         """The world of the running episode; raise `UnjamError` if there is none."""
@@ -208,20 +263,28 @@ class RoadStepper:
         return self._world
 
     def _observe(self) -> Observations:
-        with naming_cav(self.world):
-            observations = self._driver.observation(self.world.local_state(), self._drive_loop.memory)
-        self._observations = observations.clip(-MAX_OBSERVATION, MAX_OBSERVATION).astype(np.float32)
+        found = self._drive_loop.observe()
+        low, high = -MAX_OBSERVATION, MAX_OBSERVATION
+        if self.world.is_scalar:  # a call of NumPy would take longer than those for the floats
+            self._observations = np.array([[clip(value, low, high) for value in found]], np.float32)
+        else:
+            self._observations = clip(found, low, high).astype(np.float32)
         return self._observations
+
+    def end_episode(self) -> None:
+        """End the running episode, if any."""
+        self._world = None
+        self._world_context.close()
 
     def close(self) -> None:
         """Close the backend; may be called twice."""
-        self._world = self._opened = None
-        self._world_context.close()
+        self.end_episode()
+        self._opened = None
         self._backend_context.close()
 
 
 class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
-    """One CAV among human drivers, in SUMO.
+    """One CAV among human drivers, in SUMO or another backend.
 
     ``gymnasium.make("unjam/Ring-v0")``, ``"unjam/FigureEight-v0"``, ``"unjam/Merge-v0"``, ``"unjam/OnRamp-v0"``,
     ``"unjam/Recorded-v0"``, with any parameter of the scenario:
@@ -233,7 +296,11 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     Action       ``Box(-limit, limit, (1,), float32)``: acceleration [m/s2], limit 1 by default; with ``expert``, the
                  addition to its acceleration
     Observation  ``Box(-50, 50, (5,), float32)``: own speed / 10 m/s; leader speed - own speed / 5 m/s; leader gap /
-                 20 m; follower speed - own speed / 5 m/s; follower gap / 20 m; more with ``features``
+                 20 m; follower speed - own speed / 5 m/s; follower gap / 20 m. ``features`` selects others:
+                 ``local`` (these five), ``expert_acceleration``, ``expert_memory``, ``penetration_rate``; on closed
+                 roads ``loop_length``, ``lap_position``; on roads that provide them ``route_position``,
+                 ``allowed_speed``, ``distance_to_merge``, ``merge_proximity``, ``lane_speeds``, ``road_speeds``,
+                 ``adjacent_lanes``; a `PolicyInput`, ``path.py:name``, or a function of a `LocalState`
     Reward       that of the scenario, or ``reward``; its terms are in ``info["reward_terms"]``
     Start        ``reset(seed=s)`` starts the same episode as ``unjam drive --seed s``, with its warm-up; on open roads
                  it returns when the CAV has entered, and ``info["control_steps"]`` of the horizon have passed
@@ -244,7 +311,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
     libsumo can run one simulation per process: if other code or another environment uses it, SUMO runs in a separate
     process, several times slower, with a warning. A second thread waits until the first has returned.
-    For parallel environments use ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
+    Many environments at once, without SUMO: `RoadVectorEnv`; in SUMO:
+    ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -283,13 +351,12 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
             raise unknown_name("render_mode", render_mode, ("human", "rgb_array"))
         if render_mode == "human" and not has_display():
             raise MissingPartError("render_mode: 'human' needs a display; without one: 'rgb_array'")
-        self.render_mode = render_mode
+        self.render_mode, self._spec = render_mode, None
         if render_mode == "human" and backend != "sumo":
             raise invalid_value("render_mode", render_mode, "rgb_array, except with backend='sumo'")
         backend = "sumo-gui" if render_mode == "human" else backend
         self._road = RoadStepper(scenario, changes, reward, expert, features, backend)
-        if getattr(self._road.scenario, "cavs", None) != 1:
-            raise InputError("cavs: several are not allowed here; allowed: 1; use unjam.parallel_env")
+        check_single_cav(self._road.scenario)
         self.observation_space = self._road.observation_space
         self.action_space = self._road.action_space
 
@@ -297,9 +364,13 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode: that of `seed`; without one, the next after that of the last seed."""
+        """Start an episode: that of `seed`; without one, the next after that of the last seed.
+
+        `options` are changes to the parameters of the scenario, as `changes` of the constructor, for this episode only:
+        `reset(options={"length": 230})`. The number of CAVs and the action limit stay.
+        """
         super().reset(seed=seed)
-        observations = self._road.reset(seed, self.np_random)
+        observations = self._road.reset(seed, self.np_random, options)
         world = self._road.world
         return observations[0], {"drawn_values": dict(world.road.drawn_values), "control_steps": world.control_steps}
 
@@ -311,6 +382,20 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         truncated = result.truncated or (bool(result.departed) and not result.terminated)
         return observation, result.reward, result.terminated, truncated, {"reward_terms": result.reward_terms}
 
+    @property
+    def spec(self) -> EnvSpec | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The specification of `gymnasium.make`, whose `max_episode_steps` is the horizon of the constructor.
+
+        It is not registered: the `TimeLimit` that Gymnasium then adds would end episodes with a longer horizon early.
+        """
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec
+        if spec is not None and spec.max_episode_steps is None:
+            spec.max_episode_steps = self._road.scenario.horizon
+
     @synchronized
     def render(self) -> Any:
         """Return an image of the current state, shape (640, 640, 3); None for SUMO's own window."""
@@ -320,7 +405,9 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
         world = self._road.world
         limit = world.road.limit_speed
-        max_speed = 2.0 * limit if np.isfinite(limit) else self._road.scenario.top_speed  # unknown on user networks
+        max_speed = (
+            2.0 * limit if np.isfinite(limit) else self._road.episode_scenario.top_speed
+        )  # unknown on user networks
         return np.asarray(draw_road(world.scene(), max_speed, f"mean {np.mean(world.speeds):.1f} m/s"))
 
     @synchronized

@@ -11,10 +11,14 @@ from pettingzoo import ParallelEnv
 from unjam.drivers.observation import FeatureLike
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.gymnasium_env import RoadStepper, as_action
+from unjam.environments.slots import SlottedRoadEnv
 from unjam.environments.threads import synchronized
 from unjam.errors import InputError
 from unjam.worlds.backend import BackendLike
 from unjam.worlds.reward import RewardLike
+
+API_TEST_OPTIONS = {"options": 1}
+"""options without a meaning, with which `parallel_api_test` of PettingZoo calls `reset`"""
 
 
 class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
@@ -60,8 +64,16 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start the episode of `seed`; without a seed, the next episode of the last seed."""
-        observations = self._road.reset(seed, np.random.default_rng())
+        """Start the episode of `seed`; without a seed, the next episode of the last seed.
+
+        `options` are as in `RoadEnv.reset`. Raise `InputError` if the road can then have other CAVs.
+        """
+        options = None if options == API_TEST_OPTIONS else options
+        observations = self._road.reset(seed, np.random.default_rng(), options)
+        if options and (others := {*self._road.episode_scenario.possible_cav_ids()}.difference(self.possible_agents)):
+            self._road.end_episode()
+            allowed = "as many CAVs as in the constructor, or fewer"
+            raise InputError(f"reset: options: {len(others)} more CAVs are not allowed; allowed: {allowed}")
         self._agent_by_vehicle.clear()
         self._departed_agents.clear()
         self.agents = self._assign_agents(self._road.world.cav_ids)
@@ -114,6 +126,12 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
         self._road.close()
 
 
-def parallel_env(scenario: str = "ring", **arguments: Any) -> ParallelRoadEnv:
-    """Return the PettingZoo environment of a scenario; the arguments are those of `RoadEnv`."""
-    return ParallelRoadEnv(scenario, **arguments)
+def parallel_env(
+    scenario: str = "ring", slots: int | None = None, **arguments: Any
+) -> ParallelRoadEnv | SlottedRoadEnv:
+    """Return the PettingZoo environment of a scenario; the arguments are those of `RoadEnv`.
+
+    With `slots`, CAVs that come and go are mapped to so many agents that stay for the whole episode: `SlottedRoadEnv`.
+    """
+    environment = ParallelRoadEnv(scenario, **arguments)
+    return environment if slots is None else SlottedRoadEnv(environment, slots)

@@ -15,13 +15,7 @@ class CopyableLock:
 
     def __init__(self) -> None:
         """Create it unlocked."""
-        self._lock = RLock()
-
-    def __enter__(self) -> None:
-        self._lock.acquire()
-
-    def __exit__(self, *error: object) -> None:
-        self._lock.release()
+        self.held = RLock()
 
     def __reduce__(self) -> tuple[type[Self], tuple[()]]:
         return type(self), ()
@@ -32,7 +26,7 @@ def synchronized(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate
 
     @wraps(method)
     def call(self: S, /, *arguments: P.args, **keywords: P.kwargs) -> T:
-        with self._road.lock:  # pyright: ignore[reportAttributeAccessIssue]
+        with self._road.lock.held:  # pyright: ignore[reportAttributeAccessIssue]
             return method(self, *arguments, **keywords)
 
     return call

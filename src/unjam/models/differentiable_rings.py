@@ -31,6 +31,8 @@ class DifferentiableRings(RingBatch):
 
     The episodes are those of `run_episode` with the same seeds, except for rounding. `local_state()` returns what the
     CAVs observe: tensors of shape (CAVs * W,), with the first CAV of each ring, then the second one, and so on.
+    `speeds` [m/s] has the shape (vehicles, W); `crashed_roads` and `has_ended` say which rings had a collision, and whether
+    the episode is over.
     """
 
     reward_terms: Mapping[str, Tensor] = MappingProxyType({})
@@ -80,11 +82,6 @@ class DifferentiableRings(RingBatch):
             self._history = self.start(is_controlled=True)
 
     @property
-    def speeds(self) -> Tensor:
-        """Speeds of all vehicles in their order along the road [m/s], shape (vehicles, W)."""
-        return self._speed[:-1]
-
-    @property
     def positions(self) -> Tensor:
         """Front bumpers of all vehicles along the road [m], not wrapped, shape (vehicles, W)."""
         return self._position
@@ -121,8 +118,8 @@ class DifferentiableRings(RingBatch):
         """
         was_running = self._is_running
         self.advance(Command(acceleration))
-        state = self.exact_state()
-        by_cav = self.limits.clip(acceleration), time_gap(state.leader_gap, state.speed), state.speed
+        speed, _, gap = self.following_state()
+        by_cav = self.last_applied_acceleration(), time_gap(gap, speed), speed
         accelerations, gaps, speeds = (values.reshape(self._shape).T for values in by_cav)
         outcome = Outcome(self.speeds.T, accelerations, gaps, self.crashed_roads, 0.0 * was_running, speeds)
         self.reward_terms = {name: values * was_running for name, values in self._reward(outcome).items()}

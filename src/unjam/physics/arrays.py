@@ -78,9 +78,31 @@ def square_root(array: Array) -> Array:
     return array.rsqrt().reciprocal()
 
 
-def as_indices(array: Array) -> Array:
-    """Return whole numbers as integers, without a gradient."""
-    return array.astype(np.int64) if isinstance(array, np.ndarray) else array.long()
+def as_indices(values: Array) -> Array:
+    """Return whole numbers as indices of arrays, through which no gradient flows."""
+    return values.astype(np.int64) if isinstance(values, np.ndarray) else values.detach().long()
+
+
+def replace_entries(values: Array, index: Any, source: Array, source_index: Any) -> Array:
+    """Return a copy of an array with `source[source_index]` in place of the entries `values[index]`."""
+    copy = values.copy() if isinstance(values, np.ndarray) else values.clone()
+    copy[index] = source[source_index]
+    return copy
+
+
+def replace_columns(values: Any, columns: Any, source: Any, source_columns: Any) -> Any:
+    """Return an array with columns of `source` in place of some of its own, along the last axis.
+
+    In tuples and lists of arrays, too; what is no array stays as it is.
+    """
+    if isinstance(values, tuple | list):
+        parts = [
+            replace_columns(own, columns, other, source_columns) for own, other in zip(values, source, strict=True)
+        ]
+        return type(values)(*parts) if hasattr(values, "_fields") else type(values)(parts)
+    if not hasattr(values, "shape"):
+        return values
+    return replace_entries(values, np.s_[..., columns], source, np.s_[..., source_columns])
 
 
 def as_column(array: Array) -> Array:

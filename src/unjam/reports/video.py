@@ -76,7 +76,7 @@ def draw_road(scene: RoadScene, max_speed: float, caption: str) -> Image.Image:
         align="center" if is_centered else "left",
         spacing=12,
     )
-    return image.resize((FRAME_SIZE, FRAME_SIZE), Image.Resampling.LANCZOS)
+    return image.reduce(OVERSAMPLING)
 
 
 def split_lines(lines: np.ndarray) -> list[np.ndarray]:

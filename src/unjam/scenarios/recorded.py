@@ -7,7 +7,7 @@ ICRA; the drives on I-24 of that experiment are the usual recordings.
 import re
 from dataclasses import field, replace
 from functools import cached_property
-from math import ceil
+from math import ceil, floor
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
@@ -105,6 +105,21 @@ class Recorded(Scenario):
     def cavs(self) -> int:
         """Number of CAVs."""
         return self.vehicle_kinds.count("cav")
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Control steps of the longest recording after its begin, or of the window, within the horizon."""
+        seconds = self.window or self._longest_recording - self.begin
+        return min(self.horizon, max(1, floor(seconds / self.control_step + 1e-9)))
+
+    @cached_property
+    def _longest_recording(self) -> float:
+        """Duration of the longest recording [s]."""
+        if not self.recordings:
+            return ARTIFICIAL_SECONDS
+        from unjam.recordings.leader_files import read_leaders
+
+        return max(each.seconds for path in recording_files(Path(self.recordings)) for each in read_leaders(path))
 
     @property
     def acceleration_limits(self) -> Limits:

@@ -2,19 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from unjam.parameters import STRICT, NumberOrRange, PositiveInt, parameter_dataclass
+from unjam.parameters import STRICT, NumberOrRange, PositiveInt, is_packaged, parameter_dataclass
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.road import ClosedRoad, Edge, Entry, Node, RoadNetwork, Route, as_polyline
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
 RING_EDGES = 4
 """number of edges of a ring"""
+MAX_CACHED_ROADS = 256
+"""roads that are kept for later episodes: as many sizes as the default ranges have, and more"""
 
 
 class EdgeSpan(NamedTuple):
@@ -73,7 +76,8 @@ class LoopScenario(Scenario):
 
     def draw(self, generator: np.random.Generator) -> ClosedRoad:
         """Return a road of random size with its vehicles."""
-        road = self.build(float(generator.integers(*self._size_range, endpoint=True)))
+        size = float(generator.integers(*self._size_range, endpoint=True))
+        road = _packaged_road(self, size) if is_packaged(type(self)) else self.build(size)
         return replace(road, human_parameters=self.draw_humans(road.vehicle_ids, generator))
 
     def _closed_road(
@@ -142,6 +146,12 @@ class LoopScenario(Scenario):
         cavs = {round(index * self.vehicles / self.cavs) for index in range(self.cavs)}
         ids = [f"{'cav' if index in cavs else 'human'}_{index}" for index in range(self.vehicles)]
         return tuple(reversed(ids) if self.is_first_leading else ids)
+
+
+@lru_cache(maxsize=MAX_CACHED_ROADS)
+def _packaged_road(scenario: LoopScenario, size: float) -> ClosedRoad:
+    """Return `scenario.build(size)`, once for the many episodes of the same size."""
+    return scenario.build(size)
 
 
 @parameter_dataclass(frozen=True, config=STRICT)

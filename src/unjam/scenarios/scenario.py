@@ -256,6 +256,11 @@ class Scenario(Subclassable):
         return self.simulation_step * (self.warmup + self.horizon * self.steps_per_control_step)
 
     @property
+    def max_episode_steps(self) -> int:
+        """Most control steps of an episode; fewer than the horizon if the road ends it earlier."""
+        return self.horizon
+
+    @property
     def acceleration_limits(self) -> Limits:
         """Accelerations that a CAV can command."""
         return Limits.symmetric(self.action_limit)

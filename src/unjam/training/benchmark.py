@@ -8,19 +8,24 @@ import itertools
 import os
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from statistics import median
 from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import torch
 
+from unjam.drivers.command import Command
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
+from unjam.environments.gymnasium_env import RoadEnv
+from unjam.environments.vector_env import RoadVectorEnv
 from unjam.learners.settings import PolicySettings
 from unjam.manifest import manifest
 from unjam.models.ensemble import torch_generator
@@ -53,6 +58,8 @@ BATCH_VEHICLES = 90_112
 """vehicles of a batch: 4,096 rings of 22"""
 BENCHMARK_SCENARIOS = ("ring", "figure-eight", "merge")
 """scenarios that are compared with plain SUMO"""
+VECTOR_ENVIRONMENTS = ((1024, False), (4096, False), (1024, True))
+"""numbers of rings in vector environments, and whether they equal SUMO exactly"""
 STEPS_PER_ROUND = 100
 METERS_PER_VEHICLE = 245 / 22
 VEHICLES_PER_RING = 22
@@ -63,6 +70,8 @@ BENCHMARK_MODEL = ModelSettings(hidden=(32, 32))
 """the networks of human drivers"""
 SUMO_PART, EPISODE_PART = "SUMO alone", "run_episode"
 """what other parts are related to, after the name of a scenario"""
+ENVIRONMENT_PART = "ring: env.step"
+"""part of the Gymnasium environment in SUMO, to which vector environments are related"""
 
 
 class Part(NamedTuple):
@@ -80,7 +89,7 @@ def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: N
 
     Episodes have the default residual driver of training, which has an action repeat of one second, and are loaded,
     filtered, audited and recorded. Batches of rings are in single precision, with fast noise; model rollouts use the
-    default ensemble.
+    default ensemble. Environments have no policy: their actions are zeros.
     """
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
     if cores is not None:
@@ -89,12 +98,15 @@ def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: N
         torch.set_num_threads(1)
         driver = make_benchmark_driver(SCENARIOS["ring"].control_step)
         batches = {vehicles: start_batch(BATCH_VEHICLES // vehicles, vehicles, driver) for vehicles in RING_SIZES}
+        vectors = list(itertools.starmap(VectorBenchmark, VECTOR_ENVIRONMENTS))
         with Simulation() as simulation:  # writes network files and fills caches
             episode, *_ = [_run_episode(SCENARIOS[name], 0, simulation) for name in BENCHMARK_SCENARIOS]
         rates: defaultdict[Part, list[float]] = defaultdict(list)
         for number in range(1, rounds + 1):
             on_message(f"round {number} of {rounds}")
-            for part, rate in _measure_round(number, driver, episode, batches):
+            for part, rate in itertools.chain(
+                _measure_round(number, driver, episode, batches), _measure_environments(number, vectors)
+            ):
                 rates[part].append(rate)
     finally:
         if cores is not None:
@@ -123,6 +135,7 @@ def _measure_round(
             yield Part(f"{name}: {EPISODE_PART}", sumo_part), _episode_rate(scenario, number, simulation)
         yield Part(f"{own}, network in every step", sumo), _episode_rate(ring, number, simulation, 0.0)
         yield Part(f"{own} without safety filter", own), _episode_rate(unfiltered, number, simulation)
+        yield Part("ring: env.step", sumo), _environment_rate(ring, number, simulation)
         yield Part("ring: audit of an episode", own), steps_per_second(partial(_repeat_audit, episode), ring.horizon)
         for rows, steps in ROLLOUT_SIZES:
             name = f"learned model: {rows:,} rollouts of {steps} control steps"
@@ -141,6 +154,43 @@ def _measure_round(
         yield Part("driving loop over TraCI", f"driving loop, ring of {smallest} vehicles"), rate
 
 
+class VectorBenchmark:
+    """A vector environment of rings, and the same batch alone with constant commands."""
+
+    def __init__(self, rings: int, is_exact: bool) -> None:
+        """Start both; no episode ends."""
+        self.rings, self.is_exact = rings, is_exact
+        self.name = f"vector environment of {rings:,} rings{', exact' * is_exact}"
+        self._environment = RoadVectorEnv(rings, exact=is_exact, horizon=MAX_HORIZON)
+        self._environment.reset(seed=0)
+        self._batch = self._environment.make_batch(range(rings))
+        self._batch.start(True)
+
+    def measure(self) -> Iterator[tuple[Part, float]]:
+        """Yield the speeds in rings times steps per second."""
+        actions, command = np.zeros((self.rings, 1), np.float32), Command(np.zeros(self.rings, np.float32))
+        bare = f"{self.name}: batch alone"
+        yield Part(bare), self._rate(lambda: self._batch.advance(command))
+        yield Part(self.name, bare), (rate := self._rate(lambda: self._environment.step(actions)))
+        yield Part(f"{self.name}, compared with SUMO", ENVIRONMENT_PART), rate
+
+    def _rate(self, step: Callable[[], object]) -> float:
+        return steps_per_second(
+            lambda: deque((step() for _ in range(STEPS_PER_ROUND)), 0), self.rings * STEPS_PER_ROUND
+        )
+
+
+def _measure_environments(number: int, vectors: Sequence[VectorBenchmark]) -> Iterator[tuple[Part, float]]:
+    """Yield the speeds of environments without a policy."""
+    with closing(RoadEnv()) as environment:
+        environment.reset(seed=number)
+        action, steps = np.zeros(1, np.float32), SCENARIOS["ring"].horizon
+        rate = steps_per_second(lambda: deque((environment.step(action) for _ in range(steps)), 0), steps)
+        yield Part(ENVIRONMENT_PART, f"ring: {SUMO_PART}"), rate
+    for vector in vectors:
+        yield from vector.measure()
+
+
 def _run_episode(scenario: Scenario, seed: int, simulation: Simulation, action_duration: float = 1.0) -> Episode:
     driver = make_benchmark_driver(scenario.control_step, action_duration)
     return run_episode(scenario, driver, (seed,), explore=True, backend=SumoBackend(simulation))
@@ -155,6 +205,14 @@ def _loop_rate(scenario: Scenario, driver: ResidualDriver, simulation: Simulatio
     options = WorldOptions(accepts_floats=not driver.requirements().needs_arrays)
     traffic = make_traffic(scenario, (1,), simulation, options)
     return steps_per_second(lambda: deque(DriveLoop(traffic, driver, explore=True), maxlen=0), scenario.horizon)
+
+
+def _environment_rate(scenario: Scenario, seed: int, simulation: Simulation) -> float:
+    """Return control steps per second of the Gymnasium environment with random actions; the reset is not timed."""
+    environment = gymnasium.make("unjam/Ring-v0", backend=SumoBackend(simulation))
+    environment.reset(seed=seed)
+    actions = np.random.default_rng(seed).uniform(-1.0, 1.0, (scenario.horizon, 1)).astype(np.float32)
+    return steps_per_second(lambda: deque(map(environment.step, actions), maxlen=0), len(actions))
 
 
 def _rollout_rate(episode: Episode, scenario: Scenario, driver: ResidualDriver, rows: int, steps: int) -> float:

@@ -240,7 +240,7 @@ def planned_steps(config: RunConfig) -> int:
     """Return the environment steps of a new training: whole iterations, unless episodes end early."""
     tasks = config.make_tasks()
     counts = count_episodes(tasks, config.learner.steps_per_iteration, weight_shares(tasks))
-    steps = sum(count * task.scenario.horizon for count, task in zip(counts, tasks, strict=True))
+    steps = sum(count * task.scenario.max_episode_steps for count, task in zip(counts, tasks, strict=True))
     return ceil(config.steps / steps) * steps
 
 

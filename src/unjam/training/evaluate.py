@@ -108,14 +108,10 @@ class DriveResult(Evaluation):
 
     def _repr_html_(self) -> str:
         """Return every metric with its CI, and the trajectories of all vehicles, for notebooks."""
-        import pandas as pd
-
         from unjam.reports.figures import data_uri
         from unjam.reports.space_time import space_time_figure
 
-        headings, rows = metric_table(self.rows, choose_baseline(self.rows))
-        cells = [[f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)] for row in rows]
-        table = pd.DataFrame(cells, columns=["", *headings]).to_html(index=False, border=0)
+        table = metric_frame(self.rows).to_html(index=False, border=0)
         if not self.plot_episodes:
             return table
         episodes = [to_plot_episode(label, each) for label, each in self.plot_episodes.items()]
@@ -123,7 +119,7 @@ class DriveResult(Evaluation):
         return f'{table}<img {attributes} src="{data_uri(space_time_figure(episodes))}">'
 
     def document(self) -> dict[str, Any]:
-        """Return the result as `unjam drive --json` prints it; with several drivers, a list of documents."""
+        """Return the result as `unjam drive --json` prints it, with a document for each driver, also for one."""
         verdicts, effects = feasibility_by_driver(self.rows), effects_by_driver(self.rows)
         baseline, documents = choose_baseline(self.rows), list[dict[str, Any]]()
         for driver, rows in self.rows.items():
@@ -151,7 +147,16 @@ class DriveResult(Evaluation):
                     "difference_to_baseline": differences,
                 }
             )
-        return documents[0] if len(documents) == 1 else {"scenario": self.scenario, "drivers": documents}
+        return {"scenario": self.scenario, "drivers": documents}
+
+
+def metric_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":
+    """Return the table of all metrics as texts: a row per metric, a column per driver and per difference."""
+    import pandas as pd
+
+    headings, rows = metric_table(rows_by_driver, choose_baseline(rows_by_driver))
+    cells = [[f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)] for row in rows]
+    return pd.DataFrame(cells, columns=["", *headings])
 
 
 def rows_to_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":
@@ -266,7 +271,9 @@ def drivers_to_compare(config: RunConfig, folder: Path) -> dict[str, Driver]:
 
 def evaluation_steps(config: RunConfig, folder: Path) -> int:
     """Return the largest number of control steps of `evaluate_run`."""
-    return len(drivers_to_compare(config, folder)) * config.evaluation.episodes * config.make_scenario().horizon
+    return (
+        len(drivers_to_compare(config, folder)) * config.evaluation.episodes * config.make_scenario().max_episode_steps
+    )
 
 
 def evaluate_run(

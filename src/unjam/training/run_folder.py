@@ -135,12 +135,30 @@ def lock_new_folder(folder: Path, resumable_file: str = "") -> Iterator[None]:
             make_new_folder(folder)
 
     check()
+    with removing_if_empty(folder), lock_folder(folder):
+        check()  # another process may have written to it in the meantime
+        yield
+
+
+@contextmanager
+def removing_if_empty(folder: Path) -> Iterator[None]:
+    """Remove a folder if it is empty after the block."""
     try:
-        with lock_folder(folder):
-            check()  # another process may have written to it in the meantime
-            yield
+        yield
     finally:
         remove_if_empty(folder)
+
+
+@contextmanager
+def discarding_refused(folder: Path) -> Iterator[None]:
+    """Empty the locked folder of a run if the block raises `InputError` before the first iteration is complete."""
+    try:
+        yield
+    except InputError:
+        if not read_progress(folder):
+            for path in [each for each in folder.iterdir() if each.name != LOCK_FILE]:
+                remove(path)
+        raise
 
 
 def create_run_folder(folder: Path, config: RunConfig) -> None:

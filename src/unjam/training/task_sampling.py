@@ -76,7 +76,7 @@ def regret_shares(shares: Sequence[float], best_returns: Sequence[float], return
 def count_episodes(tasks: Sequence[Task], steps: int, shares: Sequence[float]) -> list[int]:
     """Return the number of episodes of each task in an iteration of so many environment steps, at least one."""
     pairs = zip(tasks, shares, strict=True)
-    return [max(1, ceil(round(share * steps / task.scenario.horizon, 9))) for task, share in pairs]
+    return [max(1, ceil(round(share * steps / task.scenario.max_episode_steps, 9))) for task, share in pairs]
 
 
 def make_episodes(

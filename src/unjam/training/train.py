@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -32,13 +32,20 @@ from unjam.learners.algorithm import (
 from unjam.learners.algorithm_1 import make_algorithm
 from unjam.learners.model_rollouts import full_policy
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import Estimate
+from unjam.measures.statistics import Estimate, format_ci
 from unjam.processes import lock_folder
 from unjam.reports.html import write_report_page
 from unjam.reports.results import read_progress
 from unjam.training import run_folder
 from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
-from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert, raise_failure
+from unjam.training.evaluate import (
+    EvaluationProgress,
+    RowsByDriver,
+    evaluate_run,
+    gain_over_expert,
+    metric_frame,
+    raise_failure,
+)
 from unjam.training.executors import IterationCallback, train_in_subprocess
 from unjam.training.export import ControllerStore
 from unjam.training.fingerprint import check_file_hashes, code_hashes, fingerprint
@@ -74,6 +81,18 @@ class TrainResult:
     """paired difference of return between the trained controller and its expert; None without an expert"""
     tasks: dict[str, "TrainResult"] = field(default_factory=dict)
     """results by task, each in its own folder; empty for a single road"""
+
+    def __str__(self) -> str:
+        """Return the metrics of all drivers as a table, by task, and the files."""
+        if self.tasks:
+            return "\n\n".join(f"{name}: {result}" for name, result in self.tasks.items())
+        table = metric_frame(self.rows).iloc[:, : 1 + len(self.rows)]  # the differences would make it too wide
+        lines = [f"training run {self.folder}", table.to_string(index=False)]
+        if self.gain:
+            lines.append(
+                f"return compared with the expert: {self.gain.mean:+.1f} {format_ci(self.gain, '.1f')}".strip()
+            )
+        return "\n".join([*lines, f"controller: {self.controller}"])
 
     @property
     def controller(self) -> Path:
@@ -163,9 +182,10 @@ def train_in_process(
         run_folder.read_config(folder)
     else:
         run_folder.make_new_folder(folder, f", or --resume {folder}")
-    with expecting_code(), lock_folder(folder):
+    with run_folder.removing_if_empty(folder), expecting_code(), lock_folder(folder):
         (run_folder.resume_run_folder if resume else run_folder.create_run_folder)(folder, config)
-        with ExitStack() as locks, WorkerPool(config.workers) as workers:
+        refusals = nullcontext() if resume else run_folder.discarding_refused(folder)
+        with refusals, ExitStack() as locks, WorkerPool(config.workers) as workers:
             for task_folder in [folder / name for name in config.task_configs() if name]:
                 make_folder(task_folder)
                 locks.enter_context(lock_folder(task_folder))

@@ -116,7 +116,7 @@ def tune(
             raise unknown_name("vary", key, known)
     is_single = len(roads) == 1
     episodes = TUNING_EPISODES if is_single else TUNING_EPISODES_PER_ROAD
-    trial_steps = episodes * sum(scenario.horizon for scenario in roads.values())
+    trial_steps = episodes * sum(scenario.max_episode_steps for scenario in roads.values())
     # On several roads the human baseline runs as often as a trial and a finalist.
     final_steps = (TUNING_FINALISTS + 1) * 2 * trial_steps + (0 if is_single else 3 * trial_steps)
     trial_count = (steps - final_steps) // trial_steps
@@ -185,7 +185,7 @@ def tune(
     if best is None or best.score is None:
         raise UnjamError(f"all {trial_count} settings of {expert} are infeasible: {default.verdict}")
     trial_runs = len({trial.driver for trial in trials if not invalid_reason(trial.driver)})
-    batch_steps = trial_runs * episodes * sum(roads[road].horizon for road in screened)
+    batch_steps = trial_runs * episodes * sum(roads[road].max_episode_steps for road in screened)
     unused_steps = (TUNING_FINALISTS - len(best_values)) * 2 * trial_steps
     sumo_steps = trial_runs * trial_steps + final_steps - unused_steps - batch_steps
     result = TuningResult(best, default, trials, sumo_steps, batch_steps, folder / f"{expert}{SUFFIX}")

@@ -1,7 +1,6 @@
 """The loop in which a driver drives the CAVs of a world."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -51,7 +50,7 @@ class DriveLoop:
         """Yield each decision after it was carried out; None where the simulator itself drives."""
         world, driver, noise, steps = self.world, self.driver, self._draw_noise, 0
         local_state, decide, advance = world.local_state, driver.decide, world.advance
-        with naming_cav(world):
+        try:
             while not world.has_ended:
                 if driver.is_native:
                     decision = None
@@ -66,6 +65,15 @@ class DriveLoop:
                 if self._on_progress is not None and steps % PROGRESS_CONTROL_STEPS == 0:
                     self._on_progress(steps)
                 yield decision
+        except RowError as error:
+            raise _naming_cav(error, world) from None
+
+    def observe(self) -> Any:
+        """Return the driver's current network input, as `Driver.observation`."""
+        try:
+            return self.driver.observation(self.world.local_state(), self.memory)
+        except RowError as error:
+            raise _naming_cav(error, self.world) from None
 
     def _update_memory(self) -> None:
         """Give each CAV on the road a row of memory, new CAVs at the end."""
@@ -84,15 +92,11 @@ class DriveLoop:
             self.initial_memories.append(map_leaves(lambda values: np.array(values[row], np.float64), self.memory))  # noqa: B023
 
 
-@contextmanager
-def naming_cav(world: Any) -> Iterator[None]:
-    """Add the CAV and the step to the message of a `RowError` in the block, if the world has names of CAVs."""
-    try:
-        yield
-    except RowError as error:
-        if not hasattr(world, "cav_ids"):
-            raise
-        raise InputError(f"{error} ({world.cav_ids[error.row]}, step {world.control_steps})") from None
+def _naming_cav(error: RowError, world: Any) -> InputError:
+    """Return an error that also names the CAV and the step, if the world has names of CAVs."""
+    if not hasattr(world, "cav_ids"):
+        return error
+    return InputError(f"{error} ({world.cav_ids[error.row]}, step {world.control_steps})")
 
 
 def drive_world(
@@ -110,8 +114,7 @@ def finish_drive(drive_loop: DriveLoop) -> Any:
     """Drive to the end of a loop that has just been created, and return the world's record."""
     world, driver = drive_loop.world, drive_loop.driver
     decisions = [decision[1:4] for decision in drive_loop if decision is not None and decision.observation is not None]
-    with naming_cav(world):
-        last = driver.observation(world.local_state(), drive_loop.memory)
+    last = drive_loop.observe()
     if last is None:
         return world.record(DriverLog())
     memories = [each[EXPERT_KEY] for each in drive_loop.initial_memories]

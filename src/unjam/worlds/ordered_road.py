@@ -243,7 +243,8 @@ class OrderedRoadRecorder:
         """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2], shape (CAVs,)."""
         scenario, road, _ = self._arguments
         count = len(road.cav_ids) * scenario.steps_per_control_step
-        return np.array(self.series["safe_accelerations"][-count:]).reshape(-1, len(road.cav_ids)).mean(0)
+        rows = np.array(self.series["safe_accelerations"][-count:]).reshape(-1, len(road.cav_ids))
+        return rows[0] if len(rows) == 1 else rows.mean(0)
 
 
 def ordered_scene(road: OrderedRoad, positions: Floats, speeds: Any) -> RoadScene:

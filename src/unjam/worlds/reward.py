@@ -1,6 +1,7 @@
 """Rewards as sums of named terms, used both in the environment and in the learned model."""
 
 from collections.abc import Callable, Sequence
+from math import isfinite, isnan
 from sys import float_info
 from typing import Any, NamedTuple
 
@@ -40,7 +41,11 @@ MAX_REWARD_CELLS = 4_000_000
 
 
 class Outcome(NamedTuple):
-    """The outcome of control steps, one per row. NumPy arrays or torch tensors, SI units."""
+    """The outcome of control steps, one per row. NumPy arrays or torch tensors, SI units.
+
+    The rewards of the package also take the outcome of one control step without the axis of rows, with a bool and a
+    float where there is one value; the values of a single CAV may then be floats, too.
+    """
 
     speeds: Array
     """speeds of all (in a model: modeled) vehicles after the step [m/s], shape (rows, vehicles); NaN if absent"""
@@ -63,12 +68,19 @@ RewardLike = str | Callable[[Outcome], Any]
 
 def _nan_mean(values: Array) -> Array:
     """Mean over the last axis without NaN; 0 if all are NaN."""
+    if type(values) is float:
+        return _nan_sum(values)
+    if namespace(values) is np and not np.isnan(total := np.add.reduce(values, -1)).any():
+        return total / max(values.shape[-1], 1)  # no vehicle is absent; the way below takes several times as long
     return _nan_sum(values) / clamp_min((~namespace(values).isnan(values)).sum(-1), 1)
 
 
 def _nan_sum(values: Array) -> Array:
     """Sum over the last axis without NaN."""
-    return namespace(values).nan_to_num(values, nan=0.0).sum(-1)
+    if type(values) is float:
+        return 0.0 if isnan(values) else values
+    xp = namespace(values)
+    return xp.where(xp.isnan(values), 0.0, values).sum(-1)
 
 
 def released_reward(outcome: Outcome) -> dict[str, Array]:
@@ -76,7 +88,7 @@ def released_reward(outcome: Outcome) -> dict[str, Array]:
 
     Source: the authors' released code, after Flow's wave attenuation environment.
     """
-    running = ~outcome.has_crashed
+    running = outcome.has_crashed == 0
     return {
         "speed": 4.0 * _nan_mean(outcome.speeds) / 20.0 * running,
         "acceleration": -4.0 * _nan_mean(abs(outcome.accelerations)) * running,
@@ -105,7 +117,7 @@ def released_merge_reward(outcome: Outcome) -> dict[str, Array]:
     Source: the authors' released code, after Flow's merge environment.
     """
     xp = namespace(outcome.speeds)
-    running = ~outcome.has_crashed
+    running = outcome.has_crashed == 0
     on_road = ~xp.isnan(outcome.speeds)
     errors = _nan_sum((MERGE_TARGET_SPEED - outcome.speeds) ** 2)
     relative = errors / (MERGE_TARGET_SPEED**2 * clamp_min(on_road.sum(-1), 1))
@@ -137,7 +149,7 @@ def power_reward(outcome: Outcome) -> dict[str, Array]:
     Source: throughput over delay, the power of Kleinrock 1979 (IEEE ICC, 43.1), in vehicles.
     """
     flow = _nan_sum(outcome.speeds) / (MERGE_TARGET_SPEED * MERGE_FREE_FLOW_VEHICLES)
-    return {"power": flow * _nan_mean(outcome.speeds) / MERGE_TARGET_SPEED * ~outcome.has_crashed}
+    return {"power": flow * _nan_mean(outcome.speeds) / MERGE_TARGET_SPEED * (outcome.has_crashed == 0)}
 
 
 def travel_time_reward(outcome: Outcome) -> dict[str, Array]:
@@ -159,13 +171,13 @@ def time_gap_penalty(outcome: Outcome) -> Array:
 
 def acceleration_penalty(outcome: Outcome) -> Array:
     """Term: minus the CAVs' mean squared acceleration [m2/s4]."""
-    return -_nan_mean(outcome.accelerations**2)
+    return -_nan_mean(outcome.accelerations * outcome.accelerations)
 
 
 def speed_variation_penalty(outcome: Outcome) -> Array:
     """Term: minus the standard deviation of speed across vehicles [m/s]."""
     mean = _nan_mean(outcome.speeds)[..., None]
-    return -(_nan_mean((outcome.speeds - mean) ** 2) ** 0.5)
+    return -square_root(_nan_mean((outcome.speeds - mean) ** 2))
 
 
 REWARD_TERMS: dict[str, Callable[[Outcome], Array]] = {
@@ -225,6 +237,11 @@ def make_reward(text: RewardLike) -> Reward:
 
     weighted_reward.__name__ = text
     return weighted_reward if weights else reward
+
+
+def is_packaged_reward(reward: RewardLike) -> bool:
+    """Return whether a reward is one of the package, with or without weights, instead of a user's function."""
+    return isinstance(reward, str) and not is_file_reference(split_parameters(reward)[0])
 
 
 def _file_reward(reference: FileReference) -> Reward:
@@ -299,16 +316,33 @@ def _step_outcomes(
     return Outcome(all_speeds, accelerations, time_gaps, crashed, waiting, cav_speeds)
 
 
-def validate_reward_terms(reward: Reward, outcome: Outcome, start: int = 0) -> dict[str, Floats]:
+def validate_reward_terms(
+    reward: Reward, outcome: Outcome, start: int = 0, row_name: str = "step"
+) -> dict[str, Floats]:
     """Return the terms of a reward for consecutive control steps, of which `start` is the first.
 
-    Raise `InputError` unless each is finite and has one value per control step.
+    Raise `InputError` unless each is finite and has one value per control step. `row_name` says what the rows are.
     """
     label, terms = f"reward {object_label(reward)}", dict[str, Floats]()
     for name, answer in reward(outcome).items():
         values = answer_as_array(answer, len(outcome.speeds), label, f"term {name!r}", "control step")
         if not np.isfinite(values).all():
             row = int(np.argmax(~np.isfinite(values)))
-            raise InputError(f"{label}: step {start + row}: term {name!r} is {values[row]}; allowed: finite")
+            raise InputError(f"{label}: {row_name} {start + row}: term {name!r} is {values[row]}; allowed: finite")
         terms[name] = values
     return terms
+
+
+def step_reward_terms(reward: Reward, outcome: Outcome, step: int, needs_rows: bool) -> dict[str, float]:
+    """Return the terms of a reward in one control step, whose `outcome` has no axis of rows.
+
+    `needs_rows`: the reward is a user's function. Raise `InputError` unless each term is one finite number.
+    """
+    if not needs_rows:
+        terms = {name: float(value) for name, value in reward(outcome).items()}
+        if all(map(isfinite, terms.values())):
+            return terms
+    rows = Outcome(*(np.array(values, ndmin=axes) for values, axes in zip(outcome, (2, 2, 2, 1, 1, 2), strict=True)))
+    if step == 0:  # a constant of one number would be right for one step only
+        validate_reward_terms(reward, Outcome(*(np.repeat(values, 2, axis=0) for values in rows)))
+    return {name: values.item() for name, values in validate_reward_terms(reward, rows, step).items()}

@@ -60,8 +60,11 @@ class RoadWorld(World[Episode], Protocol):
         """Return the local state of the CAVs now without errors of sensors, arrays of shape (CAVs,)."""
         return self.local_state()
 
-    def last_applied_acceleration(self) -> Floats:
-        """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2], shape (CAVs,)."""
+    def last_applied_acceleration(self) -> Array:
+        """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2].
+
+        Their shape is (CAVs,); that of a single CAV may be a float if the world `is_scalar`.
+        """
         ...
 
     def scene(self) -> RoadScene:

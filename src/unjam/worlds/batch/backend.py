@@ -74,11 +74,7 @@ class SingleRing(_SingleRoad, RingBatch):
     @property
     def speeds(self) -> Floats:
         """Of all vehicles with a driver [m/s]."""
-        return self._speed[: self.road.driven_count, 0]
-
-    def last_applied_acceleration(self) -> Floats:
-        """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2]."""
-        return np.mean(self.safe_accelerations, axis=0)
+        return super().speeds[:, 0]
 
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""

@@ -1,9 +1,11 @@
 """Random numbers of many episodes at once: those of SUMO's episodes of the same seeds, or quick ones."""
 
 from collections.abc import Callable, Mapping, Sequence
+from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unjam.physics.arrays import Array, Floats, namespace
 from unjam.worlds.ordered_road import NOISE_BLOCK_STEPS
@@ -14,6 +16,17 @@ DrawNormal = Callable[[tuple[int, ...]], Array]
 """draws standard normal numbers of a shape"""
 WorldSeeds = Sequence[Sequence[np.random.SeedSequence]]
 """seeds of each world, from `Scenario.draw_from_seed`"""
+
+
+def draw_single_normal(generator: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return standard normal numbers in single precision, several times faster than `generator.standard_normal`.
+
+    Source: Box and Muller 1958, Ann. Math. Stat. 29:610.
+    """
+    size = prod(shape)
+    uniform = generator.random((2, (size + 1) // 2), np.float32)
+    radius, angle = np.sqrt(-2.0 * np.log(1.0 - uniform[0])), 2.0 * np.pi * uniform[1]
+    return np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])[:size].reshape(shape)
 
 
 class NoiseState(NamedTuple):
@@ -62,6 +75,15 @@ class SeededNoise:
             generator.bit_generator.state = dict(state.generator)
         self._remaining_steps = list(self._to_array(np.stack([state.remaining_block for state in states], 2)))
 
+    def replace_worlds(self, worlds: Sequence[int], source: "SeededNoise", source_worlds: Sequence[int]) -> None:
+        """Continue with the generators of other worlds, which have no rest of a block."""
+        for world, other in zip(worlds, source_worlds, strict=True):
+            generator = self._human_generators[world] = source._human_generators[other]
+            self._exploration_seeds[world] = source._exploration_seeds[other]
+            draws = self._to_array(generator.standard_normal((len(self._remaining_steps), self._block.shape[2])))
+            for step, values in zip(reversed(self._remaining_steps), draws, strict=True):
+                step[:, world] = values
+
     def drop_block(self) -> None:
         """Drop the rest of a block, as SUMO's episodes do when CAVs take over."""
         self._remaining_steps = []
@@ -94,6 +116,9 @@ class QuickNoise:
     def human_noise(self) -> Array:
         """Return a number for each vehicle in this step, shape (vehicles, W)."""
         return self._draw(self._human_shape)
+
+    def replace_worlds(self, worlds: Sequence[int], source: "QuickNoise", source_worlds: Sequence[int]) -> None:
+        """Do nothing: all worlds have the same generator."""
 
     def drop_block(self) -> None:
         """Do nothing: nothing is drawn in advance."""

@@ -48,6 +48,7 @@ class OrderedTraffic(Traffic[OrderedRoad]):
         if self._commands_humans:
             simulation.command_humans(road.vehicle_ids, scenario.right_of_way, scenario.enforce_human_limits)
         self._exploration_noise: Any = None
+        self._current_state: LocalState | None = None
         self._speeds = simulation.speeds(road.vehicle_ids)
         self._check_all_present()
         self._reset_log()
@@ -90,6 +91,11 @@ class OrderedTraffic(Traffic[OrderedRoad]):
 
     def exact_state(self) -> LocalState:
         """Return the exact local state of the CAVs now."""
+        if self._current_state is None:
+            self._current_state = self._compute_state()
+        return self._current_state
+
+    def _compute_state(self) -> LocalState:
         tracked = self._tracked_positions
         if self.is_scalar:
             return ordered_road.loop_state(self._speeds, tracked, self._scalar_neighbors, *self._loop_arguments)
@@ -128,7 +134,7 @@ class OrderedTraffic(Traffic[OrderedRoad]):
     def _simulate(self) -> None:
         """Simulate one step, and add noise to the speeds of human-driven vehicles.
 
-        Two formulas of `physics.kinematics` are inlined here: calls would take a tenth of the episode.
+        Three formulas of `physics.kinematics` are inlined here: calls would take a tenth of the episode.
         """
         simulation, positions, step = self._simulation, self._tracked_positions, self.scenario.simulation_step
         if self._commands_humans:
@@ -142,9 +148,9 @@ class OrderedTraffic(Traffic[OrderedRoad]):
         if self.scenario.noise > 0 and not self._commands_humans:
             speeds = list(map(add, speeds, self._next_speed_noise()))
             if min(speeds) < 0.0:
-                speeds = [clamp_min(speed, 0.0) for speed in speeds]
+                speeds = [0.0 if speed < 0.0 else speed for speed in speeds]
             simulation.replace_speeds(self._human_ids, compress(speeds, self._human_mask))
-        self._speeds = speeds
+        self._speeds, self._current_state = speeds, None
         self._series["speeds"].fromlist(speeds)
         if colliding := simulation.colliding_vehicles():
             self._collided_vehicles.update(colliding)
@@ -217,14 +223,18 @@ class OrderedTraffic(Traffic[OrderedRoad]):
         rows = None if self.is_scalar else np.arange(len(self.cav_ids))
         return self._make_log().episode(self.speeds_and_positions(), fields, driver_log, rows)
 
-    def last_applied_acceleration(self) -> Floats:
-        """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2], shape (CAVs,)."""
+    def last_applied_acceleration(self) -> Array:
+        """Return the CAVs' accelerations in the last control step, as `RoadWorld.last_applied_acceleration`."""
+        if self.is_scalar and self.scenario.steps_per_control_step == 1:
+            return self._series["safe_accelerations"][-1]
         return self._recorder.last_applied_acceleration()
 
     @property
-    def speeds(self) -> list[float]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def speeds(self) -> Sequence[float]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Speeds of all vehicles with a driver [m/s]."""
-        return self._speeds[: self.road.driven_count]
+        return self._series["speeds"][-len(self._speeds) :][
+            : self.road.driven_count
+        ]  # NumPy reads it faster than lists
 
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""

@@ -46,6 +46,7 @@ class Libsumo:
         self._is_loaded = call("simulation", "isLoaded")
         self._get_time, self._step = call("simulation", "getTime"), call("simulation", "step")
         self._get_time_step, self._get_option = call("simulation", "getDeltaT"), call("simulation", "getOption")
+        self._time_step = 1.0
         self._log_path: str | None = None
         """the error log of the running simulation, by which it is identified; None: it does not run"""
         self._step_count, self._begin_time = 0, 0.0
@@ -66,8 +67,9 @@ class Libsumo:
         """Whether other code of this process has started, stepped or closed libsumo's simulation."""
         if not self._is_own():
             return True
-        steps = round((self._get_time() - self._begin_time) / self._get_time_step()) if self.is_running else 0
-        return self.is_running and steps != self._step_count
+        if self._log_path is None:
+            return False
+        return round((self._get_time() - self._begin_time) / self._time_step) != self._step_count
 
     def check(self) -> None:
         """Raise `LostWorkerError` if other code has changed the simulation. It takes less than a microsecond."""
@@ -88,7 +90,8 @@ class Libsumo:
 
     def _start(self, start: Callable[[list[str]], object], options: Sequence[str]) -> None:
         start([*options])
-        self._begin_time, self._step_count, self.has_refused = self._get_time(), 0, False
+        self._begin_time, self._time_step = self._get_time(), self._get_time_step()
+        self._step_count, self.has_refused = 0, False
 
     def step(self) -> None:
         """Simulate one time step."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.car_following import MIN_IDM_GAP
-from unjam.physics.arrays import Array, Floats, clamp_max, clamp_min, namespace, square_root
+from unjam.physics.arrays import Array, Floats, clamp_max, clamp_min, namespace, replace_columns, square_root
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import gap_on_loop
 from unjam.scenarios.figure_eight import CROSSING_LINK, INNER_LINK, OUTER_LINK, figure_eight_radius, lane_lengths
@@ -350,6 +350,11 @@ class FigureEightMovement:
             has_entered = self._sumo_loop_length - distance_past < next_speed * step
             entry_step = xp.where(has_entered, 0.0, entry_step)
         self.memory = CrossingMemory(waiting_time, entry_step)
+
+    def replace_roads(self, roads: Any, source: "FigureEightMovement", source_roads: Any) -> None:
+        """Continue on some roads with those of another batch."""
+        for name in ("memory", "_crossings", "_loop_length", "_sides", "_sumo_loop_length", "_position_offset"):
+            setattr(self, name, replace_columns(getattr(self, name), roads, getattr(source, name), source_roads))
 
     def restore_memory(self, memories: Sequence[CrossingMemory]) -> None:
         """Continue from the memories of the roads, shape (vehicles,) each."""

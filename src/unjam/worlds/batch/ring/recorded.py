@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from unjam.drivers.local_state import LocalState
-from unjam.physics.arrays import Array, namespace
+from unjam.physics.arrays import Array, as_indices, clamp_max, namespace, replace_columns
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.batch.human_idm import CONTACT_GAP, Leader, human_idm_speed, slow_to_desired_speed
 from unjam.worlds.batch.noise import ArrayFactory
@@ -20,6 +20,8 @@ class RecordedBatch(RingBatch):
     After the end of its recording, a road is simulated behind a vehicle of constant speed, and no longer counted.
     """
 
+    _road_arrays = (*RingBatch._road_arrays, "_next_samples", "_road_ends")
+
     def __init__(
         self,
         scenarios: Sequence[Scenario],
@@ -32,17 +34,13 @@ class RecordedBatch(RingBatch):
         recorded = [np.asarray(road.replayed_speeds) for road in self.roads]
         longest = max(map(len, recorded))
         padded = [np.pad(speeds, (0, longest - len(speeds)), "edge") for speeds in recorded]
-        self._replayed_speeds, self._next_sample = to_array(np.stack(padded, 1)), 1
+        self._replayed_speeds, self._next_samples = to_array(np.stack(padded, 1)), to_array(np.ones(len(recorded)))
+        self._columns = np.arange(len(recorded))
         counts = [(len(speeds) - 1) // scenarios[0].steps_per_control_step for speeds in recorded]
         self._ends = to_array(np.minimum(counts, scenarios[0].horizon).astype(np.float64))
         self._road_ends = to_array(np.array([road.network.edges[0].length for road in self.roads]))
         self._noise_scale[-1] = 0.0
         self._find_contacts = platoon_contacts
-
-    @property
-    def platoon_speeds(self) -> Array:
-        """Speeds of all vehicles behind the recorded ones, from the last to the first [m/s], shape (vehicles, W)."""
-        return self._speed[:-2]
 
     @property
     def is_running(self) -> Array:
@@ -58,10 +56,14 @@ class RecordedBatch(RingBatch):
         """Return the exact local state of the CAVs now."""
         return without_loop(super().exact_state())
 
-    def advance(self, command: Any) -> None:
-        """Simulate one control step with the same command throughout; None: the CAVs stay human."""
-        super().advance(command)
-        self._is_running = self._is_running * (self.control_steps < self._ends)
+    def replace_roads(self, roads: Any, source: Any, source_roads: Any) -> None:
+        """Continue on some roads with those of another batch, see `RingBatch.replace_roads`."""
+        longest = np.arange(max(len(each._replayed_speeds) for each in (self, source)))
+        own, other = (
+            each._replayed_speeds[longest.clip(max=len(each._replayed_speeds) - 1)] for each in (self, source)
+        )
+        self._replayed_speeds = replace_columns(own, roads, other, source_roads)
+        super().replace_roads(roads, source, source_roads)
 
     def _human_speeds(self, speed: Array, leader: Leader) -> Array:
         if self._human_model is not None:
@@ -72,9 +74,9 @@ class RecordedBatch(RingBatch):
 
     def _next_speeds(self, speed: Array, leader: Leader, cav_speeds: Array | None) -> tuple[Array, Array]:
         moved, speeds = super()._next_speeds(speed, leader, cav_speeds)
-        replayed = self._replayed_speeds[self._next_sample : self._next_sample + 1]
-        self._next_sample = min(self._next_sample + 1, len(self._replayed_speeds) - 1)
-        xp = namespace(replayed)
+        xp = namespace(moved)
+        replayed = self._replayed_speeds[as_indices(self._next_samples), self._columns][None]
+        self._next_samples = clamp_max(self._next_samples + 1.0, len(self._replayed_speeds) - 1.0)
         return xp.concatenate([moved[:-1], replayed]), xp.concatenate([speeds[:-1], replayed])
 
 

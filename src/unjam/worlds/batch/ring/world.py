@@ -8,7 +8,7 @@ the first CAV of every ring, then of the second one, and so on.
 from collections.abc import Collection, Sequence
 from functools import reduce
 from itertools import product
-from typing import NamedTuple, Self, cast
+from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import CAVActuation, FollowingState
 from unjam.drivers.sensors import SensorReadings
 from unjam.errors import EpisodeError
-from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace
+from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, replace_columns
 from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
 from unjam.scenarios.road import ClosedRoad, OrderedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
@@ -65,6 +65,11 @@ class RingBatch:
     """
 
     is_scalar, remaining_rows = False, None
+    _road_arrays: ClassVar[tuple[str, ...]] = (
+        *("_speed", "_position", "_gap", "_loop_lengths", "_cav_loop_lengths", "_crossing_starts", "_human_parameters"),
+        *("_is_running", "crashed_roads", "control_step_counts", "_ends"),
+    )
+    """attributes whose arrays have a column for each road"""
     measured_fields: Collection[str] = ()
     """optional fields of `LocalState` that the driver reads; others are not provided"""
     safe_accelerations: Sequence[Array] = ()
@@ -115,6 +120,8 @@ class RingBatch:
             self._find_contacts = figure_eight_contacts
         crossings = zip(*(road.crossings for road in roads), strict=True)
         self._crossing_starts = [to_array(np.tile([start for start, _ in each], cavs)) for each in crossings]
+        self._ends = to_array(np.full(len(roads), float(scenario.horizon)))
+        """number of control steps in the episode of each road, shape (W,)"""
         self._noise_scale = to_array(np.full((vehicles, 1), scenario.noise_per_step * step))
         self._actuation = CAVActuation(scenario.safety, scenario.actuator, step)
         self._readings = RingReadings(scenario, roads[0].cav_ids, generator_seeds, to_array)
@@ -147,7 +154,7 @@ class RingBatch:
         self._series = {"speeds": [self._speed[:-1]], **{name: [] for name in ("noise_free_speeds", *cav_series)}}
         self._start_positions = as_numpy(self._position)
         zeros = self._speed[0] * 0.0
-        self._is_running, self.crashed_roads, self._control_step_counts = zeros + 1.0, zeros > 0.0, zeros
+        self._is_running, self.crashed_roads, self.control_step_counts = zeros + 1.0, zeros > 0.0, zeros
         """whether each road still counts, whether there was a collision on it, and its control steps, shape (W,)"""
 
     def place_vehicles(self, speeds: Array, positions: Array, memories: Sequence[CrossingMemory | None]) -> None:
@@ -212,6 +219,36 @@ class RingBatch:
             return None
         return histories[0].map(lambda *values: np.stack(values, 1).reshape(self.cav_count, -1), *histories[1:])
 
+    def replace_roads(self, roads: Any, source: Self, source_roads: Any) -> None:
+        """Continue on some roads with those of another batch that has just been started; one CAV on each.
+
+        `roads` and `source_roads` are lists of equal length. Both batches keep no record, and have the same kind of
+        arrays, noise and scenario.
+        """
+        for name in self._road_arrays:
+            setattr(self, name, replace_columns(getattr(self, name), roads, getattr(source, name), source_roads))
+        for own, other in zip(roads, source_roads, strict=True):
+            self.roads[own] = source.roads[other]
+        self._readings.replace_roads(roads, source._readings, source_roads)
+        self._noise.replace_worlds(roads, source._noise, source_roads)  # pyright: ignore[reportArgumentType]
+        self._actuation.reset_rows(roads)
+        if self._figure_eight and source._figure_eight:
+            self._figure_eight.replace_roads(roads, source._figure_eight, source_roads)
+
+    @property
+    def speeds(self) -> Array:
+        """Speeds of all vehicles with a driver [m/s], shape (vehicles, W)."""
+        return self._speed[: self.roads[0].driven_count]
+
+    @property
+    def completed_roads(self) -> Array:
+        """Whether the episode of each road has reached its horizon, shape (W,)."""
+        return self.control_step_counts >= self._ends
+
+    def last_applied_acceleration(self) -> Array:
+        """Return the accelerations of the CAVs in the last control step, after the filter [m/s2], shape (CAVs * W,)."""
+        return sum(self.safe_accelerations) / len(self.safe_accelerations)
+
     @property
     def has_ended(self) -> bool:
         """Whether the horizon is reached; rings with a collision are still simulated but no longer counted."""
@@ -227,19 +264,24 @@ class RingBatch:
     def exact_state(self) -> LocalState:
         """Return the exact local state of the CAVs now."""
         loop, position = self._cav_loop_lengths, self._rows_of(self._position, self._cav_indices)
+        if self._has_quick_noise:
+            place = position - loop * namespace(position).floor(position / loop)  # `%` takes ten times as long
+        else:
+            place = position % loop
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
         distances = [(start - position) % loop for start in self._crossing_starts]
         return LocalState(
-            *self._following_state(),
+            *self.following_state(),
             self._rows_of(self._speed, self._follower_indices),
             self._rows_of(self._gap, self._follower_indices),
-            position % loop,
+            place,
             loop,
             distance_to_crossing=reduce(namespace(position).minimum, distances) if distances else None,
             penetration_rate=None if rate is None else position * 0.0 + rate,
         )
 
-    def _following_state(self) -> FollowingState:
+    def following_state(self) -> FollowingState:
+        """Return the exact speeds of the CAVs, and those of and gaps to their leaders now, shape (CAVs * W,) each."""
         own, leader_speed = self._cav_indices, self._rows_of(self._speed, self._leader_indices)
         return FollowingState(self._rows_of(self._speed, own), leader_speed, self._rows_of(self._gap, own))
 
@@ -256,8 +298,8 @@ class RingBatch:
                 self._series["requested_accelerations"].append(requested)
         self.safe_accelerations = [self._simulate(requested) for _ in range(self.scenario.steps_per_control_step)]
         self.control_steps += 1
-        self._control_step_counts = self._control_step_counts + self._is_running
-        self._is_running = self._is_running * ~self.crashed_roads
+        self.control_step_counts = self.control_step_counts + self._is_running
+        self._is_running = self._is_running * (~self.crashed_roads & ~self.completed_roads)
 
     def _human_speeds(self, speed: Array, leader: Leader) -> Array:
         """Return the speeds of all vehicles after this step if humans drive them, shape (vehicles, W)."""
@@ -270,7 +312,7 @@ class RingBatch:
 
     def _simulate(self, accelerations: Array | None) -> Array:
         """Simulate one step, and return the CAVs' safe accelerations; None: the CAVs are human."""
-        step, speed, state = self.scenario.simulation_step, self._speed, self._following_state()
+        step, speed, state = self.scenario.simulation_step, self._speed, self.following_state()
         safe, commanded = None, None
         if accelerations is not None:
             safe, applied = self._actuation.apply("all", accelerations, self._readings.read_for_filters(state))
@@ -316,7 +358,7 @@ class RingBatch:
         """Return the record of each ring since the start, without rewards; none if records are not kept."""
         if not self._keep_record:
             return ()
-        steps, crashed = as_numpy(self._control_step_counts).astype(int), as_numpy(self.crashed_roads) > 0.0
+        steps, crashed = as_numpy(self.control_step_counts).astype(int), as_numpy(self.crashed_roads) > 0.0
         rings = zip(self._scenarios, self.roads, self._seeds, steps.tolist(), crashed.tolist(), strict=True)
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
         return make_ring_episodes(rings, self._start_positions, self._series, self._find_contacts, driver_log, rate)
@@ -333,6 +375,12 @@ class RingReadings:
         ]
         self._cav_ids, self._to_array, self._shape = cav_ids, to_array, (len(cav_ids), len(seeds))
         self._cached_readings: tuple[int, LocalState] | None = None
+
+    def replace_roads(self, roads: Sequence[int], source: "RingReadings", source_roads: Sequence[int]) -> None:
+        """Continue on some rings with the sensors of another batch, from the next control step on."""
+        if self._ring_readings:
+            for own, other in zip(roads, source_roads, strict=True):
+                self._ring_readings[own] = source._ring_readings[other]
 
     def read_for_drivers(self, step_index: int, true_state: LocalState) -> LocalState:
         """Return the drivers' readings of the true state, the same for all calls in a control step."""

@@ -1,0 +1,115 @@
+"""Fixed agents for CAVs that come and go, for algorithms whose agents must stay the same."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from unjam.environments.gymnasium_env import as_action
+from unjam.environments.threads import synchronized
+from unjam.errors import InputError, invalid_value
+
+
+class SlottedRoadEnv(ParallelEnv[str, Any, Any]):
+    """A `ParallelRoadEnv` with the agents slot_0, slot_1, ..., all of which exist for the whole episode.
+
+    A CAV that enters takes the first free slot until it leaves the road. If no slot is free, the expert drives it for
+    its whole trip (without an expert it keeps its speed, as with action 0). The slot of a CAV that leaves is free from
+    the next control step on; in the step itself it has the last observation of this CAV.
+
+    An empty slot observes zeros, its action is ignored, and its reward is 0. `infos` has for each slot `is_occupied`,
+    which is the mask, `has_left` (its CAV left in this step), the name of its `vehicle`, and the `reward_terms`.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "unjam_slots_v0", "render_modes": []}  # pyright: ignore
+
+    def __init__(self, environment: Any, slots: int) -> None:
+        """Map the agents of a `ParallelRoadEnv` to so many slots."""
+        if not isinstance(slots, int) or isinstance(slots, bool) or slots < 1:
+            raise invalid_value("slots", slots, "an integer >= 1")
+        self._environment, self._road = environment, environment._road
+        self.possible_agents = [f"slot_{number}" for number in range(slots)]
+        self.agents: list[str] = []
+        self.render_mode = None
+        self._cavs: dict[str, str] = {}
+        """agent of the environment by occupied slot"""
+        self._without_slot: set[str] = set()
+        self.observation_spaces, self.action_spaces = (
+            {slot: spaces.Box(space.low, space.high, dtype=np.float32) for slot in self.possible_agents}
+            for space in (self._road.observation_space, self._road.action_space)
+        )
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        """Return the observation space of a slot: that of one CAV."""
+        return self.observation_spaces[agent]  # pyright: ignore[reportReturnType]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        """Return the action space of a slot: that of one CAV."""
+        return self.action_spaces[agent]  # pyright: ignore[reportReturnType]
+
+    @synchronized
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode, as `ParallelRoadEnv.reset`."""
+        observations, infos = self._environment.reset(seed, options)
+        self.agents = list(self.possible_agents)
+        self._cavs, self._without_slot = {}, set()
+        self._assign_slots(self.agents)
+        return self._observe(observations, self._cavs), self._infos(infos, self._cavs, {})
+
+    @synchronized
+    def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Advance one control step; empty slots need no action."""
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        if missing := [slot for slot in self._cavs if slot not in actions]:
+            raise InputError(f"step: no action for {', '.join(missing)}; allowed: one for each occupied slot")
+        before = self._cavs
+        commands = dict.fromkeys(self._environment.agents, 0.0)
+        commands |= {name: as_action(actions[slot], slot) for slot, name in before.items()}
+        observations, rewards, terminations, _, infos = self._environment.step(commands)
+        present, is_terminated = set(self._environment.agents), any(terminations.values())
+        has_ended = not present
+        left = {} if has_ended else {slot: name for slot, name in before.items() if name not in present}
+        self._cavs = {slot: name for slot, name in before.items() if slot not in left}
+        self._assign_slots([slot for slot in self.possible_agents if slot not in before])
+        slots, shown = self.possible_agents, self._cavs | left
+        self.agents = [] if has_ended else list(slots)
+        return (
+            self._observe(observations, shown),
+            {slot: rewards[before[slot]] if slot in before else 0.0 for slot in slots},
+            dict.fromkeys(slots, is_terminated),
+            dict.fromkeys(slots, has_ended and not is_terminated),
+            self._infos(infos, shown, left),
+        )
+
+    def _assign_slots(self, free: list[str]) -> None:
+        """Give CAVs that have entered the first free slots; those for which none is left get none later."""
+        known = {*self._cavs.values(), *self._without_slot}
+        new = [name for name in self._environment.agents if name not in known]
+        self._cavs |= zip(free, new, strict=False)
+        self._without_slot.update(new[len(free) :])
+
+    def _observe(self, observations: dict[str, Any], shown: dict[str, str]) -> dict[str, Any]:
+        empty = np.zeros(self._road.observation_space.shape, np.float32)
+        return {slot: observations[shown[slot]] if slot in shown else empty.copy() for slot in self.possible_agents}
+
+    def _infos(self, infos: dict[str, Any], shown: dict[str, str], left: dict[str, str]) -> dict[str, Any]:
+        return {
+            slot: {
+                **infos.get(shown.get(slot, ""), {}),
+                "is_occupied": slot in self._cavs,
+                "has_left": slot in left,
+                "vehicle": shown.get(slot, ""),
+            }
+            for slot in self.possible_agents
+        }
+
+    def render(self) -> None:
+        """Draw nothing."""
+
+    def close(self) -> None:
+        """Close SUMO; further calls have no effect."""
+        self._environment.close()

@@ -1,0 +1,326 @@
+"""Many roads of a batch as a Gymnasium vector environment, with NumPy arrays or torch tensors."""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from operator import index
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from unjam.drivers.command import as_numbers
+from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike
+from unjam.drivers.user_driver import DriverLike
+from unjam.environments.gymnasium_env import ExternalDriver, RoadStepper, check_single_cav, episode_seed
+from unjam.errors import InputError, MissingPartError, UnjamError, import_optional, invalid_value
+from unjam.measures.step_metrics import step_metrics
+from unjam.physics.arrays import Array, clip, namespace, replace_entries
+from unjam.scenarios import make_scenario
+from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, draw_single_normal
+from unjam.worlds.batch.ring.record import as_numpy
+from unjam.worlds.batch.ring.world import RingBatch
+from unjam.worlds.batch.run import start_batch_drive
+from unjam.worlds.batch.support import required_batch_kind, statistically_unsupported_reason
+from unjam.worlds.episode import as_seed
+from unjam.worlds.reward import Outcome, RewardLike, time_gap, validate_reward_terms
+
+OTHER_MODE = "allowed: vectorization_mode='async', which simulates in SUMO"
+
+
+class _ArrayKind(NamedTuple):
+    """Library and precision of the arrays of an environment, and its noise."""
+
+    to_array: ArrayFactory
+    draw: DrawNormal | None
+    """draws the noise of all roads; None: each road has that of SUMO's episode"""
+    to_single: Callable[[Array], Array]
+    """returns an array in single precision"""
+    no_gradient: Callable[[], AbstractContextManager[object]]
+
+
+def _numpy_kind(is_exact: bool, seed: Sequence[int]) -> _ArrayKind:
+    to_array = partial(np.asarray, dtype=np.float64 if is_exact else np.float32)
+    draw = None if is_exact else partial(draw_single_normal, np.random.default_rng(seed))
+    return _ArrayKind(to_array, draw, lambda values: values.astype(np.float32), nullcontext)
+
+
+def _torch_kind(is_exact: bool, seed: Sequence[int], device: str) -> _ArrayKind:
+    torch = import_optional("torch")
+    to_array = partial(torch.as_tensor, dtype=torch.float64 if is_exact else torch.float32, device=device)
+    generator = torch.Generator(device).manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
+    draw = None if is_exact else partial(torch.randn, generator=generator, device=device)
+    return _ArrayKind(to_array, draw, lambda values: values.float(), torch.no_grad)
+
+
+def _with_masks(values: dict[str, Any], mask: Array) -> dict[str, Any]:
+    """Return values of environments together with Gymnasium's masks, which say for which of them they are."""
+    return values | {f"_{name}": mask for name in values}
+
+
+class _Episodes:
+    """Episodes on the roads of a batch, and the driver of their CAVs."""
+
+    def __init__(self, world: RingBatch, driver: ExternalDriver, to_array: ArrayFactory) -> None:
+        """Start the episodes, with their warm-up."""
+        self.world, self._driver, self._memory = world, driver, start_batch_drive(world, driver, to_array).memory
+        self.observe()
+
+    def advance(self, actions: Array) -> Outcome:
+        """Advance one control step with actions of shape (W,), and return its outcome."""
+        self._driver.actions = actions
+        decision, world = self._driver.decide(self._state, self._memory), self.world
+        self._memory = decision.memory
+        world.advance(decision.command)
+        speed, _, gap = world.following_state()
+        accelerations, time_gaps = world.last_applied_acceleration()[:, None], time_gap(gap, speed)[:, None]
+        return Outcome(
+            world.speeds.T, accelerations, time_gaps, world.crashed_roads, 0.0 * speed, cav_speeds=speed[:, None]
+        )
+
+    def observe(self) -> None:
+        """Let the driver observe the current state, once in each control step."""
+        self._state = self.world.local_state()
+        found = self._driver.observation(self._state, self._memory)
+        self.observations = clip(found, -MAX_OBSERVATION, MAX_OBSERVATION)
+
+    def replace(self, rows: list[int], source: "_Episodes", source_rows: list[int]) -> None:
+        """Go on in some rows with episodes that have just been started."""
+        self.world.replace_roads(rows, source.world, source_rows)
+        self._driver.replace_rows(rows, source._driver, source_rows)
+        self.observations = replace_entries(self.observations, rows, source.observations, source_rows)
+
+
+class RoadVectorEnv(VectorEnv[Any, Any, Any]):
+    """W environments as `RoadEnv`, simulated together without SUMO.
+
+    ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4096)``, with the arguments of `RoadEnv`. Spaces, observations,
+    rewards and ends are those of `RoadEnv`. With the same seeds, so are the episodes: on rings and recorded roads they
+    equal SUMO's except for rounding, on figure eights they have the same distribution.
+
+    ================  ==============================================================================================
+    Roads             rings, figure eights, recorded roads
+    Seeds             ``reset(seed=s)`` gives environment i the seed s + i; or a list of seeds. Without a seed, each
+                      environment starts the next episode after that of its last seed
+    End of episodes   ``AutoresetMode.NEXT_STEP``: the step after the end of an episode ignores its action, and returns
+                      the first observation of the next episode with reward 0. ``reset(options={"reset_mask": mask})``
+                      restarts some environments
+    ``info``          ``reward_terms``; at the end of an episode ``episode_metrics``: ``return``, ``steps``, and metrics
+                      of ``unjam drive`` that are means over time; at its start ``drawn_values``
+    ================  ==============================================================================================
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: str = "ring",
+        reward: RewardLike = "",
+        expert: str | DriverLike = "",
+        features: Sequence[FeatureLike] = ("local",),
+        exact: bool = True,
+        device: str = "",
+        **changes: Any,
+    ) -> None:
+        """Prepare the environments; arguments as of `RoadEnv`, or as follows.
+
+        Args:
+            num_envs: number of environments, W.
+            exact: whether each episode equals that of `RoadEnv` with its seed, in double precision. Otherwise episodes
+                have the same distribution: all roads share a fast noise generator, human drivers follow only the
+                vehicle ahead, and numbers have single precision.
+            device: `cpu`, `cuda` or another device of torch: actions, and all that `reset` and `step` return, are then
+                tensors on it, through which gradients flow unless `torch.no_grad` is set. Empty: NumPy arrays.
+
+        Raises:
+            InputError: an argument is wrong, or a batch cannot simulate the scenario.
+            MissingPartError: torch or the device is not available.
+        """
+        for name in ("backend", "render_mode"):
+            if changes.pop(name, None):
+                raise InputError(f"{name}: is not an option of batches; {OTHER_MODE}")
+        if not isinstance(num_envs, int) or num_envs < 1:
+            raise invalid_value("num_envs", num_envs, "an integer >= 1")
+        made = make_scenario(scenario, changes)
+        reason = statistically_unsupported_reason(made)
+        if not reason and not issubclass(required_batch_kind(made).world, RingBatch):
+            reason = "vehicles enter and leave"
+        if reason:
+            raise InputError(f"scenario: {made.title} is not possible in a batch ({reason}); {OTHER_MODE}")
+        check_single_cav(made)
+        self._road = RoadStepper(scenario, changes, reward, expert, features, "batch")
+        needs_numpy = self._road.copy_driver().expert.requirements().needs_numpy
+        if device and needs_numpy:
+            raise invalid_value("expert", expert, "one that takes tensors, like 'pi'; or device='', NumPy")
+        self._make_kind = partial(_torch_kind, device=device) if device else _numpy_kind
+        self._exact, self._device, self._is_numpy, self.num_envs = exact, device, not device, num_envs
+        self._kind = self._make_array_kind((0,))
+        self.single_observation_space, self.single_action_space = self._road.observation_space, self._road.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._seeds: list[int | None] = [None] * num_envs
+        self._episode_counts = [0] * num_envs
+        """episodes of each environment since that seed, prepared ones included"""
+        self._episodes: _Episodes | None = None
+        self._prepared: dict[int, tuple[_Episodes, int]] = {}
+        """the next episode of an environment, as a row of started episodes"""
+        self._ended_rows: list[int] = []
+        """environments whose episode ended in the last step"""
+
+    def _make_array_kind(self, seed: Sequence[int]) -> _ArrayKind:
+        try:
+            return self._make_kind(self._exact, seed)
+        except (RuntimeError, AssertionError):  # of torch
+            message = f"device: {self._device!r} is not available to torch; allowed: 'cpu', or '' for NumPy"
+            raise MissingPartError(message) from None
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start an episode in each environment, or in those of `options["reset_mask"]`, booleans of shape (W,)."""
+        rows, seeds = self._rows_to_reset(options or {}), self._seeds_of_environments(seed)
+        for row in rows:
+            given = seeds[row]
+            if given is None and self._seeds[row] is None:
+                given = int(self.np_random.integers(2**31))
+            if given is not None:
+                self._seeds[row], self._episode_counts[row] = given, 0
+                self._prepared.pop(row, None)
+        if len(rows) == self.num_envs and not self._prepared:
+            self._kind = self._make_array_kind((self._seeds[0] or 0, self._episode_counts[0]))
+            self._episodes = self._start_episodes(rows)
+            zeros = self._kind.to_array(np.zeros(self.num_envs))
+            self._all = zeros == 0.0
+            self._totals: defaultdict[str, Array] = defaultdict(lambda: zeros)
+            """sums of the reward and of the metrics over the current episodes, by name, shape (W,)"""
+        else:
+            self._restart(rows)
+        self._ended_rows = [row for row in self._ended_rows if row not in set(rows)]
+        return self._kind.to_single(self._running_episodes.observations), self._start_info(rows)
+
+    def _rows_to_reset(self, options: dict[str, Any]) -> list[int]:
+        if unknown := options.keys() - {"reset_mask"}:
+            raise InputError(f"options: {min(unknown)!r} is not allowed; allowed: 'reset_mask'")
+        mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+            raise InputError(f"options: reset_mask is not {self.num_envs} booleans, at least one of them True")
+        if self._episodes is None and not mask.all():
+            raise InputError("options: reset_mask is not allowed in the first reset")
+        return np.flatnonzero(mask).tolist()
+
+    def _seeds_of_environments(self, seed: Any) -> list[int | None]:
+        """Return a seed or None for each environment."""
+        if isinstance(seed, int | np.integer):
+            super().reset(seed=as_seed(seed)[0])
+            return list(range(int(seed), int(seed) + self.num_envs))
+        try:
+            seeds = [
+                None if each is None else as_seed(index(each))[0]
+                for each in ([None] * self.num_envs if seed is None else seed)
+            ]
+        except TypeError:
+            raise invalid_value("seed", seed, "an integer, or one for each environment") from None
+        if len(seeds) != self.num_envs:
+            raise InputError(f"seed: {len(seeds)} seeds are not allowed; allowed: {self.num_envs}, or a single one")
+        return seeds
+
+    def make_batch(self, rows: Sequence[int]) -> RingBatch:
+        """Return a batch of the next episodes of some environments, which has not been started."""
+        seeds = [episode_seed(self._seeds[row] or 0, self._episode_counts[row]) for row in rows]
+        for row in rows:
+            self._episode_counts[row] += 1
+        kind, scenarios = self._kind, [self._road.scenario] * len(rows)
+        batch: Any = required_batch_kind(self._road.scenario).world
+        return batch(scenarios, seeds, kind.to_array, keep_record=False, draw=kind.draw)
+
+    def _start_episodes(self, rows: list[int]) -> _Episodes:
+        return _Episodes(self.make_batch(rows), self._road.copy_driver(), self._kind.to_array)
+
+    def _restart(self, rows: list[int]) -> None:
+        """Go on in some environments with their next episodes.
+
+        If one of these is not prepared, those of all environments are, because many warm-ups together are fast.
+        """
+        if not self._prepared.keys() >= set(rows):
+            missing = [row for row in range(self.num_envs) if row not in self._prepared]
+            started = self._start_episodes(missing)
+            self._prepared |= {row: (started, index) for index, row in enumerate(missing)}
+        groups = defaultdict[_Episodes, list[tuple[int, int]]](list)
+        for row in rows:
+            source, source_row = self._prepared.pop(row)
+            groups[source].append((row, source_row))
+        for source, pairs in groups.items():
+            own, others = map(list, zip(*pairs, strict=True))
+            self._running_episodes.replace(own, source, others)
+        zeros = self._kind.to_array(np.zeros(self.num_envs))
+        for name, total in self._totals.items():
+            self._totals[name] = replace_entries(total, rows, zeros, rows)
+
+    @property
+    def _running_episodes(self) -> _Episodes:
+        if self._episodes is None:
+            raise UnjamError("no episode is running: call reset first")
+        return self._episodes
+
+    def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Advance one control step with actions of shape (W, 1) [m/s2]; restart episodes that ended in the last one."""
+        episodes, restarted = self._running_episodes, self._ended_rows
+        outcome = episodes.advance(self._as_actions(actions))
+        episodes.observe()
+        terms, has_stepped = self._reward_terms(outcome), replace_entries(self._all, restarted, ~self._all, restarted)
+        rewards = sum(terms.values())
+        if restarted:
+            rewards = namespace(rewards).where(has_stepped, rewards, 0.0)
+        terminated = outcome.has_crashed & has_stepped
+        truncated = episodes.world.completed_roads & has_stepped & ~terminated
+        info = _with_masks({"reward_terms": _with_masks(terms, has_stepped)}, has_stepped)
+        with self._kind.no_gradient():
+            for name, values in {"return": rewards, **step_metrics(outcome)}.items():
+                self._totals[name] = self._totals[name] + values
+            ended = terminated | truncated
+            self._ended_rows = np.flatnonzero(as_numpy(ended)).tolist() if bool(ended.any()) else []
+            if self._ended_rows:
+                info |= _with_masks({"episode_metrics": _with_masks(self._metrics(ended), ended)}, ended)
+            if restarted:
+                self._restart(restarted)
+                info |= self._start_info(restarted)
+        return self._kind.to_single(episodes.observations), rewards, terminated, truncated, info
+
+    def _as_actions(self, actions: Any) -> Array:
+        if self._is_numpy:
+            actions = as_numbers(actions, "step: actions")
+        allowed = (self.num_envs, 1), (self.num_envs,)
+        if np.shape(actions) not in allowed:
+            raise InputError(f"step: actions of shape {np.shape(actions)} are not allowed; allowed: {allowed[0]}")
+        return self._kind.to_array(actions).reshape(-1)
+
+    def _reward_terms(self, outcome: Outcome) -> dict[str, Array]:
+        reward = self._road.reward
+        terms = reward(outcome)
+        is_valid = all(getattr(values, "shape", None) == (self.num_envs,) for values in terms.values())
+        if is_valid and (not self._is_numpy or np.isfinite(sum(terms.values())).all()):
+            return terms
+        return validate_reward_terms(reward, outcome, row_name="environment")
+
+    def _metrics(self, ended: Array) -> dict[str, Array]:
+        """Return the metrics of the episodes that have ended, zeros for others."""
+        steps = self._running_episodes.world.control_step_counts
+        means = {name: total / steps for name, total in self._totals.items() if name != "return"}
+        metrics = {"return": self._totals["return"], "steps": steps, **means}
+        return {name: namespace(values).where(ended, values, 0.0) for name, values in metrics.items()}
+
+    def _start_info(self, rows: list[int]) -> dict[str, Any]:
+        is_new = replace_entries(~self._all, rows, self._all, rows)
+        roads = self._running_episodes.world.roads
+        drawn = {}
+        for name in roads[0].drawn_values:
+            values = np.zeros(self.num_envs)
+            values[rows] = [roads[row].drawn_values[name] for row in rows]
+            drawn[name] = self._kind.to_array(values)
+        return _with_masks({"drawn_values": _with_masks(drawn, is_new)}, is_new)

@@ -1,0 +1,316 @@
+import re
+import warnings
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
+
+from unjam.drivers import Constant
+from unjam.environments.gymnasium_env import RoadEnv
+from unjam.environments.vector_env import RoadVectorEnv
+from unjam.errors import InputError, MissingPartError, UnjamError
+from unjam.measures.metrics import METRICS
+from unjam.scenarios import make_scenario
+from unjam.worlds.batch.noise import draw_single_normal
+from unjam.worlds.episode import run_episode
+
+SEEDS = [5, 6, 7]
+RESETS = {13: 1, 37: 0, 61: 2}
+"""environment that is reset before each of some steps"""
+STEPS = 100
+CRASHING: Any = {"actuation": "raw", "length": (160, 160), "safety": {"active": False}, "horizon": 90}
+
+
+class Parrot:
+    """A user's driver, which takes NumPy arrays."""
+
+    def initial_memory(self, n: int) -> dict[str, Any]:
+        return {"last": np.zeros(n)}
+
+    def act(self, state: Any, memory: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        return 0.1 * (state.leader_speed - state.speed + memory["last"]), {"last": state.speed}
+
+
+CASES: dict[str, dict[str, Any]] = {
+    "two features and an expert": {"expert": "pi", "features": ("local", "expert_memory")},
+    "a warm-up": {"scenario": "ring-jammed", "warmup": 330, "expert": "pi", "features": ("local", "expert_memory")},
+    "sensors with errors": {"sensors": {"gap_error": 1.0, "dropout": 0.2}, "safety": {"gap_error": 1.0}},
+    "delayed actuators": {"actuator": {"delay": 0.2, "lag": 0.3}, "steps_per_control_step": 2, "reward": "eq16"},
+    "a population": {"population": "unjam:ngsim"},
+    "a user's expert": {"expert": Parrot},
+    "collisions": CRASHING,
+    "recorded": {"scenario": "recorded"},
+    "figure eight": {"scenario": "figure-eight", "horizon": 40, "warmup": 30},
+}
+
+
+def action(step: int, row: int, arguments: dict[str, Any]) -> float:
+    """A different one for each environment; with `CRASHING` the first two run into their leaders."""
+    return float(row < 2) if arguments is CRASHING else 0.5 * np.sin(0.1 * step + row)
+
+
+def step_single(row: int, arguments: dict[str, Any]) -> list[Any]:
+    """What SUMO's environment returns: observation, reward, and whether the episode is terminated or truncated."""
+    with closing(RoadEnv(**{"horizon": 40, **arguments})) as environment:
+        found: list[Any] = [(environment.reset(seed=SEEDS[row])[0], 0.0, False, False)]
+        has_ended = False
+        for step in range(STEPS):
+            if RESETS.get(step) == row:
+                found.append((environment.reset(seed=100 + step)[0], 0.0, False, False))
+                has_ended = False
+            if has_ended:
+                found.append((environment.reset()[0], 0.0, False, False))
+                has_ended = False
+            else:
+                *values, _ = environment.step([action(step, row, arguments)])
+                found.append(tuple(values))
+                has_ended = values[2] or values[3]
+    return found
+
+
+def step_all(arguments: dict[str, Any]) -> list[list[Any]]:
+    """The same of a vector environment, for each of its environments."""
+    environment, count = RoadVectorEnv(len(SEEDS), **{"horizon": 40, **arguments}), len(SEEDS)
+    observations, _ = environment.reset(seed=SEEDS)
+    found = [[(observation, 0.0, False, False)] for observation in observations]
+    for step in range(STEPS):
+        if step in RESETS:
+            options = {"reset_mask": np.arange(count) == RESETS[step]}
+            observations, _ = environment.reset(seed=[100 + step] * count, options=options)
+            found[RESETS[step]].append((observations[RESETS[step]], 0.0, False, False))
+        actions = np.array([[action(step, row, arguments)] for row in range(count)])
+        for row, values in enumerate(zip(*environment.step(actions)[:4], strict=True)):
+            found[row].append(values)
+    return found
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_episodes_equal_those_of_single_environments_in_sumo(name: str) -> None:
+    found, ends = step_all(CASES[name]), 0
+    for row, rows in enumerate(found):
+        expected = step_single(row, CASES[name])
+        assert len(rows) == len(expected)
+        for (observation, reward, *is_end), (single, single_reward, *is_single_end) in zip(rows, expected, strict=True):
+            np.testing.assert_allclose(observation, single, atol=2e-6)
+            assert reward == pytest.approx(single_reward, abs=1e-9)
+            assert is_end == is_single_end
+            ends += any(is_end)
+    assert ends >= len(SEEDS) - 1
+    assert any(row[2] for rows in found for row in rows) == (name == "collisions")
+
+
+def test_roads_end_with_their_recordings(tmp_path: Path) -> None:
+    for seconds in (20.0, 21.0, 22.5):
+        times = 0.1 * np.arange(round(seconds / 0.1) + 1)
+        speeds = pd.DataFrame({"time": times, "speed": 12.0 + np.sin(times + seconds)})
+        speeds.to_csv(tmp_path / f"{seconds}.csv", index=False)
+    arguments: dict[str, Any] = {"scenario": "recorded", "recordings": str(tmp_path)}
+    environment = RoadVectorEnv(8, **arguments)
+    files = [environment.reset(seed=0)[1]["drawn_values"]["file"]]
+    lengths, ages = [], np.zeros(8, int)
+    for _ in range(450):
+        *_, truncated, info = environment.step(np.zeros((8, 1)))
+        ages += 1
+        lengths += [(files[-1][row], ages[row]) for row in np.flatnonzero(truncated)]
+        if "drawn_values" in info:
+            files.append(np.where(info["_drawn_values"], info["drawn_values"]["file"], files[-1]))
+            ages[info["_drawn_values"]] = 0
+    assert set(lengths) == {(0.0, 200), (1.0, 210), (2.0, 225)}
+    expected = [run_episode(make_scenario("recorded", {"recordings": str(tmp_path)}), Constant(), (0,)).control_steps]
+    assert expected[0] == dict(lengths)[files[0][0]]
+
+
+@pytest.mark.parametrize("scenario", ["ring", "recorded"])
+def test_the_metrics_of_an_episode_are_in_the_info_of_its_last_step(scenario: str) -> None:
+    environment = RoadVectorEnv(2, scenario, horizon=60)
+    environment.reset(seed=3)
+    infos = [environment.step(np.full((2, 1), 0.1))[-1] for _ in range(60)]
+    assert not any("episode_metrics" in info for info in infos[:-1])
+    metrics = infos[-1]["episode_metrics"]
+    assert infos[-1]["_episode_metrics"].all()
+    for row in range(2):
+        episode = run_episode(make_scenario(scenario, {"horizon": 60}), Constant(acceleration=0.1), (3 + row,))
+        for name in ("return", "mean_speed", "speed_std_fleet", "cav_mean_speed", "mean_abs_accel"):
+            assert metrics[name][row] == pytest.approx(METRICS[name].function(episode), abs=1e-6)
+        assert metrics["steps"][row] == 60
+        terms = {name: sum(info["reward_terms"][name][row] for info in infos) for name in episode.reward_terms}
+        assert terms == pytest.approx({name: values.sum() for name, values in episode.reward_terms.items()})
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_seeds_count_up_and_episodes_can_be_repeated(exact: bool) -> None:
+    def run(seed: Any) -> Any:
+        observations = [environment.reset(seed=seed)[0]]
+        return [*observations, *(environment.step(np.ones((3, 1)))[0] for _ in range(45))]
+
+    environment = RoadVectorEnv(3, exact=exact, horizon=20, cavs=1)
+    first = run(4)
+    np.testing.assert_array_equal(run([4, 5, 6]), first)
+    assert np.abs(np.subtract(run(5), first)).max() > 0.01
+    assert (first[0] != first[21]).any()  # the next episode has another road
+    np.testing.assert_array_equal(run(4), first)
+
+
+def test_without_a_seed_episodes_are_those_after_the_last_seed() -> None:
+    environment, single = RoadVectorEnv(2), RoadEnv()
+    environment.reset(seed=8)
+    with closing(single):
+        single.reset(seed=9)
+        for _ in range(3):
+            np.testing.assert_allclose(environment.reset()[0][1], single.reset()[0], atol=1e-6)
+    assert RoadVectorEnv(2).reset()[0].shape == (2, 5)
+
+
+def test_quick_episodes_have_the_same_distribution_in_single_precision() -> None:
+    means: dict[bool, Any] = {}
+    for exact in (True, False):
+        environment = RoadVectorEnv(64, exact=exact, horizon=200)
+        environment.reset(seed=0)
+        *_, info = [environment.step(np.zeros((64, 1))) for _ in range(200)][-1]
+        means[exact] = info["episode_metrics"]
+    assert means[False]["mean_speed"].dtype == np.float32
+    for name, tolerance in {"mean_speed": 0.02, "speed_std_fleet": 0.02, "return": 10.0}.items():
+        assert means[False][name].mean() == pytest.approx(means[True][name].mean(), abs=tolerance)
+        assert (means[False][name] != means[True][name].astype(np.float32)).any()
+
+
+def test_numbers_of_the_fast_generator_are_standard_normal() -> None:
+    drawn = draw_single_normal(np.random.default_rng(0), (999, 1001))
+    assert (drawn.shape, drawn.dtype) == ((999, 1001), np.float32)
+    moments = [(drawn.astype(np.float64) ** power).mean() for power in (1, 2, 3, 4)]
+    np.testing.assert_allclose(moments, [0.0, 1.0, 0.0, 3.0], atol=0.03)
+    assert abs(np.corrcoef(drawn[:499].ravel(), drawn[500:].ravel())[0, 1]) < 0.01
+
+
+@pytest.mark.parametrize("name", ["two features and an expert", "recorded", "figure eight", "collisions"])
+def test_tensors_are_what_arrays_are(name: str) -> None:
+    arguments = {"horizon": 30, **CASES[name]}
+    arrays, tensors = RoadVectorEnv(3, **arguments), RoadVectorEnv(3, device="cpu", **arguments)
+    expected, found = arrays.reset(seed=1)[0], tensors.reset(seed=1)[0]
+    assert found.dtype == torch.float32
+    for step in range(50):
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+        actions = np.array([[action(step, row, CASES[name])] for row in range(3)])
+        expected, *numbers, info = arrays.step(actions)
+        found, *others, tensor_info = tensors.step(torch.as_tensor(actions))
+        for own, other in zip(numbers, others, strict=True):
+            np.testing.assert_allclose(own, other, atol=1e-9)
+        assert info.keys() == tensor_info.keys()
+        assert all(isinstance(values, torch.Tensor) for values in tensor_info["reward_terms"].values())
+
+
+def test_gradients_flow_through_tensors_of_many_steps() -> None:
+    def total_reward(actions: torch.Tensor) -> torch.Tensor:
+        environment.reset(seed=0)
+        return sum((environment.step(actions)[1].sum() for _ in range(30)), torch.zeros(()))
+
+    environment = RoadVectorEnv(2, device="cpu", reward="eq16", horizon=20)  # with the restart of both
+    actions = torch.tensor([[0.3], [-0.2]], dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(total_reward(actions), actions)
+    for row in range(2):
+        change = torch.zeros_like(actions)
+        change[row] = 1e-5
+        with torch.no_grad():
+            slope = (total_reward(actions + change) - total_reward(actions - change)) / 2e-5
+        assert gradient[row].item() == pytest.approx(slope.item(), rel=1e-4)
+    assert abs(gradient).min() > 1.0
+
+
+def test_it_follows_the_conventions_of_gymnasium() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        environment: Any = gymnasium.make_vec("unjam/FigureEight-v0", num_envs=3, horizon=20, expert="idm")
+        assert environment.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+        recorded = RecordEpisodeStatistics(environment)
+        observations, info = recorded.reset(seed=1)
+        assert observations in environment.observation_space
+        assert info["drawn_values"]["_radius"].all()
+        environment.action_space.seed(0)
+        steps = [recorded.step(environment.action_space.sample()) for _ in range(21)]
+        *_, truncated, info = steps[19]
+        assert truncated.all()
+        np.testing.assert_allclose(info["episode"]["r"], info["episode_metrics"]["return"], rtol=1e-6)
+        observations, rewards, *_, info = steps[20]
+        assert not rewards.any()
+        assert not info["_reward_terms"].any()
+        assert info["_drawn_values"].all()
+        as_list = DictInfoToList(environment)
+        as_list.reset(seed=1)
+        *_, infos = as_list.step(environment.action_space.sample())
+    assert infos[2]["reward_terms"].keys() == {"speed", "acceleration"}  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            {"scenario": "merge", "cavs": 1},
+            "scenario: merge is not possible in a batch (merge is not a ring); allowed: vec",
+        ),
+        (
+            {"scenario": "on-ramp", "cavs": 1},
+            "scenario: motorway is not possible in a batch (vehicles enter and leave); allowed: vec",
+        ),
+        ({"actuation": "flow"}, "actuation: flow is not allowed in a batch; allowed: raw, or shielded"),
+        ({"backend": "sumo"}, "backend: is not an option of batches; allowed: vectorization_mode='async'"),
+        ({"render_mode": "rgb_array"}, "render_mode: is not an option of batches"),
+        ({"cavs": 2}, "cavs: several are not allowed here; allowed: 1"),
+        ({"num_envs": 0}, "num_envs: 0 is not allowed; allowed: an integer >= 1"),
+        ({"lenght": 230}, "lenght: unknown name"),
+        ({"expert": Parrot, "device": "cpu"}, "allowed: one that takes tensors, like 'pi'; or device=''"),
+    ],
+)
+def test_what_a_batch_cannot_do_is_refused_in_one_line(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=re.escape(words)):
+        RoadVectorEnv(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda made: made.reset(seed=[1]), "seed: 1 seeds are not allowed; allowed: 2, or a single one"),
+        (lambda made: made.reset(seed=-1), "seed: -1 is not allowed; allowed: >= 0"),
+        (
+            lambda made: made.reset(seed="a"),
+            "seed: 'a' is not allowed; allowed: an integer, or one for each environment",
+        ),
+        (lambda made: made.reset(seed=[1, 0.5]), "seed: [1, 0.5] is not allowed; allowed: an integer"),
+        (lambda made: made.reset(options={"length": 230}), "options: 'length' is not allowed; allowed: 'reset_mask'"),
+        (lambda made: made.reset(options={"reset_mask": [1, 0]}), "options: reset_mask is not 2 booleans"),
+        (lambda made: made.reset(options={"reset_mask": np.zeros(2, bool)}), "options: reset_mask is not 2 booleans"),
+        (lambda made: made.step(np.zeros(3)), "step: actions of shape (3,) are not allowed; allowed: (2, 1)"),
+        (lambda made: made.step(np.full((2, 1), np.nan)), "finite"),
+        (lambda made: made.step([["a"], ["b"]]), "step: actions is not numbers"),
+    ],
+)
+def test_wrong_calls_are_refused_in_one_line(call: Callable[[Any], Any], words: str) -> None:
+    made = RoadVectorEnv(2)
+    made.reset(seed=0)
+    with pytest.raises(InputError, match=re.escape(words)):
+        call(made)
+
+
+def test_other_wrong_uses_are_refused() -> None:
+    with pytest.raises(UnjamError, match="call reset first"):
+        RoadVectorEnv(2).step(np.zeros((2, 1)))
+    with pytest.raises(InputError, match="reset_mask is not allowed in the first reset"):
+        RoadVectorEnv(2).reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(
+        MissingPartError, match="device: 'nonesuch' is not available to torch; allowed: 'cpu', or '' for NumPy"
+    ):
+        RoadVectorEnv(2, device="nonesuch")
+    made = RoadVectorEnv(2, reward=lambda outcome: {"mine": outcome.speeds.mean(-1) / 0.0 * np.array([1.0, 0.0])})
+    made.reset(seed=0)
+    with (
+        np.errstate(all="ignore"),
+        pytest.raises(InputError, match=r"environment 0: term 'mine' is (inf|nan); allowed"),
+    ):
+        made.step(np.zeros((2, 1)))
