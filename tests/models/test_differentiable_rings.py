@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from unjam.drivers import PISaturation
+from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Memory
 from unjam.drivers.safety import Actuator, FollowingState, SafetyFilter
 from unjam.drivers.sensors import Sensors
@@ -185,7 +186,8 @@ FILTERED = {"safety": SafetyFilter(time_gap=2.5), "steps_per_control_step": 2, "
 )
 def test_an_episode_is_that_of_a_batch_with_rewards(changes: dict[str, Any], is_filtered: bool) -> None:
     road, seeds = replace(SMALL, **changes), [(3, 1), (3, 2)]
-    driver, rings = PISaturation(window=5.0, time_step=road.control_step), DifferentiableRings(road, seeds)
+    driver = Constant(acceleration=0.8) if is_filtered else PISaturation(window=5.0)
+    rings = DifferentiableRings(road, seeds)
     memory, rewards, speeds = rings.initial_memory(driver), [], [rings.speeds]
     with torch.no_grad():
         while not rings.has_ended:

@@ -31,7 +31,7 @@ class DifferentiableRings(RingBatch):
 
     The episodes are those of `run_episode` with the same seeds, except for rounding. `local_state()` returns what the
     CAVs observe: tensors of shape (CAVs * W,), with the first CAV of each ring, then the second one, and so on.
-    `speeds` [m/s] has the shape (vehicles, W); `crashed_roads` and `has_ended` say which rings had a collision, and whether
+    `speeds` [m/s] has the shape (vehicles, W). `crashed_roads` marks rings with a collision, and `has_ended` whether
     the episode is over.
     """
 
