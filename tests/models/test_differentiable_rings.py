@@ -164,6 +164,7 @@ def test_after_detach_no_gradient_flows_to_earlier_steps() -> None:
     memory, bias = rings.initial_memory(driver), torch.zeros(2, dtype=torch.float64, requires_grad=True)
 
     def drive(memory: Memory) -> tuple[Tensor, Memory]:
+        reward = torch.zeros(2)
         for _ in range(15):
             acceleration, memory = driver.act(rings.local_state(), memory)
             reward = rings.step(acceleration + bias)
@@ -213,10 +214,10 @@ def test_rings_with_a_noise_generator_have_a_warm_up_too() -> None:
 
 
 def test_a_ring_counts_until_its_collision() -> None:
-    road = replace(SMALL, safety=SafetyFilter(active=False), actuation="raw")
+    road = replace(SMALL, safety=SafetyFilter(active=False), actuation="raw", horizon=400)
     rings = DifferentiableRings(road, [0, 1], reward="eq16")
     command = torch.tensor([1.0, 0.0], dtype=torch.float64)
-    while not rings.crashed_roads[0]:
+    while not rings.crashed_roads[0] and not rings.has_ended:
         rings.step(command)
     rings.step(command)
     terms = rings.reward_terms

@@ -114,7 +114,7 @@ class DifferentiableRings(RingBatch):
         """Simulate one control step, and return the reward of each ring, shape (W,); `reward_terms` are its terms.
 
         `acceleration` [m/s2], shape (CAVs * W,), is limited to the scenario's limits, and then by the safety filter.
-        After a collision, `crashed_roads`, the rewards of a ring are zero.
+        After a collision, `crashed_roads`, and after the horizon, the rewards of a ring are zero.
         """
         was_running = self._is_running
         self.advance(Command(acceleration))
