@@ -20,6 +20,8 @@ from unjam.worlds.batch.run import run_batches
 from unjam.worlds.worker_pool import EpisodeTask
 
 RINGS, WINDOW, GAMMA, LAMBDA = 32, 300, 0.998, 0.95
+ACCELERATION_WEIGHT = 4.0
+"""that of the scenario's reward [s2/m]"""
 BLOCK = 10
 """control steps between two states with which the critic learns"""
 MEMORY_SECONDS = torch.tensor([10.0, 40.0, 40.0, 40.0])
@@ -115,7 +117,10 @@ for update in range(options.updates):
     inputs, rewards = [critic_inputs(rings, memory["means"])], []
     for step in range(min(WINDOW, scenario.horizon - rings.control_steps)):
         acceleration, memory["means"] = policy(rings.local_state(), memory["means"])
-        rewards.append(rings.step(acceleration))
+        reward = rings.step(acceleration)
+        # A command that the safety filter replaces has no gradient, so it costs as much as one that is carried out.
+        filtered = abs(acceleration) - abs(rings.last_applied_acceleration())
+        rewards.append(reward - ACCELERATION_WEIGHT * filtered)
         if (step + 1) % BLOCK == 0:
             inputs.append(critic_inputs(rings, memory["means"]))
     returns = (1 - GAMMA) * sum(GAMMA**step * reward for step, reward in enumerate(rewards))

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from unjam.drivers import PISaturation
+from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Memory
 from unjam.drivers.safety import Actuator, FollowingState, SafetyFilter
 from unjam.drivers.sensors import Sensors
@@ -163,6 +164,7 @@ def test_after_detach_no_gradient_flows_to_earlier_steps() -> None:
     memory, bias = rings.initial_memory(driver), torch.zeros(2, dtype=torch.float64, requires_grad=True)
 
     def drive(memory: Memory) -> tuple[Tensor, Memory]:
+        reward = torch.zeros(2)
         for _ in range(15):
             acceleration, memory = driver.act(rings.local_state(), memory)
             reward = rings.step(acceleration + bias)
@@ -175,11 +177,17 @@ def test_after_detach_no_gradient_flows_to_earlier_steps() -> None:
     assert not any(each.requires_grad for each in (rings.speeds, rings.positions, rings.gaps, reward))
 
 
+FILTERED = {"safety": SafetyFilter(time_gap=2.5), "steps_per_control_step": 2, "actuator": LAGGING}
+
+
 @pytest.mark.parametrize(
-    "changes", [{}, {"warmup": 100}, {"cavs": 2, "warmup": 20}], ids=["start", "warm-up", "two CAVs"]
+    ("changes", "is_filtered"),
+    [({}, False), (FILTERED, True), ({"warmup": 100}, False), ({"cavs": 2, "warmup": 20}, False)],
+    ids=["start", "filter acts", "warm-up", "two CAVs"],
 )
-def test_an_episode_is_that_of_a_batch_with_rewards(changes: dict[str, Any]) -> None:
-    road, driver, seeds = replace(SMALL, **changes), PISaturation(window=5.0), [(3, 1), (3, 2)]
+def test_an_episode_is_that_of_a_batch_with_rewards(changes: dict[str, Any], is_filtered: bool) -> None:
+    road, seeds = replace(SMALL, **changes), [(3, 1), (3, 2)]
+    driver = Constant(acceleration=0.8) if is_filtered else PISaturation(window=5.0)
     rings = DifferentiableRings(road, seeds)
     memory, rewards, speeds = rings.initial_memory(driver), [], [rings.speeds]
     with torch.no_grad():
@@ -188,6 +196,7 @@ def test_an_episode_is_that_of_a_batch_with_rewards(changes: dict[str, Any]) -> 
             rewards.append(rings.step(acceleration))
             speeds.append(rings.speeds)
     episodes = run_batch([EpisodeTask(road, driver, seed) for seed in seeds])
+    assert is_filtered == any((each.filter_braking > 0.0).any() for one in episodes for each in one.trajectories)
     for ring, episode in enumerate(episodes):
         assert np.abs(episode.reward - torch.stack(rewards)[:, ring].numpy()).max() < 1e-9
         assert np.abs(episode.speeds - torch.stack(speeds)[..., ring].numpy()).max() < 1e-9
@@ -205,10 +214,10 @@ def test_rings_with_a_noise_generator_have_a_warm_up_too() -> None:
 
 
 def test_a_ring_counts_until_its_collision() -> None:
-    road = replace(SMALL, safety=SafetyFilter(active=False), actuation="raw")
+    road = replace(SMALL, safety=SafetyFilter(active=False), actuation="raw", horizon=400)
     rings = DifferentiableRings(road, [0, 1], reward="eq16")
     command = torch.tensor([1.0, 0.0], dtype=torch.float64)
-    while not rings.crashed_roads[0]:
+    while not rings.crashed_roads[0] and not rings.has_ended:
         rings.step(command)
     rings.step(command)
     terms = rings.reward_terms

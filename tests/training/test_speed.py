@@ -7,19 +7,19 @@ import torch
 from unjam.drivers import PISaturation
 from unjam.drivers.check import check_driver
 from unjam.errors import MissingPartError
-from unjam.training import benchmark
+from unjam.training import speed
 from unjam.training.speed import benchmark_batches, benchmark_episodes, make_benchmark_driver
 
 
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measures less, and so less exactly."""
-    monkeypatch.setattr(benchmark, "TRACI_STEPS", 50)
-    monkeypatch.setattr(benchmark, "ROLLOUT_SIZES", ((500, 20), (50, 10)))
-    monkeypatch.setattr(benchmark, "RING_SIZES", {22: 200, 66: 100})
-    monkeypatch.setattr(benchmark, "BATCH_VEHICLES", 2200)
-    monkeypatch.setattr(benchmark, "STEPS_PER_ROUND", 20)
-    monkeypatch.setattr(benchmark, "VECTOR_ENVIRONMENTS", ((50, False),))
+    monkeypatch.setattr(speed, "TRACI_STEPS", 50)
+    monkeypatch.setattr(speed, "ROLLOUT_SIZES", ((500, 20), (50, 10)))
+    monkeypatch.setattr(speed, "RING_SIZES", {22: 200, 66: 100})
+    monkeypatch.setattr(speed, "BATCH_VEHICLES", 2200)
+    monkeypatch.setattr(speed, "STEPS_PER_ROUND", 20)
+    monkeypatch.setattr(speed, "VECTOR_ENVIRONMENTS", ((50, False),))
 
 
 @pytest.fixture(autouse=True)
@@ -66,8 +66,8 @@ def test_benchmark_has_rates_and_ratios_and_restores_cores() -> None:
 
 
 def test_batches_are_measured_with_both_human_models(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(benchmark, "STEPS_PER_ROUND", 3)
-    monkeypatch.setattr(benchmark, "BATCH_SIZES", {"cpu": (2, 5)})
+    monkeypatch.setattr(speed, "STEPS_PER_ROUND", 3)
+    monkeypatch.setattr(speed, "BATCH_SIZES", {"cpu": (2, 5)})
     messages: list[str] = []
     found = benchmark_batches("cpu", messages.append)
     assert found["device"] == "one core"

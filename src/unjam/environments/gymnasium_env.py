@@ -385,7 +385,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         return observation, result.reward, result.terminated, truncated, {"reward_terms": result.reward_terms}
 
     @property
-    def spec(self) -> EnvSpec | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def spec(self) -> EnvSpec | None:
         """The specification of `gymnasium.make`, whose `max_episode_steps` is the horizon of the constructor.
 
         It is not registered: the `TimeLimit` that Gymnasium then adds would end episodes with a longer horizon early.
@@ -393,7 +393,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         return self._spec
 
     @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
+    def spec(self, spec: EnvSpec | None) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
         self._spec = spec
         if spec is not None and spec.max_episode_steps is None:
             spec.max_episode_steps = self._road.scenario.horizon

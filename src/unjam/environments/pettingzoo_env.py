@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
-from typing import Any, ClassVar
+from typing import Any, ClassVar, overload
 
 import numpy as np
 from gymnasium import spaces
@@ -124,6 +124,14 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
     def close(self) -> None:
         """Close SUMO; further calls have no effect."""
         self._road.close()
+
+
+@overload
+def parallel_env(scenario: str = "ring", slots: None = None, **arguments: Any) -> ParallelRoadEnv: ...
+
+
+@overload
+def parallel_env(scenario: str, slots: int, **arguments: Any) -> SlottedRoadEnv: ...
 
 
 def parallel_env(

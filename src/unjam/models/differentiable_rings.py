@@ -31,6 +31,8 @@ class DifferentiableRings(RingBatch):
 
     The episodes are those of `run_episode` with the same seeds, except for rounding. `local_state()` returns what the
     CAVs observe: tensors of shape (CAVs * W,), with the first CAV of each ring, then the second one, and so on.
+    `speeds` [m/s] has the shape (vehicles, W). `crashed_roads` marks rings with a collision, and `has_ended` whether
+    the episode is over.
     """
 
     reward_terms: Mapping[str, Tensor] = MappingProxyType({})
@@ -112,12 +114,12 @@ class DifferentiableRings(RingBatch):
         """Simulate one control step, and return the reward of each ring, shape (W,); `reward_terms` are its terms.
 
         `acceleration` [m/s2], shape (CAVs * W,), is limited to the scenario's limits, and then by the safety filter.
-        After a collision, `crashed_roads`, the rewards of a ring are zero.
+        After a collision, `crashed_roads`, and after the horizon, the rewards of a ring are zero.
         """
         was_running = self._is_running
         self.advance(Command(acceleration))
-        state = self.exact_state()
-        by_cav = self.limits.clip(acceleration), time_gap(state.leader_gap, state.speed), state.speed
+        speed, _, gap = self.following_state()
+        by_cav = self.last_applied_acceleration(), time_gap(gap, speed), speed
         accelerations, gaps, speeds = (values.reshape(self._shape).T for values in by_cav)
         outcome = Outcome(self.speeds.T, accelerations, gaps, self.crashed_roads, 0.0 * was_running, speeds)
         self.reward_terms = {name: values * was_running for name, values in self._reward(outcome).items()}
