@@ -1,4 +1,4 @@
-"""Train a policy on the ring by analytic gradients, from nothing, and compare it with PI on test seeds in SUMO.
+"""Train a policy on the ring by analytic gradients, from nothing, and compare it with PI on test seeds.
 
 Short-horizon actor-critic (SHAC, Xu et al. 2022, ICLR): the gradient of the return flows back through 30 s of traffic,
 and a critic stands for the time after that.
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 import unjam
 from unjam.drivers.observation import local_observation
 from unjam.drivers.user_driver import as_driver
-from unjam.seeds import make_test_seeds
+from unjam.seeds import held_out_seeds
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.worker_pool import EpisodeTask
 
@@ -135,7 +135,7 @@ for update in range(options.updates):
         print(f"update {update + 1}: mean reward {torch.stack(rewards).mean().item():.3f}", flush=True)
 wall, cpu = time.perf_counter() - started, time.process_time() - cpu_started
 print(f"trained on {options.updates * WINDOW * RINGS:,} environment steps in {wall:.0f} s (CPU time {cpu:.0f} s)")
-seeds = make_test_seeds(options.episodes)
+seeds = held_out_seeds(options.episodes)
 returns = dict[str, torch.Tensor]()
 for label, driver in {"pi": unjam.make_driver("pi", scenario.control_step), "policy": as_driver(policy)}.items():
     episodes = run_batches([EpisodeTask(scenario, driver, seed) for seed in seeds])

@@ -234,6 +234,7 @@ def test_a_ring_counts_until_its_collision() -> None:
         ((replace(SMALL, actuation="flow"), [0]), "actuation: flow is not allowed in a batch"),
         ((replace(SMALL, sensors=Sensors(dropout=0.1)), [0]), "sensors: errors have no gradient"),
         (("rign", [0]), "did you mean 'ring'"),
+        (("ring", [0], "cpu", torch.int64), "dtype: 'torch.int64' is not allowed; allowed: torch.float32"),
         (("ring", [-1]), "seed: -1 is not allowed"),
     ],
 )

@@ -63,6 +63,8 @@ class DifferentiableRings(RingBatch):
             MissingPartError: the device is not available.
         """
         check_device(device)
+        if dtype not in (torch.float32, torch.float64):
+            raise invalid_value("dtype", str(dtype), "torch.float32, torch.float64")
         road, numbers = make_scenario(scenario), [as_seed(seed) for seed in seeds]
         if not numbers:
             raise invalid_value("seeds", seeds, "one or more")
