@@ -64,12 +64,12 @@ class LocalState(NamedTuple):
         return self.map(lambda values: values[index])
 
     def as_read_only(self) -> "LocalState":
-        """Return the same values as write-protected arrays; a world may not change the arrays in place later."""
-        protected = self.map(lambda values: values.view())
-        for values in protected:
+        """Return a copy with write-protected arrays."""
+        copy = self.map(lambda values: values.copy())
+        for values in copy:
             if values is not None:
                 values.flags.writeable = False
-        return protected
+        return copy
 
 
 MAX_OBSERVED_GAP = 100.0
