@@ -13,7 +13,7 @@ import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
-from unjam.drivers import Constant
+from unjam.drivers import Constant, LocalState
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.environments.vector_env import RoadVectorEnv
 from unjam.errors import InputError, MissingPartError, UnjamError
@@ -21,6 +21,7 @@ from unjam.measures.metrics import METRICS
 from unjam.scenarios import make_scenario
 from unjam.worlds.batch.noise import draw_single_normal
 from unjam.worlds.episode import run_episode
+from unjam.worlds.reward import Outcome
 
 SEEDS = [5, 6, 7]
 RESETS = {13: 1, 37: 0, 61: 2}
@@ -314,3 +315,53 @@ def test_other_wrong_uses_are_refused() -> None:
         pytest.raises(InputError, match=r"environment 0: term 'mine' is (inf|nan); allowed"),
     ):
         made.step(np.zeros((2, 1)))
+
+
+def mix(state: LocalState) -> np.ndarray:
+    return 0.1 * (np.mean(state.leader_speed) - state.speed)
+
+
+class Counting:
+    count = 0
+
+    def initial_memory(self, n: int) -> dict[str, Any]:
+        return {}
+
+    def act(self, state: LocalState, memory: dict[str, Any]) -> Any:
+        self.count += 1
+        return np.full(len(state.speed), 0.01 * self.count), memory
+
+
+@pytest.mark.parametrize("expert", [mix, Counting()])
+def test_experts_that_couple_environments_are_refused(expert: Any) -> None:
+    with pytest.raises(InputError, match="driver"):
+        RoadVectorEnv(3, expert=expert)
+
+
+def test_a_reward_that_writes_into_its_outcome_changes_no_episode() -> None:
+    def destructive(outcome: Outcome) -> dict[str, Any]:
+        mean = np.array(outcome.speeds.mean(-1))
+        outcome.speeds[:] = 0.0
+        outcome.cav_speeds[:] = 0.0
+        return {"mean": mean}
+
+    made = [RoadVectorEnv(2, horizon=30), RoadVectorEnv(2, horizon=30, reward=destructive)]
+    for each in made:
+        each.reset(seed=1)
+    for _ in range(25):
+        np.testing.assert_array_equal(*(each.step(np.full((2, 1), 0.5))[0] for each in made))
+
+
+def test_reserved_seeds_of_any_environment_are_warned_of() -> None:
+    with pytest.warns(UserWarning, match="seed=1000000 is reserved"):
+        RoadVectorEnv(2, horizon=5).reset(seed=999_999)
+
+
+def test_infinite_actions_are_refused_except_where_they_are_ignored() -> None:
+    made = RoadVectorEnv(2, horizon=5)
+    made.reset(seed=1)
+    with pytest.raises(InputError, match="inf of environment 1 is not allowed"):
+        made.step(np.array([[0.0], [np.inf]]))
+    ends = [made.step(np.zeros((2, 1)))[3].all() for _ in range(5)]
+    assert ends[-1]
+    made.step(np.full((2, 1), np.nan))

@@ -38,6 +38,7 @@ COMMANDS = {
     "export": ("export", "run", "--out", "it.unjam"),
     "certify": ("certify", "run"),
     "verify": ("verify", "run"),
+    "benchmark": ("benchmark", "run", "--suite", "closed-roads-v1", "--out", "new.json"),
 }
 
 

@@ -43,6 +43,9 @@ from unjam.worlds.worker_pool import WorkerPool
 EXACT_BACKEND = "exact"
 """backend of benchmarks: the batch where its episodes are those of SUMO, else SUMO"""
 
+MAX_TRAINING_STEPS = 2**53
+"""environment steps that a result can record"""
+
 
 def benchmark(
     driver: str | DriverLike = DEFAULT_DRIVER,
@@ -71,6 +74,8 @@ def benchmark(
     roads = {name: make_scenario(f"{FAMILY_PREFIX}{name}") for name in find_suite(suite).roads}
     if workers is not None and workers < 1:
         raise invalid_value("workers", workers, ">= 1")
+    if training_steps is not None and not 0 <= training_steps <= MAX_TRAINING_STEPS:
+        raise invalid_value("training_steps", training_steps, f"0 to {MAX_TRAINING_STEPS:g}")
     drivers, reasons = _make_drivers(driver, roads)
     if backend != EXACT_BACKEND:
         with open_backend(backend) as simulator:
@@ -86,8 +91,11 @@ def benchmark(
     )
     path = None if out is None else Path(out)
     if path is not None:
+        if path.is_symlink():
+            raise invalid_value("out", str(path), "a file, and no link")
         make_folder(path.parent)
         result = _stored_result(path, result) if os.path.lexists(path) else result
+    written = path.read_bytes() if path is not None and path.is_file() else b""
     with WorkerPool(workers or os.cpu_count() or 1) as pool:
         for number, name in enumerate(result.missing_roads, len(result.roads) + 1):
             scenario = roads[name]
@@ -98,7 +106,12 @@ def benchmark(
             record = RoadRecord(used, to_columns(baseline), to_columns(rows), one_line(reasons.get(name, "")))
             result = replace(result, roads={**result.roads, name: record})
             if path is not None:
+                if (path.read_bytes() if path.is_file() else b"") != written:
+                    raise InputError(
+                        f"out: {path} was changed by another process meanwhile; allowed: a file of its own"
+                    )
                 write_result(path, result)
+                written = path.read_bytes()
             row = result.road_rows()[len(result.roads) - 1]
             progress(f"{number} of {len(roads)}: {name}: gain {row['gain']:.2f}, {row['feasible']}")
     return result

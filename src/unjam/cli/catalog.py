@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from unjam.cli.options import JsonOption
-from unjam.cli.output import console, err_console, new_table, print_json
+from unjam.cli.output import console, new_table, print_json
 from unjam.controller import PACKAGED_PREFIX, packaged_file, packaged_names
 from unjam.controller.file import read_controller
 from unjam.drivers.observation import FEATURES
@@ -61,7 +61,7 @@ def scenarios_command(
             table.add_row(key, *(facts[column] for column in columns), f"{scenario.horizon:,}", warmup)
         console.print(table)
         if name is None:
-            err_console.print(f"{len(FAMILY_SCENARIOS)} roads of `unjam benchmark`: unjam scenarios {FAMILY_GROUP}")
+            console.print(f"{len(FAMILY_SCENARIOS)} roads of `unjam benchmark`: unjam scenarios {FAMILY_GROUP}")
         return
     scenario = example_scenario(name)
     if picture is not None:

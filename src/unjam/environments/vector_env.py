@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from unjam.drivers.check import check_driver
 from unjam.drivers.command import as_numbers
 from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike
 from unjam.drivers.user_driver import DriverLike
@@ -19,6 +20,7 @@ from unjam.errors import InputError, MissingPartError, UnjamError, import_option
 from unjam.measures.step_metrics import step_metrics
 from unjam.physics.arrays import Array, clip, namespace, replace_entries
 from unjam.scenarios import make_scenario
+from unjam.seeds import RESERVED_SEEDS, warn_of_reserved_seed
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, draw_single_normal
 from unjam.worlds.batch.ring.record import as_numpy
 from unjam.worlds.batch.ring.world import RingBatch
@@ -27,6 +29,8 @@ from unjam.worlds.batch.support import required_batch_kind, statistically_unsupp
 from unjam.worlds.episode import as_seed
 from unjam.worlds.reward import Outcome, RewardLike, time_gap, validate_reward_terms
 
+EXPERT_CHECK_STEPS = 3
+"""random steps in which an expert must drive each row by itself, without a state of its own"""
 OTHER_MODE = "allowed: vectorization_mode='async', which simulates in SUMO"
 
 
@@ -60,6 +64,10 @@ def _with_masks(values: dict[str, Any], mask: Array) -> dict[str, Any]:
     return values | {f"_{name}": mask for name in values}
 
 
+def _copy(values: Array) -> Array:
+    return values.copy() if isinstance(values, np.ndarray) else values.clone()
+
+
 class _Episodes:
     """Episodes on the roads of a batch, and the driver of their CAVs."""
 
@@ -76,9 +84,8 @@ class _Episodes:
         world.advance(decision.command)
         speed, _, gap = world.following_state()
         accelerations, time_gaps = world.last_applied_acceleration()[:, None], time_gap(gap, speed)[:, None]
-        return Outcome(
-            world.speeds.T, accelerations, time_gaps, world.crashed_roads, 0.0 * speed, cav_speeds=speed[:, None]
-        )
+        speeds, crashed, speed = map(_copy, (world.speeds.T, world.crashed_roads, speed))  # rewards may write into them
+        return Outcome(speeds, accelerations, time_gaps, crashed, 0.0 * speed, cav_speeds=speed[:, None])
 
     def observe(self) -> None:
         """Let the driver observe the current state, once in each control step."""
@@ -158,6 +165,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         needs_numpy = self._road.copy_driver().expert.requirements().needs_numpy
         if device and needs_numpy:
             raise invalid_value("expert", expert, "one that takes tensors, like 'pi'; or device='', NumPy")
+        if expert and not device:
+            check_driver(self._road.copy_driver().expert, steps=EXPERT_CHECK_STEPS)
         self._make_kind = partial(_torch_kind, device=device) if device else _numpy_kind
         self._exact, self._device, self._is_numpy, self.num_envs = exact, device, not device, num_envs
         self._kind = self._make_array_kind((0,))
@@ -185,6 +194,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode in each environment, or in those of `options["reset_mask"]`, booleans of shape (W,)."""
         rows, seeds = self._rows_to_reset(options or {}), self._seeds_of_environments(seed)
+        warn_of_reserved_seed(next((each for each in seeds if each in RESERVED_SEEDS), None))
         for row in rows:
             given = seeds[row]
             if given is None and self._seeds[row] is None:
@@ -298,7 +308,15 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         allowed = (self.num_envs, 1), (self.num_envs,)
         if np.shape(actions) not in allowed:
             raise InputError(f"step: actions of shape {np.shape(actions)} are not allowed; allowed: {allowed[0]}")
-        return self._kind.to_array(actions).reshape(-1)
+        found = self._kind.to_array(actions).reshape(-1)
+        if rows := self._ended_rows:  # their actions are ignored
+            found = replace_entries(found, rows, self._kind.to_array(np.zeros(self.num_envs)), rows)
+        if self._is_numpy and not np.isfinite(found).all():
+            row = int(np.argmin(np.isfinite(found)))
+            raise InputError(
+                f"step: actions: {found[row]} of environment {row} is not allowed; allowed: finite numbers"
+            )
+        return found
 
     def _reward_terms(self, outcome: Outcome) -> dict[str, Array]:
         reward = self._road.reward
