@@ -20,10 +20,10 @@ RESERVED_SEEDS = range(TRAINING_SEED_LIMIT, TRAINING_SEED_LIMIT + 1000)
 """first numbers of seeds that are reserved for such purposes"""
 
 
-def warn_of_reserved_seed(seed: int | None) -> None:
-    """Warn if the seed of an environment is reserved: test seeds begin with it."""
-    if seed in RESERVED_SEEDS:
-        text = f"reset: seed={seed} is reserved for tests; allowed in trainings: other seeds"
+def warn_of_reserved_seed(*seeds: int | None) -> None:
+    """Warn of the first seed of an environment that is reserved: test seeds begin with it."""
+    if (found := next((seed for seed in seeds if seed in RESERVED_SEEDS), None)) is not None:
+        text = f"reset: seed={found} is reserved for tests; allowed in trainings: other seeds"
         warnings.warn(f"{text}, such as those below {TRAINING_SEED_LIMIT:,}", stacklevel=3)
 
 

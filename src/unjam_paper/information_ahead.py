@@ -17,7 +17,7 @@ from optuna.distributions import FloatDistribution
 from unjam.controller import make_driver
 from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.smooth_acc import SmoothACC
+from unjam.drivers.smooth_acc import SmoothACC, update_mean
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
 from unjam.measures.statistics import estimate
 from unjam.physics.arrays import Array, Floats
@@ -64,15 +64,12 @@ class InformedACC(SmoothACC):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration, and the new memory; rows are those of all roads, for one candidate after another."""
-        _, after = super().act(state, memory)
         step = min(int(memory["step"][0]), len(self.received_speeds) - 1)
         received = np.tile(self.received_speeds[step], len(state.speed) // self.received_speeds.shape[1])
-        before = np.where(np.isnan(memory["mean_received_speed"]), received, memory["mean_received_speed"])
-        ahead = before + (1.0 - np.exp(-self.time_step / self.ahead_averaging_time)) * (received - before)
-        mean = after["mean_leader_speed"]
-        mean = mean + self.ahead_weight * (ahead - mean)
-        after |= {"mean_received_speed": ahead, "step": memory["step"] + 1.0}
-        return self.acceleration_from_mean(mean, state), after
+        ahead = update_mean(memory["mean_received_speed"], received, self.ahead_averaging_time, self.time_step)
+        mean = update_mean(memory["mean_leader_speed"], state.leader_speed, self.averaging_time, self.time_step)
+        after = {"mean_leader_speed": mean, "mean_received_speed": ahead, "step": memory["step"] + 1.0}
+        return self.acceleration_from_mean(mean + self.ahead_weight * (ahead - mean), state), after
 
 
 def received_speeds(scenarios: list[Recorded], latency: float) -> Floats:

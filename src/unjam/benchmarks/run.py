@@ -8,7 +8,7 @@ from typing import Any
 
 from safetensors.numpy import save
 
-from unjam.benchmarks.episodes import FAMILY_METRICS, FAMILY_TEST_SEEDS, make_tasks
+from unjam.benchmarks.episodes import FAMILY_TEST_SEEDS, family_metrics, make_tasks
 from unjam.benchmarks.result import (
     MAX_LABEL_CHARACTERS,
     BenchmarkResult,
@@ -95,7 +95,7 @@ def benchmark(
             raise invalid_value("out", str(path), "a file, and no link")
         make_folder(path.parent)
         result = _stored_result(path, result) if os.path.lexists(path) else result
-    written = path.read_bytes() if path is not None and path.is_file() else b""
+    written = _content(path)
     with WorkerPool(workers or os.cpu_count() or 1) as pool:
         for number, name in enumerate(result.missing_roads, len(result.roads) + 1):
             scenario = roads[name]
@@ -106,15 +106,20 @@ def benchmark(
             record = RoadRecord(used, to_columns(baseline), to_columns(rows), one_line(reasons.get(name, "")))
             result = replace(result, roads={**result.roads, name: record})
             if path is not None:
-                if (path.read_bytes() if path.is_file() else b"") != written:
+                if _content(path) != written:
                     raise InputError(
                         f"out: {path} was changed by another process meanwhile; allowed: a file of its own"
                     )
                 write_result(path, result)
-                written = path.read_bytes()
+                written = _content(path)
             row = result.road_rows()[len(result.roads) - 1]
             progress(f"{number} of {len(roads)}: {name}: gain {row['gain']:.2f}, {row['feasible']}")
     return result
+
+
+def _content(path: Path | None) -> bytes:
+    """Return the content of a file; nothing if there is none."""
+    return path.read_bytes() if path is not None and path.is_file() else b""
 
 
 def _make_drivers(
@@ -149,9 +154,8 @@ def _drive_road(scenario: Scenario, driver: Driver, backend: str, pool: WorkerPo
 
 
 def _measure_episode(index: int, episode: Episode) -> dict[str, Any]:
-    row = measure(episode)
-    raise_failure([row])
-    return {name: row[name] for name in FAMILY_METRICS}
+    raise_failure([] if episode.has_run else [measure(episode)])
+    return family_metrics(index, episode)
 
 
 def _is_free_of_user_code(driver: Driver) -> bool:

@@ -69,12 +69,12 @@ class SmoothACC(FormulaDriver):
         """Return `memory` with a share of the mean of the leader's speeds in the warm-up."""
         mean = memory["mean_leader_speed"]
         for step in range(history.leader_speed.shape[1]):
-            mean = self._update_mean(mean, history.leader_speed[:, step])
+            mean = update_mean(mean, history.leader_speed[:, step], self.averaging_time, self.time_step)
         return {"mean_leader_speed": self.history_factor * mean}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the commanded speed, and the new memory."""
-        mean = self._update_mean(memory["mean_leader_speed"], state.leader_speed)
+        mean = update_mean(memory["mean_leader_speed"], state.leader_speed, self.averaging_time, self.time_step)
         return self.acceleration_from_mean(mean, state), {"mean_leader_speed": mean}
 
     def acceleration_from_mean(self, mean: Array, state: LocalState) -> Array:
@@ -103,9 +103,10 @@ class SmoothACC(FormulaDriver):
         """Return the mean leader speed, scaled, shape (n, 1)."""
         return stack_columns((memory["mean_leader_speed"] / SPEED_SCALE,))
 
-    def _update_mean(self, mean: Array, leader_speed: Array) -> Array:
-        xp = namespace(leader_speed)
-        mean = xp.where(xp.isnan(mean), leader_speed, mean)
-        time = clamp_min(self.averaging_time, MIN_AVERAGING)
-        weight = 1.0 - namespace(time).exp(-self.time_step / time)
-        return mean + weight * (leader_speed - mean)
+
+def update_mean(mean: Array, value: Array, averaging_time: Array, time_step: float) -> Array:
+    """Return the exponential mean after a step [s]; an unknown mean (NaN) becomes the value."""
+    xp = namespace(value)
+    mean = xp.where(xp.isnan(mean), value, mean)
+    time = clamp_min(averaging_time, MIN_AVERAGING)
+    return mean + (1.0 - namespace(time).exp(-time_step / time)) * (value - mean)

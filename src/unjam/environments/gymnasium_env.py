@@ -407,9 +407,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
         world = self._road.world
         limit = world.road.limit_speed
-        max_speed = (
-            2.0 * limit if np.isfinite(limit) else self._road.episode_scenario.top_speed
-        )  # unknown on user networks
+        is_known = np.isfinite(limit)  # not on user networks
+        max_speed = 2.0 * limit if is_known else self._road.episode_scenario.top_speed
         return np.asarray(draw_road(world.scene(), max_speed, f"mean {np.mean(world.speeds):.1f} m/s"))
 
     @synchronized

@@ -1,15 +1,13 @@
 """A scenario with several CAVs as a PettingZoo environment."""
 
 from collections.abc import Iterable, Sequence
-from copy import deepcopy
 from typing import Any, ClassVar, overload
 
 import numpy as np
-from gymnasium import spaces
-from pettingzoo import ParallelEnv
 
 from unjam.drivers.observation import FeatureLike
 from unjam.drivers.user_driver import DriverLike
+from unjam.environments.agents import RoadAgents
 from unjam.environments.gymnasium_env import RoadStepper, as_action
 from unjam.environments.slots import SlottedRoadEnv
 from unjam.environments.threads import synchronized
@@ -21,7 +19,7 @@ API_TEST_OPTIONS = {"options": 1}
 """options without a meaning, with which `parallel_api_test` of PettingZoo calls `reset`"""
 
 
-class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
+class ParallelRoadEnv(RoadAgents):
     """Several CAVs among human drivers, with a common reward.
 
     Action and observation of each CAV are those of `RoadEnv`. On open roads `agents` changes: a CAV becomes an agent at
@@ -42,23 +40,11 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
         **changes: Any,
     ) -> None:
         """Prepare the environment; the arguments are those of `RoadEnv`."""
-        self._road = RoadStepper(scenario, changes, reward, expert, features, backend)
-        self.possible_agents = list(self._road.scenario.possible_cav_ids())
-        self.agents: list[str] = []
+        road = RoadStepper(scenario, changes, reward, expert, features, backend)
+        super().__init__(road, road.scenario.possible_cav_ids())
         self._agent_by_vehicle: dict[str, str] = {}
         self._departed_agents: set[str] = set()
         """agents whose vehicle has left the road; if it returns, only the expert drives it"""
-        self.render_mode = None
-        self.observation_spaces = {agent: deepcopy(self._road.observation_space) for agent in self.possible_agents}
-        self.action_spaces = {agent: deepcopy(self._road.action_space) for agent in self.possible_agents}
-
-    def observation_space(self, agent: str) -> spaces.Box:
-        """Return the observation space of one CAV."""
-        return self.observation_spaces[agent]  # pyright: ignore[reportReturnType]
-
-    def action_space(self, agent: str) -> spaces.Box:
-        """Return the action space of one CAV."""
-        return self.action_spaces[agent]  # pyright: ignore[reportReturnType]
 
     @synchronized
     def reset(
@@ -116,9 +102,6 @@ class ParallelRoadEnv(ParallelEnv[str, Any, Any]):
                 free = [agent for agent in self.possible_agents if agent not in taken]
                 self._agent_by_vehicle[name] = name if name in free else free[0]
         return [self._agent_by_vehicle[name] for name in vehicles]
-
-    def render(self) -> None:
-        """Draw nothing."""
 
     @synchronized
     def close(self) -> None:

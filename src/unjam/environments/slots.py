@@ -3,15 +3,14 @@
 from typing import Any, ClassVar
 
 import numpy as np
-from gymnasium import spaces
-from pettingzoo import ParallelEnv
 
+from unjam.environments.agents import RoadAgents
 from unjam.environments.gymnasium_env import as_action
 from unjam.environments.threads import synchronized
 from unjam.errors import InputError, invalid_value
 
 
-class SlottedRoadEnv(ParallelEnv[str, Any, Any]):
+class SlottedRoadEnv(RoadAgents):
     """A `ParallelRoadEnv` with the agents slot_0, slot_1, ..., all of which exist for the whole episode.
 
     A CAV that enters takes the first free slot until it leaves the road. If no slot is free, the expert drives it for
@@ -28,27 +27,11 @@ class SlottedRoadEnv(ParallelEnv[str, Any, Any]):
         """Map the agents of a `ParallelRoadEnv` to so many slots."""
         if not isinstance(slots, int) or isinstance(slots, bool) or slots < 1:
             raise invalid_value("slots", slots, "an integer >= 1")
-        self._environment, self._road = environment, environment._road
-        self.possible_agents = [f"slot_{number}" for number in range(slots)]
-        self.agents: list[str] = []
-        self.render_mode = None
+        super().__init__(environment._road, (f"slot_{number}" for number in range(slots)))
+        self._environment = environment
         self._cavs: dict[str, str] = {}
         """agent of the environment by occupied slot"""
         self._without_slot: set[str] = set()
-        of_one_cav = self._road.observation_space, self._road.action_space
-        made: list[dict[str, spaces.Space[Any]]] = [
-            {slot: spaces.Box(space.low, space.high, dtype=np.float32) for slot in self.possible_agents}
-            for space in of_one_cav
-        ]
-        self.observation_spaces, self.action_spaces = made
-
-    def observation_space(self, agent: str) -> spaces.Box:
-        """Return the observation space of a slot: that of one CAV."""
-        return self.observation_spaces[agent]  # pyright: ignore[reportReturnType]
-
-    def action_space(self, agent: str) -> spaces.Box:
-        """Return the action space of a slot: that of one CAV."""
-        return self.action_spaces[agent]  # pyright: ignore[reportReturnType]
 
     @synchronized
     def reset(
@@ -108,9 +91,6 @@ class SlottedRoadEnv(ParallelEnv[str, Any, Any]):
             }
             for slot in self.possible_agents
         }
-
-    def render(self) -> None:
-        """Draw nothing."""
 
     def close(self) -> None:
         """Close SUMO; further calls have no effect."""

@@ -18,16 +18,16 @@ from unjam.drivers.user_driver import DriverLike
 from unjam.environments.gymnasium_env import ExternalDriver, RoadStepper, check_single_cav, episode_seed
 from unjam.errors import InputError, MissingPartError, UnjamError, import_optional, invalid_value
 from unjam.measures.step_metrics import step_metrics
-from unjam.physics.arrays import Array, clip, namespace, replace_entries
+from unjam.physics.arrays import Array, clip, copy_array, namespace, replace_entries
 from unjam.scenarios import make_scenario
-from unjam.seeds import RESERVED_SEEDS, warn_of_reserved_seed
+from unjam.seeds import warn_of_reserved_seed
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, draw_single_normal
 from unjam.worlds.batch.ring.record import as_numpy
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.batch.support import required_batch_kind, statistically_unsupported_reason
 from unjam.worlds.episode import as_seed
-from unjam.worlds.reward import Outcome, RewardLike, time_gap, validate_reward_terms
+from unjam.worlds.reward import Outcome, RewardLike, validate_reward_terms
 
 EXPERT_CHECK_STEPS = 3
 """random steps in which an expert must drive each row by itself, without a state of its own"""
@@ -64,10 +64,6 @@ def _with_masks(values: dict[str, Any], mask: Array) -> dict[str, Any]:
     return values | {f"_{name}": mask for name in values}
 
 
-def _copy(values: Array) -> Array:
-    return values.copy() if isinstance(values, np.ndarray) else values.clone()
-
-
 class _Episodes:
     """Episodes on the roads of a batch, and the driver of their CAVs."""
 
@@ -82,10 +78,7 @@ class _Episodes:
         decision, world = self._driver.decide(self._state, self._memory), self.world
         self._memory = decision.memory
         world.advance(decision.command)
-        speed, _, gap = world.following_state()
-        accelerations, time_gaps = world.last_applied_acceleration()[:, None], time_gap(gap, speed)[:, None]
-        speeds, crashed, speed = map(_copy, (world.speeds.T, world.crashed_roads, speed))  # rewards may write into them
-        return Outcome(speeds, accelerations, time_gaps, crashed, 0.0 * speed, cav_speeds=speed[:, None])
+        return Outcome(*map(copy_array, world.last_outcome()))  # rewards may write into them
 
     def observe(self) -> None:
         """Let the driver observe the current state, once in each control step."""
@@ -162,11 +155,11 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             raise InputError(f"scenario: {made.title} is not possible in a batch ({reason}); {OTHER_MODE}")
         check_single_cav(made)
         self._road = RoadStepper(scenario, changes, reward, expert, features, "batch")
-        needs_numpy = self._road.copy_driver().expert.requirements().needs_numpy
-        if device and needs_numpy:
+        made_expert = self._road.copy_driver().expert
+        if device and made_expert.requirements().needs_numpy:
             raise invalid_value("expert", expert, "one that takes tensors, like 'pi'; or device='', NumPy")
         if expert and not device:
-            check_driver(self._road.copy_driver().expert, steps=EXPERT_CHECK_STEPS)
+            check_driver(made_expert, steps=EXPERT_CHECK_STEPS)
         self._make_kind = partial(_torch_kind, device=device) if device else _numpy_kind
         self._exact, self._device, self._is_numpy, self.num_envs = exact, device, not device, num_envs
         self._kind = self._make_array_kind((0,))
@@ -194,7 +187,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode in each environment, or in those of `options["reset_mask"]`, booleans of shape (W,)."""
         rows, seeds = self._rows_to_reset(options or {}), self._seeds_of_environments(seed)
-        warn_of_reserved_seed(next((each for each in seeds if each in RESERVED_SEEDS), None))
+        warn_of_reserved_seed(*seeds)
         for row in rows:
             given = seeds[row]
             if given is None and self._seeds[row] is None:
@@ -205,9 +198,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         if len(rows) == self.num_envs and not self._prepared:
             self._kind = self._make_array_kind((self._seeds[0] or 0, self._episode_counts[0]))
             self._episodes = self._start_episodes(rows)
-            zeros = self._kind.to_array(np.zeros(self.num_envs))
-            self._all = zeros == 0.0
-            self._totals: defaultdict[str, Array] = defaultdict(lambda: zeros)
+            self._zeros = self._kind.to_array(np.zeros(self.num_envs))
+            self._totals: defaultdict[str, Array] = defaultdict(lambda: self._zeros)
             """sums of the reward and of the metrics over the current episodes, by name, shape (W,)"""
         else:
             self._restart(rows)
@@ -268,9 +260,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         for source, pairs in groups.items():
             own, others = map(list, zip(*pairs, strict=True))
             self._running_episodes.replace(own, source, others)
-        zeros = self._kind.to_array(np.zeros(self.num_envs))
         for name, total in self._totals.items():
-            self._totals[name] = replace_entries(total, rows, zeros, rows)
+            self._totals[name] = replace_entries(total, rows, self._zeros, rows)
 
     @property
     def _running_episodes(self) -> _Episodes:
@@ -283,7 +274,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         episodes, restarted = self._running_episodes, self._ended_rows
         outcome = episodes.advance(self._as_actions(actions))
         episodes.observe()
-        terms, has_stepped = self._reward_terms(outcome), replace_entries(self._all, restarted, ~self._all, restarted)
+        terms, has_stepped = self._reward_terms(outcome), ~self._mask(restarted)
         rewards = sum(terms.values())
         if restarted:
             rewards = namespace(rewards).where(has_stepped, rewards, 0.0)
@@ -310,7 +301,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             raise InputError(f"step: actions of shape {np.shape(actions)} are not allowed; allowed: {allowed[0]}")
         found = self._kind.to_array(actions).reshape(-1)
         if rows := self._ended_rows:  # their actions are ignored
-            found = replace_entries(found, rows, self._kind.to_array(np.zeros(self.num_envs)), rows)
+            found = replace_entries(found, rows, self._zeros, rows)
         if self._is_numpy and not np.isfinite(found).all():
             row = int(np.argmin(np.isfinite(found)))
             raise InputError(
@@ -333,8 +324,12 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         metrics = {"return": self._totals["return"], "steps": steps, **means}
         return {name: namespace(values).where(ended, values, 0.0) for name, values in metrics.items()}
 
+    def _mask(self, rows: list[int]) -> Array:
+        """Return which environments are among `rows`, shape (W,)."""
+        return replace_entries(self._zeros > 0.0, rows, self._zeros == 0.0, rows)
+
     def _start_info(self, rows: list[int]) -> dict[str, Any]:
-        is_new = replace_entries(~self._all, rows, self._all, rows)
+        is_new = self._mask(rows)
         roads = self._running_episodes.world.roads
         drawn = {}
         for name in roads[0].drawn_values:

@@ -23,7 +23,7 @@ from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import initial_batch_memory, warm_up_states
 from unjam.worlds.batch.support import unsupported_reason
 from unjam.worlds.episode import as_seed
-from unjam.worlds.reward import Outcome, RewardLike, make_reward, time_gap
+from unjam.worlds.reward import RewardLike, make_reward
 
 
 class DifferentiableRings(RingBatch):
@@ -120,11 +120,8 @@ class DifferentiableRings(RingBatch):
         """
         was_running = self._is_running
         self.advance(Command(acceleration))
-        speed, _, gap = self.following_state()
-        by_cav = self.last_applied_acceleration(), time_gap(gap, speed), speed
-        accelerations, gaps, speeds = (values.reshape(self._shape).T for values in by_cav)
-        outcome = Outcome(self.speeds.T, accelerations, gaps, self.crashed_roads, 0.0 * was_running, speeds)
-        self.reward_terms = {name: values * was_running for name, values in self._reward(outcome).items()}
+        terms = self._reward(self.last_outcome())
+        self.reward_terms = {name: values * was_running for name, values in terms.items()}
         return torch.stack([*self.reward_terms.values()]).sum(0)
 
     def detach(self, memory: Memory | None = None) -> Memory:

@@ -83,11 +83,16 @@ def as_indices(values: Array) -> Array:
     return values.astype(np.int64) if isinstance(values, np.ndarray) else values.detach().long()
 
 
+def copy_array(values: Array) -> Array:
+    """Return a copy, through which gradients flow."""
+    return values.copy() if isinstance(values, np.ndarray) else values.clone()
+
+
 def replace_entries(values: Array, index: Any, source: Array, source_index: Any) -> Array:
     """Return a copy of an array with `source[source_index]` in place of the entries `values[index]`."""
-    copy = values.copy() if isinstance(values, np.ndarray) else values.clone()
-    copy[index] = source[source_index]
-    return copy
+    found = copy_array(values)
+    found[index] = source[source_index]
+    return found
 
 
 def replace_columns(values: Any, columns: Any, source: Any, source_columns: Any) -> Any:

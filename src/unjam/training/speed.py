@@ -8,8 +8,7 @@ import itertools
 import os
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from statistics import median
@@ -24,7 +23,6 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
-from unjam.environments.gymnasium_env import RoadEnv
 from unjam.environments.vector_env import RoadVectorEnv
 from unjam.learners.settings import PolicySettings
 from unjam.manifest import manifest
@@ -89,7 +87,7 @@ def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: N
 
     Episodes have the default residual driver of training, which has an action repeat of one second, and are loaded,
     filtered, audited and recorded. Batches of rings are in single precision, with fast noise; model rollouts use the
-    default ensemble. Environments have no policy: their actions are zeros.
+    default ensemble. Environments have no policy: actions are random in SUMO, zeros in batches.
     """
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
     if cores is not None:
@@ -104,9 +102,8 @@ def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: N
         rates: defaultdict[Part, list[float]] = defaultdict(list)
         for number in range(1, rounds + 1):
             on_message(f"round {number} of {rounds}")
-            for part, rate in itertools.chain(
-                _measure_round(number, driver, episode, batches), _measure_environments(number, vectors)
-            ):
+            vector_rates = itertools.chain.from_iterable(vector.measure() for vector in vectors)
+            for part, rate in itertools.chain(_measure_round(number, driver, episode, batches), vector_rates):
                 rates[part].append(rate)
     finally:
         if cores is not None:
@@ -135,7 +132,7 @@ def _measure_round(
             yield Part(f"{name}: {EPISODE_PART}", sumo_part), _episode_rate(scenario, number, simulation)
         yield Part(f"{own}, network in every step", sumo), _episode_rate(ring, number, simulation, 0.0)
         yield Part(f"{own} without safety filter", own), _episode_rate(unfiltered, number, simulation)
-        yield Part("ring: env.step", sumo), _environment_rate(ring, number, simulation)
+        yield Part(ENVIRONMENT_PART, sumo), _environment_rate(ring, number, simulation)
         yield Part("ring: audit of an episode", own), steps_per_second(partial(_repeat_audit, episode), ring.horizon)
         for rows, steps in ROLLOUT_SIZES:
             name = f"learned model: {rows:,} rollouts of {steps} control steps"
@@ -178,17 +175,6 @@ class VectorBenchmark:
         return steps_per_second(
             lambda: deque((step() for _ in range(STEPS_PER_ROUND)), 0), self.rings * STEPS_PER_ROUND
         )
-
-
-def _measure_environments(number: int, vectors: Sequence[VectorBenchmark]) -> Iterator[tuple[Part, float]]:
-    """Yield the speeds of environments without a policy."""
-    with closing(RoadEnv()) as environment:
-        environment.reset(seed=number)
-        action, steps = np.zeros(1, np.float32), SCENARIOS["ring"].horizon
-        rate = steps_per_second(lambda: deque((environment.step(action) for _ in range(steps)), 0), steps)
-        yield Part(ENVIRONMENT_PART, f"ring: {SUMO_PART}"), rate
-    for vector in vectors:
-        yield from vector.measure()
 
 
 def _run_episode(scenario: Scenario, seed: int, simulation: Simulation, action_duration: float = 1.0) -> Episode:

@@ -232,9 +232,8 @@ class OrderedTraffic(Traffic[OrderedRoad]):
     @property
     def speeds(self) -> Sequence[float]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Speeds of all vehicles with a driver [m/s]."""
-        return self._series["speeds"][-len(self._speeds) :][
-            : self.road.driven_count
-        ]  # NumPy reads it faster than lists
+        newest = self._series["speeds"][-len(self._speeds) :]  # NumPy reads it faster than lists
+        return newest[: self.road.driven_count]
 
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""

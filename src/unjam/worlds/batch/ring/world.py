@@ -35,6 +35,7 @@ from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, NoiseState, Quick
 from unjam.worlds.batch.ring.record import as_numpy, make_ring_episodes
 from unjam.worlds.ordered_road import MAX_RECALL_SECONDS
 from unjam.worlds.record import Episode, Floats
+from unjam.worlds.reward import Outcome, time_gap
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam.worlds.world import DriverLog, ProgressCallback
 
@@ -248,6 +249,14 @@ class RingBatch:
     def last_applied_acceleration(self) -> Array:
         """Return the accelerations of the CAVs in the last control step, after the filter [m/s2], shape (CAVs * W,)."""
         return sum(self.safe_accelerations) / len(self.safe_accelerations)
+
+    def last_outcome(self) -> Outcome:
+        """Return the outcome of the last control step, a row for each road; some arrays belong to the world."""
+        speed, _, gap = self.following_state()
+        by_cav = self.last_applied_acceleration(), time_gap(gap, speed), speed
+        accelerations, time_gaps, cav_speeds = (values.reshape(self._shape).T for values in by_cav)
+        no_backlog = 0.0 * self._is_running
+        return Outcome(self.speeds.T, accelerations, time_gaps, self.crashed_roads, no_backlog, cav_speeds)
 
     @property
     def has_ended(self) -> bool:
