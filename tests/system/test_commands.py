@@ -173,11 +173,12 @@ def test_drive_on_your_own_network(unjam: Run, tmp_path: Path) -> None:
     file = game(tmp_path, "ramp").name
     common = ["-n", 1, "--set", "horizon=150", "--json"]
     share = document(unjam("drive", file, "--penetration-rate", "0.3", "--driver", "pi", *common, pictures=False))
-    assert (share["scenario"], share["episodes"][0]["status"]) == (file, "completed")
-    assert share["mean"]["mean_speed"] > 5
-    assert (tmp_path / share["report"]).is_file()
+    (driven,) = share["drivers"]
+    assert (share["scenario"], driven["episodes"][0]["status"]) == (file, "completed")
+    assert driven["mean"]["mean_speed"] > 5
+    assert (tmp_path / driven["report"]).is_file()
     types = document(unjam("drive", file, "--cav-types", "truck,passenger", "-d", "idm", *common, "--no-report"))
-    assert types["episodes"][0]["steps"] == 150
+    assert types["drivers"][0]["episodes"][0]["steps"] == 150
 
 
 ASSESS = ["assess", "straight.sumocfg", "--penetration-rates", "0,0.5", "-d", "acc", "--set", "horizon=120"]

@@ -19,10 +19,11 @@ NONE_ENTERED = "no vehicle entered before 60 s; the first departs at 25,200 s; u
 STOPPED = "episodes ended early: more than 0 teleports (max-num-teleports)"
 
 
-def document(run: Run, *words: object) -> dict[str, Any]:
+def only_driver(run: Run, *words: object) -> dict[str, Any]:
     ran = run(*words, "--json", pictures=False)
     assert ran.returncode == 0, ran.stderr
-    return json.loads(ran.stdout)
+    (found,) = json.loads(ran.stdout)["drivers"]
+    return found
 
 
 @pytest.mark.slow
@@ -33,7 +34,7 @@ def test_ignored_demand_is_in_terminal_json_and_report(unjam: Run, tmp_path: Pat
     ran = unjam(*drive, "--out", "out", pictures=False)
     assert f"note: {IGNORED} {count}" in ran.stderr
     assert IGNORED.replace("'", "&#39;") in (tmp_path / "out" / "report.html").read_text()
-    found = document(unjam, *drive, "--no-report")
+    found = only_driver(unjam, *drive, "--no-report")
     assert found["notes"] == [f"{IGNORED} {count}"]
     assert [row["vehicles"] for row in found["episodes"]] == [10, 10]
     assert found["early_ends"] == {}
@@ -77,7 +78,7 @@ def test_vehicles_that_sumo_does_not_insert_are_reported_in_one_line(unjam: Run,
 def test_overlaps_at_junctions_that_sumo_ignores_do_not_end_the_baseline(unjam: Run, tmp_path: Path) -> None:
     crossing(tmp_path)
     found = [
-        document(unjam, "drive", "my.sumocfg", "--penetration-rate", share, "-d", "human", "-n", 1, "--no-report")
+        only_driver(unjam, "drive", "my.sumocfg", "--penetration-rate", share, "-d", "human", "-n", 1, "--no-report")
         for share in (0.01, 0.5)
     ]
     (few,), (half,) = (each["episodes"] for each in found)
@@ -95,7 +96,7 @@ def test_assess_refuses_a_baseline_that_a_limit_of_teleports_ends(unjam: Run, tm
     ran = unjam(*drive, "--out", "out", pictures=False)
     assert f"note: human: 2 of 2 {STOPPED}; means are over complete episodes only" in ran.stderr
     assert STOPPED in (tmp_path / "out" / "report.html").read_text()
-    found = document(unjam, *drive, "--no-report")
+    found = only_driver(unjam, *drive, "--no-report")
     assert found["early_ends"] == {"more than 0 teleports (max-num-teleports)": 2}
     assert found["mean"]["travel_time"] is None
     assert {row["status"] for row in found["episodes"]} == {"teleports"}
@@ -111,7 +112,7 @@ def test_assess_refuses_a_baseline_that_a_limit_of_teleports_ends(unjam: Run, tm
 def test_contact_of_cavs_is_recorded_without_ending_the_episode(unjam: Run, tmp_path: Path) -> None:
     two_way(tmp_path)
     drive = ("drive", "my.sumocfg", "--penetration-rate", 0.9, "-d", "acc", "-n", 2, "--no-report")
-    found = document(unjam, *drive, "--set", "actuation=raw", "--set", "safety.active=false")
+    found = only_driver(unjam, *drive, "--set", "actuation=raw", "--set", "safety.active=false")
     rows = found["episodes"]
     assert {row["status"] for row in rows} == {"completed"}
     assert found["early_ends"] == {}
