@@ -287,11 +287,25 @@ def test_a_file_cut_short_is_refused(tmp_path: Path, share: float) -> None:
     assert "not a controller" in refusal_message(written(tmp_path, content[: int(share * len(content))]))
 
 
-def test_bytes_before_the_archive_do_no_harm_and_none_are_run(tmp_path: Path) -> None:
-    driver = residual(IDM())
-    content = b"#!/bin/sh\ntouch run\n" + controller_bytes(driver, ABOUT)
-    np.testing.assert_array_equal(actions(load_controller(written(tmp_path, content))), actions(driver))
-    assert not (tmp_path / "run").exists()
+def archive_with_script(place: str, script: bytes) -> bytes:
+    """An archive of a controller with a script outside its parts."""
+    content, made = controller_bytes(residual(IDM()), ABOUT), io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as archive, zipfile.ZipFile(made, "w") as other:
+        other.comment = script if place == "comment" else b""
+        for entry in archive.infolist():
+            part = archive.read(entry)
+            entry.extra = struct.pack("<HH", 0x7075, len(script)) + script if place == "extra field" else b""
+            other.writestr(entry, part)
+        if place == "left out of the index":
+            other.writestr("run.sh", script)
+            other.filelist.pop()
+    return {"before": script + content, "after": content + script}.get(place, made.getvalue())
+
+
+@pytest.mark.parametrize("place", ["before", "after", "comment", "extra field", "left out of the index"])
+def test_bytes_outside_the_parts_of_an_archive_are_refused(tmp_path: Path, place: str) -> None:
+    file = written(tmp_path, archive_with_script(place, b"#!/bin/sh\ntouch run\n"))
+    assert "has bytes outside its parts" in refusal_message(file)
 
 
 DIRECTORY = b"PK\x01\x02"

@@ -40,6 +40,8 @@ ARCHIVE_PARTS = (MANIFEST_PART, WEIGHTS_PART, SAMPLE_PART, GRAPH_PART, CERTIFICA
 certified ones a certificate, signed ones a signature"""
 MAX_PART_BYTES, MAX_JSON_BYTES = 64 * 2**20, {MANIFEST_PART: 2**20, CERTIFICATE_PART: 2**20, SIGNATURE_PART: 10_000}
 """maximum sizes: of one part, and of parts in JSON, which take many times their size in memory"""
+LOCAL_HEADER_BYTES, INDEX_ENTRY_BYTES, ARCHIVE_END_BYTES = 30, 46, 22
+"""sizes of the headers of a zip archive without extra fields and comments"""
 MAX_SAMPLE_STEPS = 1000
 """maximum number of control steps in a recorded sample"""
 ACTION_NAME = "acceleration"
@@ -214,8 +216,8 @@ def pack_parts(parts: dict[str, bytes]) -> bytes:
 def unpack_parts(file: Path) -> dict[str, bytes]:
     """Return the parts of an archive, in memory: nothing is written.
 
-    Raise `InputError` for an unknown, duplicate, compressed, encrypted or too large part or a link, and
-    `zipfile.BadZipFile`, `OSError`, `EOFError` or `RuntimeError` if it is not an archive, or damaged.
+    Raise `InputError` for an unknown, duplicate, compressed, encrypted or too large part, a link or bytes outside the
+    parts, and `zipfile.BadZipFile`, `OSError`, `EOFError` or `RuntimeError` if it is not an archive, or damaged.
     """
     size, largest = file.stat().st_size, len(ARCHIVE_PARTS) * MAX_PART_BYTES
     if size > largest:
@@ -228,10 +230,18 @@ def unpack_parts(file: Path) -> dict[str, bytes]:
             if reason := _entry_error(entry):
                 raise InputError(f"controller {file.name}: part {entry.filename!r} {reason}")
             parts[entry.filename] = archive.read(entry)
+        # Neither hashes nor a signature cover other bytes, which may be a second file of another kind.
+        if size != ARCHIVE_END_BYTES + sum(map(_packed_size, archive.infolist())):
+            raise InputError(f"controller {file.name}: has bytes outside its parts; allowed: none, as unjam writes it")
     for name in (MANIFEST_PART, WEIGHTS_PART):
         if name not in parts:
             raise InputError(f"controller {file.name}: not a controller: it has no {name}")
     return parts
+
+
+def _packed_size(entry: zipfile.ZipInfo) -> int:
+    """Return the bytes that a part takes in an archive: its headers with its name, in front and in the index."""
+    return LOCAL_HEADER_BYTES + INDEX_ENTRY_BYTES + 2 * len(entry.filename.encode()) + entry.compress_size
 
 
 def _entry_error(entry: zipfile.ZipInfo) -> str:
