@@ -263,7 +263,10 @@ CONTENTS: dict[str, tuple[bytes, str]] = {
     "XML": (b'<?xml version="1.0"?><routes/>', "it is XML, but not SUMO's FCD output"),
     "broken FCD output": (b"<fcd-export><timestep", "cannot be read: unclosed token"),
     "entities": (b'<!DOCTYPE a [<!ENTITY b "c">]><fcd-export/>', "a document type .* is not allowed"),
-    "one line": (b"pair," * 99_999, "its first line is longer than 65,536 bytes"),
+    "one line": (b"pair," * 99_999, "line 1 is longer than 65,536 bytes"),
+    "one line below the header": (b"pair,time\n" + b"1," * 3_000_000, "line 2 is longer than 65,536 bytes"),
+    "a huge element": (b'<fcd-export><vehicle id="' + b"a" * 9_000_000, "line 1 is too long; allowed: an element has"),
+    "more cells than columns": (b"pair,time\n1,2,\n1,2,3\n", "line 3 has more cells than columns have names"),
     "UTF-16": ("pair,time".encode("utf-16"), "it is not text in UTF-8"),
     "numbers alone": (b"1,2.5,3\n1,2.6,3\n", "its first line is not the names of its columns"),
     "nothing": (b"", "cannot be read: No columns"),
@@ -294,6 +297,9 @@ WRITERS: dict[str, Callable[[pd.DataFrame, Path], object]] = {
     "semicolons": lambda frame, path: frame.to_csv(path, index=False, sep=";"),
     "tabs": lambda frame, path: frame.to_csv(path, index=False, sep="\t"),
     "spaces": lambda frame, path: path.write_text(frame.to_string(index=False)),
+    "separators at the ends of lines": lambda frame, path: path.write_text(
+        frame.to_csv(index=False, lineterminator=",\n").replace(",\n", "\n", 1)
+    ),
     "decimal commas": lambda frame, path: frame.to_csv(path, index=False, sep=";", decimal=","),
     "a byte-order mark": lambda frame, path: frame.to_csv(path, index=False, encoding="utf-8-sig"),
     "commas between thousands": lambda frame, path: frame.assign(

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -52,6 +53,14 @@ def test_a_file_that_unpacks_to_too_much_is_refused(tmp_path: Path, monkeypatch:
     (tmp_path / "road.rou.xml.gz").write_bytes(gzip.compress(bomb, 1))
     path.write_text(path.read_text().replace("road.rou.xml", "road.rou.xml.gz"))
     assert "road.rou.xml.gz: cannot be read: out of memory" in refusal_message(path)
+
+
+@pytest.mark.parametrize("file", ["road.net.xml", "road.rou.xml"])
+def test_a_huge_element_is_refused_before_it_takes_time(file: str, tmp_path: Path) -> None:
+    path = configuration(tmp_path)
+    content = (tmp_path / file).read_text().replace(' id="', f' id="{"a" * 9_000_000}', 1)
+    (tmp_path / file).write_text(content)
+    assert re.fullmatch(f"{file}: line \\d+ is too long; allowed: .* 4,194,304 bytes", refusal_message(path))
 
 
 def test_reading_that_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

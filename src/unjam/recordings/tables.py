@@ -1,5 +1,6 @@
 """Read tables of recorded traffic: CSV with any separator, Parquet, and SUMO's FCD output as XML; compressed or not."""
 
+import csv
 import gzip
 import re
 import zlib
@@ -90,9 +91,9 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
         raise _refused_file(path, "it is not text in UTF-8")
     if lines[0].lstrip().startswith(("{", "[")):
         raise _refused_file(path, "it is JSON")
-    if len(lines) == 1 and len(head) == HEAD_BYTES:
-        raise _refused_file(path, f"its first line is longer than {HEAD_BYTES:,} bytes")
     header, attributes = _find_header(lines)
+    if len(lines) <= header + 2 and len(head) == HEAD_BYTES:
+        raise _refused_file(path, f"line {len(lines)} is longer than {HEAD_BYTES:,} bytes")
     separator = max(",;\t", key=lines[header].count)
     separator = separator if separator in lines[header] else r"\s+"
     cells, options = re.split(separator, lines[header].strip()), dict[str, Any](skiprows=header)
@@ -103,10 +104,23 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     rows = "\n".join(lines[header + 1 :])
     if separator != "," and re.search(r"\d,\d", rows) and not re.search(r"\d\.\d", rows):
         options["decimal"] = ","
+    surplus = [] if separator == r"\s+" else _surplus_columns(lines[header + 1 :], separator, len(cells))
+    if surplus:  # pandas would take the first columns for an index, and shift all others
+        names = options.get("names") or next(csv.reader([lines[header]], delimiter=separator))
+        options = {"header": 0, **options, "names": [*names, *surplus]}
     frame = pd.read_csv(file, sep=separator, encoding="utf-8-sig", skipinitialspace=True, **options)
+    if (is_filled := frame[surplus].notna().any(axis=1)).any():
+        raise _refused_file(path, f"line {header + 2 + int(is_filled.argmax())} has more cells than columns have names")
+    frame = frame.drop(columns=surplus)
     frame = pd.concat([frame, pd.Series(np.arange(len(frame)) + header + 2, frame.index, name="line")], axis=1)
     frame.attrs = attributes
     return frame
+
+
+def _surplus_columns(lines: list[str], separator: str, columns: int) -> list[str]:
+    """Return names for the cells of these lines beyond the columns of the header; none if there are none."""
+    widest = max((len(cells) for cells in csv.reader(lines, delimiter=separator)), default=0)
+    return [f"surplus {number}" for number in range(widest - columns)]
 
 
 def _find_header(lines: list[str]) -> tuple[int, dict[Hashable, str]]:

@@ -14,6 +14,8 @@ from xml.sax.saxutils import escape, quoteattr
 
 XML_CHUNK_BYTES, MAX_UNPACKED_BYTES = 1 << 18, 1 << 22
 """maximum number of bytes that are read, and that are unpacked, at a time"""
+MAX_ELEMENT_BYTES = 1 << 22
+"""maximum number of bytes of one element with its attributes"""
 MAX_INCLUDED_FILES = 1000
 """maximum number of files that one file includes, because files could include each other endlessly"""
 OUTPUT_ELEMENTS = {"edgeData", "laneData", "vTypeProbe", "timedEvent", "instantInductionLoop"}
@@ -255,7 +257,7 @@ def is_harmless_parameter(key: str) -> bool:
 
 
 def parse_xml(path: Path, parser: Any, chunks: Iterable[bytes]) -> None:
-    """Parse a file; raise `BrokenFileError` if it is not XML, or has a document type.
+    """Parse a file; raise `BrokenFileError` if it is not XML, or has a document type or a huge element.
 
     A document type can name other files, or grow without end. SUMO's own files have none, but SUMO would follow it.
     """
@@ -264,9 +266,15 @@ def parse_xml(path: Path, parser: Any, chunks: Iterable[bytes]) -> None:
         raise BrokenFileError(f"{path.name}: a document type (<!DOCTYPE ...>) is not allowed")
 
     parser.StartDoctypeDeclHandler = refuse_doctype
+    size = 0
     try:
         for chunk in chunks:
             parser.Parse(chunk, False)
+            size += len(chunk)
+            # The parser begins an element that is not complete anew with each chunk.
+            if size - parser.CurrentByteIndex > MAX_ELEMENT_BYTES:
+                limit = f"an element has at most {MAX_ELEMENT_BYTES:,} bytes"
+                raise BrokenFileError(f"{path.name}: line {parser.CurrentLineNumber} is too long; allowed: {limit}")
         parser.Parse(b"", True)
     except XML_ERRORS as error:
         raise BrokenFileError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
