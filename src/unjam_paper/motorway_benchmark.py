@@ -65,7 +65,7 @@ EPISODE_METRICS = (*HARM_METRICS, "vehicles", "human_braking_beyond_3_5")
 OTHER_SOURCES = ("vehicles", "detectors", "none")
 """sources of the speeds ahead, besides the CAVs of the main comparison"""
 PACKAGED_LAW, PACKAGED_SOURCES = "unjam:on-ramp-tuned", ("cavs", "vehicles")
-"""the motorway law of `unjam:best`, which was tuned for exact speeds of all vehicles ahead"""
+"""a packaged law that was tuned on `on-ramp`, with exact speeds of all vehicles ahead"""
 SENSING_SEEDS, CHANGE_SEEDS = 8, 10
 CHANGED_SETTING = 18
 """the setting of which one assumption at a time is changed"""

@@ -10,6 +10,7 @@ import pytest
 
 from tests.worlds.sumo.user_networks import built
 from unjam.errors import InputError
+from unjam.recordings import tables
 from unjam.recordings.loaders import METERS_PER_FOOT, ReadOptions, read_trajectories
 from unjam.recordings.tables import NGSIM_COLUMN_ORDER
 from unjam.worlds.sumo.networks import sumo_program
@@ -290,6 +291,20 @@ def test_missing_file_and_another_format_are_refused(tmp_path: Path) -> None:
         read_trajectories(tmp_path / "none.csv", "table")
     with pytest.raises(InputError, match="no column 'pair'; it has: Time"):
         read_trajectories(write_openacc(tmp_path / "t.csv"), "table")
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.csv.gz", "t.parquet"])
+def test_a_table_that_unpacks_to_too_much_is_refused_before_it_takes_memory(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "MAX_TEXT_BYTES", 100_000)
+    monkeypatch.setattr(tables, "MAX_CELLS", 100_000)
+    frame = pd.DataFrame({"pair": np.zeros(99_999, int), "time": 0.0})
+    (frame.to_parquet if name.endswith("parquet") else frame.to_csv)(tmp_path / name)
+    monkeypatch.setattr(pd, "read_csv", pytest.fail)
+    monkeypatch.setattr(pd, "read_parquet", pytest.fail)
+    with pytest.raises(InputError, match=r"t\..*: cannot be read: it has more than 100,000 (cells|bytes of text)"):
+        read_trajectories(tmp_path / name)
 
 
 WRITERS: dict[str, Callable[[pd.DataFrame, Path], object]] = {

@@ -17,6 +17,8 @@ from unjam.sumo_files.reader import BrokenFileError, XmlAttributes, parse_xml
 
 HEAD_BYTES = 1 << 16
 """first bytes of a file, from which its form is detected before a table is parsed; no line of a table is longer"""
+MAX_TEXT_BYTES, MAX_CELLS = 1 << 30, 1 << 27
+"""maximum size of a table: as text, uncompressed, and in Parquet; both take about five times as much memory"""
 HEAD_LINES = 20
 """first lines of a table, among which its header is"""
 RECONSTRUCTED_COLUMN_ORDER = (
@@ -50,6 +52,7 @@ def read_table(path: Path) -> pd.DataFrame:
             is_packed = raw.read(2) == b"\x1f\x8b"
         with gzip.open(path) if is_packed else path.open("rb") as file:
             head = file.read(HEAD_BYTES)
+            _check_size(path, file, head)
             file.seek(0)
             if head.startswith(b"PAR1"):
                 return pd.read_parquet(path).assign(line=lambda frame: np.arange(len(frame)) + 2)
@@ -60,6 +63,22 @@ def read_table(path: Path) -> pd.DataFrame:
         raise InputError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
     except BrokenFileError as error:
         raise InputError(str(error)) from None
+
+
+def _check_size(path: Path, file: Any, head: bytes) -> None:
+    """Raise `InputError` if a table is too large, before it takes memory: packed files can be tiny."""
+    if head.startswith(b"PAR1"):
+        from pyarrow.parquet import read_metadata
+
+        shape = read_metadata(path)
+        if shape.num_rows * shape.num_columns > MAX_CELLS:
+            raise _refused_file(path, f"it has more than {MAX_CELLS:,} cells")
+        return
+    size = len(head)
+    while size <= MAX_TEXT_BYTES and (chunk := file.read(HEAD_BYTES)):
+        size += len(chunk)
+    if size > MAX_TEXT_BYTES:
+        raise _refused_file(path, f"it has more than {MAX_TEXT_BYTES:,} bytes of text")
 
 
 def _refused_file(path: Path, reason: str) -> InputError:
