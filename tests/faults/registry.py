@@ -1,5 +1,6 @@
 """All faults that are injected, by name."""
 
+from tests.faults.commands import jumping_clocks, killed_commands, many_drivers, packed_tables
 from tests.faults.files import checkpoints, configurations, controllers, full_disks, results, signatures
 from tests.faults.inputs import inputs
 from tests.faults.links import links
@@ -89,4 +90,13 @@ FAULTS: dict[str, Fault] = {
         quick_count=40,
         long_count=500,
     ),
+    "killed commands": Fault("tune and search killed (signal 9)", killed_commands, 2, 20, is_slow=True),
+    "clocks": Fault("clock that jumps by up to a day", jumping_clocks, quick_count=2, long_count=50),
+    "packed tables": Fault(
+        "recorded traffic in files of a few megabytes that unpack to gigabytes, or have a huge line or element",
+        packed_tables,
+        quick_count=4,
+        long_count=40,
+    ),
+    "many drivers": Fault("drivers compared in one command", many_drivers, quick_count=20, long_count=500),
 }
