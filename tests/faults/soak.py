@@ -16,15 +16,15 @@ sys.path.insert(0, str(ROOT))
 
 from tests.faults.registry import FAULTS  # noqa: E402
 from unjam.errors import unknown_name  # noqa: E402
-from unjam.files import atomic_write, to_json  # noqa: E402
 from unjam.manifest import manifest  # noqa: E402
+from unjam_paper.results_file import read_part, write_results  # noqa: E402
 
 TARGET = ROOT / "results" / "soak.json"
 
 
 def soak(names: list[str]) -> None:
     """Inject the faults with these names; the rows of other faults are kept."""
-    rows = {row["name"]: row for row in json.loads(TARGET.read_text())["rows"]} if TARGET.exists() else {}
+    rows = {row["name"]: row for row in read_part(TARGET, "rows")} if TARGET.exists() else {}
     about = manifest()  # now: later the results themselves are a change of the tree
     for name in names:
         fault, started = FAULTS[name], time.monotonic()
@@ -41,7 +41,7 @@ def soak(names: list[str]) -> None:
         }
         print(json.dumps(rows[name]), flush=True)
         ordered = [rows[each] for each in FAULTS if each in rows]
-        atomic_write(TARGET, to_json({"manifest": about, "rows": ordered}, indent=1) + "\n")
+        write_results(TARGET, {"manifest": about, "rows": ordered})
 
 
 if __name__ == "__main__":

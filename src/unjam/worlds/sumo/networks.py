@@ -108,7 +108,10 @@ def network_file(network: RoadNetwork) -> Path:
     target = cache_folder() / "networks" / f"{name}.net.xml"
     if is_intact(target):
         return target
-    make_folder(target.parent)
+    try:
+        make_folder(target.parent)
+    except DiskError as error:
+        raise DiskError(f"{error}; UNJAM_CACHE can name another folder") from None
     for leftover in filter(is_leftover, target.parent.glob(".*")):  # of processes that were killed
         with suppress(FileNotFoundError, DiskError):  # another process has just removed it
             if time.time() - leftover.lstat().st_mtime > STALE_FILE_SECONDS:
