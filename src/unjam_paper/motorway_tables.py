@@ -22,8 +22,14 @@ HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuni
 SENSING_PART, SENSITIVITY_PART, PACKAGED_PART = "sensing", "sensitivity", "packaged"
 ACC_ALONE, CONTROLLER, OPPONENT = "ACC alone", "controller", "best opponent"
 """what is compared on the test half, besides human traffic"""
-COMPARED = HUMAN_LABEL, ACC_ALONE, OPPONENT
-"""what the controller is compared with"""
+COMPARISONS = {
+    "delay, against human": (CONTROLLER, HUMAN_LABEL),
+    "delay, against ACC alone": (CONTROLLER, ACC_ALONE),
+    "delay, against best opponent": (CONTROLLER, OPPONENT),
+    "ACC alone, against human": (ACC_ALONE, HUMAN_LABEL),
+    "best opponent, against human": (OPPONENT, HUMAN_LABEL),
+}
+"""pairs of drivers whose delays are compared, by heading"""
 BENCHMARK_RATES = (0.05, 0.1)
 """penetration rates with which methods are tuned and compared"""
 BREAKDOWN_SHARE = 0.5
@@ -112,14 +118,14 @@ def comparison_table(folder: Path) -> pd.DataFrame:
         delay = estimate([row[TIME_METRIC] - setting.free_flow_time for row in human])
         table.append(
             {
-                "setting": number,
+                "motorway": number,
                 "road": setting.road,
                 "demand": setting.demand,
                 "CAVs": f"{100 * rate:g} %",
                 "delay of human traffic [s]": str(estimate_cell(delay, 0)),
                 "of which unavoidable [s]": f"{setting.unavoidable_delay:.0f}",
                 "waiting at entrances [s]": f"{np.mean([row['waiting_at_entrances'] for row in human]):.0f}",
-                **{f"delay, against {label}": _percent(_delay_change(rows, label, number)) for label in COMPARED},
+                **{name: _percent(_delay_change(rows, *pair, number)) for name, pair in COMPARISONS.items()},
                 "flow": _percent(relative_difference(own, human, FLOW_METRIC)),
                 "hard braking of human drivers": _percent(relative_difference(own, human, HARD_BRAKING_METRIC)),
                 "feasible": overall_feasibility(own, human),
@@ -134,14 +140,17 @@ def summary_table(folder: Path) -> pd.DataFrame:
     table: Table = []
     for rate in BENCHMARK_RATES if comparisons else ():
         own = [(number, rows) for number, each, rows in comparisons if each == rate]
-        changes = {label: [_delay_change(rows, label, number).mean for number, rows in own] for label in COMPARED}
+        changes = {
+            name: [_delay_change(rows, *pair, number).mean for number, rows in own]
+            for name, pair in COMPARISONS.items()
+        }
         flows = [relative_difference(rows[CONTROLLER], rows[HUMAN_LABEL], FLOW_METRIC).mean for _, rows in own]
         table.append(
             {
                 "CAVs": f"{100 * rate:g} %",
-                "settings": len(own),
-                **{f"delay, against {label}": _percent(estimate(values)) for label, values in changes.items()},
-                "least reduction against human": f"{100 * max(changes[HUMAN_LABEL], default=np.nan):+.0f} %",
+                "motorways": len(own),
+                **{name: _percent(estimate(values)) for name, values in changes.items()},
+                "worst motorway, against human": f"{100 * max(changes['delay, against human'], default=np.nan):+.0f} %",
                 "flow": _percent(estimate(flows)),
             }
         )
@@ -153,7 +162,7 @@ def no_harm_table(folder: Path) -> pd.DataFrame:
     table: Table = []
     for number, rate, rows in _test_rows(folder):
         if OPPONENT not in rows:
-            row = {"setting": number, "road": SETTINGS[number].road, "demand": SETTINGS[number].demand}
+            row = {"motorway": number, "road": SETTINGS[number].road, "demand": SETTINGS[number].demand}
             time, flow = (
                 relative_difference(rows[CONTROLLER], rows[ACC_ALONE], name) for name in (TIME_METRIC, FLOW_METRIC)
             )
@@ -178,7 +187,7 @@ def sensing_table(folder: Path) -> pd.DataFrame:
             for number in sorted({row["setting"] for row in own})
         ]
         table.append(
-            {"source": source, "settings": len(by_setting), "delay, against human": _percent(estimate(by_setting))}
+            {"source": source, "motorways": len(by_setting), "delay, against human": _percent(estimate(by_setting))}
         )
     return pd.DataFrame(table)
 
@@ -232,13 +241,13 @@ def _test_rows(folder: Path) -> Iterator[tuple[int, float, dict[str, Table]]]:
         yield number, rate, found
 
 
-def _delay_change(rows: dict[str, Table], other: str, number: int) -> Estimate:
-    """Return the difference of delay to another driver, relative to the delay of human traffic."""
+def _delay_change(rows: dict[str, Table], driver: str, other: str, number: int) -> Estimate:
+    """Return the difference of delay between two drivers, relative to the delay of human traffic."""
     free, by_seed = SETTINGS[number].free_flow_time, {str(row["seed"]): row for row in rows[HUMAN_LABEL]}
     values = np.array(
         [
             (own[TIME_METRIC] - each[TIME_METRIC], by_seed[str(own["seed"])][TIME_METRIC] - free)
-            for own, each in pair_rows(rows[CONTROLLER], rows[other])
+            for own, each in pair_rows(rows[driver], rows[other])
         ]
     )
     return estimate(linearized_ratio(values[:, 0], values[:, 1]).tolist())

@@ -172,11 +172,13 @@ def test_tables_compare_the_controller_with_all_others_on_the_same_seeds(tmp_pat
     ]
     write_part(tmp_path, TEST_PART, rows)
     comparison = comparison_table(tmp_path)
-    assert comparison["setting"].tolist() == [13, 13]
+    assert comparison["motorway"].tolist() == [13, 13]
     assert comparison["delay, against human"].str.split().str[0].tolist() == ["-29", "-29"]
     assert comparison["delay, against ACC alone"].str.split().str[0].tolist() == ["-20", "-20"]
     assert comparison["feasible"].tolist() == ["feasible"] * 2
-    assert summary_table(tmp_path)["delay, against best opponent"].tolist() == ["-10 %", "-10 %"]
+    summary = summary_table(tmp_path)
+    assert summary["delay, against best opponent"].tolist() == ["-10 %", "-10 %"]
+    assert summary["ACC alone, against human"].tolist() == ["-9 %", "-9 %"]
     assert no_harm_table(tmp_path)["travel time"].tolist() == ["0.0 [0.0, 0.0] %"] * 2
 
 
