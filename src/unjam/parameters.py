@@ -1,11 +1,13 @@
 """Check the values of unjam's frozen dataclasses: types, ranges, unknown names."""
 
+import operator
 import os
 import re
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import field, fields, is_dataclass
 from functools import cache, wraps
 from inspect import get_annotations, getattr_static
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar, dataclass_transform
 
@@ -43,6 +45,17 @@ def as_range(value: Any) -> Any:
     if isinstance(value, str):
         raise ValueError("a number, or two like (220, 270)")
     return (value, value) if isinstance(value, int | float) else value
+
+
+def check_integer(field: str, value: Any, minimum: int, maximum: float = inf) -> int:
+    """Return an integer argument; raise `InputError` if it has another type, such as bool, or is out of range."""
+    try:
+        if not isinstance(value, bool) and minimum <= (number := operator.index(value)) <= maximum:
+            return number
+    except TypeError:
+        pass
+    allowed = f">= {minimum}" if maximum == inf else f"from {minimum:,} to {maximum:,}"
+    raise invalid_value(field, value, f"an integer {allowed}")
 
 
 def _without_tuples(options: dict[str, Any]) -> dict[str, Any]:

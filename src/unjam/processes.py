@@ -161,15 +161,21 @@ def lock_folder(folder: Path) -> Iterator[None]:
     Raises:
         InputError: another process has locked it, or one of its entries is a link.
     """
-    path = folder / LOCK_FILE
-    with protect_folder(folder), ExitStack() as stack:
-        descriptor = _open_locked(path)
+    with protect_folder(folder), lock_file(folder / LOCK_FILE, f"run: {str(folder)!r}"):
+        yield
+
+
+@contextmanager
+def lock_file(path: Path, target: str) -> Iterator[None]:
+    """Lock what messages call `target` for this process, by a file that exists meanwhile; else as `lock_folder`."""
+    with ExitStack() as stack:
+        descriptor = _open_locked(path, target)
         while descriptor is not None and not _is_same_file(path, descriptor):  # its owner has just removed it
             os.close(descriptor)
-            descriptor = _open_locked(path)
+            descriptor = _open_locked(path, target)
         if descriptor is not None:
             stack.callback(os.close, descriptor)
-            _check_other_machine(path, descriptor)
+            _check_other_machine(path, descriptor, target)
             os.pwrite(descriptor, f"{platform.node()} {os.getpid()}\n".ljust(300).encode(), 0)
             stop = threading.Event()
             heart = threading.Thread(target=_send_heartbeats, args=(descriptor, stop), daemon=True)
@@ -186,12 +192,12 @@ def _send_heartbeats(descriptor: int, stop: threading.Event) -> None:
             os.utime(descriptor)
 
 
-def _check_other_machine(path: Path, descriptor: int) -> None:
-    """Raise `InputError` if a process of another machine has locked the folder and is alive."""
+def _check_other_machine(path: Path, descriptor: int, target: str) -> None:
+    """Raise `InputError` if a process of another machine has locked the file and is alive."""
     owner = os.pread(descriptor, 300, 0).decode(errors="replace").split()
     age, max_age = time.time() - os.fstat(descriptor).st_mtime, MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL
     if owner and owner[0] != platform.node() and abs(age) < max_age:
-        message = f"run: {str(path.parent)!r} is being written on {owner[0]}"
+        message = f"{target} is being written on {owner[0]}"
         raise InputError(f"{message}; allowed: one at a time, or {max_age:g} s after its end")
 
 
@@ -236,12 +242,13 @@ def _folder_identity(folder: Path) -> bytes:
 
 def check_not_locked(folder: Path) -> None:
     """Raise `InputError` if a process has locked a folder; its lock is only read, never written or made."""
-    path = folder / LOCK_FILE
+    path, target = folder / LOCK_FILE, f"run: {str(folder)!r}"
     with suppress(OSError):  # there is no lock, or it cannot be read
-        if not stat.S_ISREG(path.lstat().st_mode) or (descriptor := _open_locked(path, is_shared=True)) is None:
+        is_file = stat.S_ISREG(path.lstat().st_mode)
+        if not is_file or (descriptor := _open_locked(path, target, is_shared=True)) is None:
             return
         try:
-            _check_other_machine(path, descriptor)
+            _check_other_machine(path, descriptor, target)
         finally:
             os.close(descriptor)
 
@@ -255,7 +262,7 @@ def is_locked(folder: Path) -> bool:
     return False
 
 
-def _open_locked(path: Path, is_shared: bool = False) -> int | None:
+def _open_locked(path: Path, target: str = "", is_shared: bool = False) -> int | None:
     """Return an open and locked file, with `is_shared` for reading alone; None without locks."""
     try:
         import fcntl
@@ -266,8 +273,7 @@ def _open_locked(path: Path, is_shared: bool = False) -> int | None:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(descriptor)
-        message = f"run: {str(path.parent)!r} is being written by another process"
-        raise InputError(f"{message}; allowed: one at a time") from None
+        raise InputError(f"{target} is being written by another process; allowed: one at a time") from None
     except OSError:  # a file system without locks
         pass
     return descriptor

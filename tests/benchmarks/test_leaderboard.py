@@ -99,8 +99,8 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
     file.write_bytes(content)
     with pytest.raises(InputError, match=r"a\.json: it is not a result of `unjam benchmark`"):
         read_result(file)
-    for other in (tmp_path, tmp_path / "missing.json"):
-        with pytest.raises(InputError, match="allowed: a file of `unjam benchmark`"):
+    for other, reason in ((tmp_path, "it is not a file"), (tmp_path / "missing.json", "there is no such file")):
+        with pytest.raises(InputError, match=f"^{other}: {reason}; allowed: a file of `unjam benchmark`$"):
             read_result(other)
 
 
@@ -117,3 +117,21 @@ def test_the_command_prints_eighty_columns_and_draws(tmp_path: Path) -> None:
     assert "\x1b" not in board
     assert b"<svg" in picture.read_bytes()[:400]
     assert picture.read_bytes().count(b"</svg>") == 1
+
+
+@pytest.mark.parametrize(
+    ("drivers", "labels"),
+    [
+        (("a", "b", "c"), ["a", "b", "c"]),
+        (("pi", "pi", "b"), ["pi (0.json)", "pi (1.json)", "b"]),
+        (("pi", "pi", "pi (0.json)"), ["1. pi (0.json)", "2. pi (1.json)", "3. pi (0.json)"]),
+        (("pi\n", " pi", "p\x1b[2J"), ["pi (0.json)", "pi (1.json)", "p?[2J"]),
+        (("x" * 300, "x" * 299, "b"), [f"{'x' * 33}… (0.json)", f"{'x' * 33}… (1.json)", "b"]),
+    ],
+)
+def test_every_file_has_its_own_label(tmp_path: Path, drivers: tuple[str, ...], labels: list[str]) -> None:
+    edits = [set_entry("driver", value=driver) for driver in drivers]
+    files = [edited(tmp_path, edit).rename(tmp_path / f"{number}.json") for number, edit in enumerate(edits)]
+    results = read_leaderboard(files)
+    assert list(results) == labels
+    assert [row[0] for row in leaderboard_rows(results)] == labels

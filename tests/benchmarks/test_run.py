@@ -53,7 +53,8 @@ def test_a_second_call_drives_only_the_missing_roads(
     with pytest.raises(KeyboardInterrupt):
         unjam.benchmark("pi", suite, file, workers=1, progress=stop)
     assert read_result(file).missing_roads == [ROADS[1]]
-    assert "summary" not in json.loads(file.read_text())
+    assert "summary" not in (document := json.loads(file.read_text()))
+    assert document["training_steps_unit"] == "environment steps: control steps in the simulator"
     first = read_result(file).roads[ROADS[0]]
     result = unjam.benchmark("pi", suite, file, workers=1, progress=lines.append)
     assert [line.partition(": gain")[0] for line in lines] == [f"1 of 2: {ROADS[0]}", f"2 of 2: {ROADS[1]}"]
@@ -96,7 +97,9 @@ def test_a_driver_that_cannot_drive_on_a_road_counts_as_the_human_baseline_there
     [
         ({"driver": "pie"}, "driver: 'pie' is not allowed.*did you mean 'pi'"),
         ({"suite": "short-v2"}, "suite: 'short-v2' is not allowed; allowed: all-roads-v1"),
-        ({"workers": 0}, "workers: 0 is not allowed; allowed: >= 1"),
+        ({"workers": 0}, "workers: 0 is not allowed; allowed: an integer >= 1"),
+        ({"workers": "x"}, "workers: 'x' is not allowed; allowed: an integer >= 1"),
+        ({"training_steps": 1.5}, "training_steps: 1.5 is not allowed; allowed: an integer from 0 to 9,007"),
         ({"backend": "sumi"}, "backend: 'sumi' is not allowed"),
         ({"driver": "unjam:on-ramp-best"}, "it is not allowed on ring"),
         ({"driver": lambda state: math.nan * state.speed}, "finite"),
@@ -106,6 +109,16 @@ def test_wrong_arguments_are_refused_in_one_line(suite: str, arguments: dict[str
     with pytest.raises(unjam.errors.UnjamError, match=message) as error:
         unjam.benchmark(**{"driver": "pi", "suite": "ring", "workers": 1, **arguments})
     assert "\n" not in str(error.value)
+
+
+def test_one_process_at_a_time_writes_a_result(suite: str, tmp_path: Path) -> None:
+    def run_second(line: str) -> None:
+        unjam.benchmark("pi", "ring", tmp_path / "b.json", workers=1)  # another file
+        with pytest.raises(InputError, match=r"^out: '.*a\.json' is being written by another process; allowed: one at"):
+            unjam.benchmark("pi", "ring", tmp_path / "a.json", workers=1)
+
+    unjam.benchmark("pi", "ring", tmp_path / "a.json", workers=1, progress=run_second)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "b.json"]
 
 
 def test_a_file_of_another_driver_or_suite_is_not_overwritten(suite: str, tmp_path: Path) -> None:

@@ -166,14 +166,29 @@ def test_control_steps_before_the_entry_of_the_cav_count_for_the_horizon() -> No
         passed = environment.reset(seed=0)[1]["control_steps"]
         steps = 0
         truncated = False
+        total, info = 0.0, dict[str, Any]()
         while not truncated:
-            *_, truncated, _ = environment.step(np.zeros(1))
-            steps += 1
+            _, reward, _, truncated, info = environment.step(np.zeros(1))
+            steps, total = steps + 1, total + reward
     assert 0 < passed == 5 - steps
-    with closing(RoadEnv("on-ramp", cavs=1, horizon=1, backend="batch")) as environment:
-        message = r"reset: no CAV enters the road within the horizon, 1 control steps; allowed: a longer horizon"
-        with pytest.raises(EpisodeError, match=message):
-            environment.reset(seed=0)
+    assert info["episode_metrics"] == {"return": pytest.approx(total), "steps": steps}
+    for horizon in (1, passed):  # with the second, the CAV enters in the last control step
+        with closing(RoadEnv("on-ramp", cavs=1, horizon=horizon, backend="batch")) as environment:
+            assert_refuses_an_episode_without_decisions(environment, horizon)
+            with pytest.raises(UnjamError, match="call reset first"):
+                environment.step(np.zeros(1))
+
+
+def assert_refuses_an_episode_without_decisions(environment: Any, horizon: int) -> None:
+    allowed = f"allowed: a horizon of more than {horizon} control steps, or more CAVs"
+    with pytest.raises(EpisodeError, match=f"reset: no CAV enters the road before the episode ends; {allowed}"):
+        environment.reset(seed=0)
+
+
+@pytest.mark.parametrize("slots", [None, 2])
+def test_agents_that_enter_only_at_the_horizon_are_refused(slots: int | None) -> None:
+    with closing(unjam.parallel_env("merge", slots, horizon=18)) as environment:  # pyright: ignore[reportCallIssue, reportArgumentType]
+        assert_refuses_an_episode_without_decisions(environment, 18)
 
 
 def test_the_same_seed_starts_the_same_episode_and_later_ones_differ() -> None:
@@ -270,6 +285,9 @@ def test_renders_the_road_with_its_cav(scenario: str) -> None:
         ({"lenght": (230, 230)}, "lenght: unknown name"),
         ({"expert": "nonesuch"}, "nonesuch"),
         ({"scenario": "merge", "expert": "pacer"}, "it needs a closed road"),
+        ({"features": ("expert_acceleration",)}, "features: 'expert_acceleration' is not allowed; allowed: with an ex"),
+        ({"features": ("local", "expert_memory")}, "features: 'expert_memory' is not allowed; allowed: with an expert"),
+        ({"scenario": 5}, "scenario: 5 is not allowed; allowed: a name, a Scenario, or its class"),
     ],
 )
 def test_wrong_arguments_get_one_clear_line(arguments: Any, words: str) -> None:
@@ -374,6 +392,7 @@ def test_options_of_a_reset_change_the_scenario_for_this_episode() -> None:
         ({"cavs": 2}, "reset: options: cavs: 2 is not allowed; allowed: 1, as in the constructor"),
         ({"action_limit": 3}, "reset: options: action_limit: 3.0 is not allowed; allowed: 1.0, as in the constructor"),
         ([230], "reset: options: [230] is not allowed; allowed: a dict of parameters"),
+        (5, "reset: options: 5 is not allowed; allowed: a dict of parameters"),
     ],
 )
 def test_options_that_are_not_parameters_of_this_road_are_refused(options: Any, words: str) -> None:
@@ -382,6 +401,14 @@ def test_options_that_are_not_parameters_of_this_road_are_refused(options: Any, 
         with pytest.raises(InputError, match=re.escape(words)):
             environment.reset(options=options)
         environment.step(np.zeros(1))  # the episode goes on
+
+
+@pytest.mark.parametrize("seed", ["1", 0.5, -1, True, [1, 2]])
+@pytest.mark.parametrize("make", [RoadEnv, unjam.parallel_env])
+def test_seeds_that_are_no_integers_are_refused(make: Callable[..., Any], seed: Any) -> None:
+    words = re.escape(f"seed: {seed!r} is not allowed; allowed: an integer >= 0")
+    with closing(make("ring", **SHORT)) as environment, pytest.raises(InputError, match=words):
+        environment.reset(seed=seed)
 
 
 def test_documentation_names_all_environments_and_features() -> None:

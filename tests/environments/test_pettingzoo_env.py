@@ -14,6 +14,7 @@ from unjam.drivers import Constant
 from unjam.environments.gymnasium_env import RoadStepResult
 from unjam.environments.threads import CopyableLock
 from unjam.errors import InputError
+from unjam.measures.metrics import METRICS
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 
@@ -33,13 +34,17 @@ def test_steps_the_very_episode_that_run_episode_runs() -> None:
     expected = run_episode(make_scenario("ring", SHORT), Constant(acceleration=0.2), (4,))
     environment = unjam.parallel_env("ring", **SHORT)
     environment.reset(seed=4)
-    rewards = []
+    rewards, infos = [], dict[str, Any]()
     while environment.agents:
-        _, reward, *_ = environment.step({agent: np.array([0.2]) for agent in environment.agents})
+        _, reward, *_, infos = environment.step({agent: np.array([0.2]) for agent in environment.agents})
         assert set(reward) == {"cav_0", "cav_7", "cav_15"}
         rewards.append(reward["cav_0"])
     environment.close()
     np.testing.assert_allclose(rewards, expected.trajectories[0].reward, atol=1e-12)
+    metrics = infos["cav_7"]["episode_metrics"]
+    assert metrics.pop("steps") == 40
+    assert metrics == pytest.approx({name: METRICS[name].function(expected) for name in metrics}, abs=1e-9)
+    assert len(metrics) > 4
 
 
 def test_the_same_seed_gives_the_same_observations() -> None:
@@ -185,6 +190,9 @@ def test_a_vehicle_that_comes_back_is_no_agent_again() -> None:
             left = {name: np.zeros(5, np.float32) for name in before if name not in now}
             self.world.cav_ids = now
             return RoadStepResult(now, np.zeros((len(now), 5), np.float32), left, 1.0, {}, False, False)
+
+        def step_info(self, result: RoadStepResult, has_ended: bool) -> dict[str, Any]:
+            return {}
 
     environment._road = Road()  # pyright: ignore[reportAttributeAccessIssue]
     environment.agents = environment._assign_agents(cav_ids_by_step[0])

@@ -146,6 +146,25 @@ def test_the_metrics_of_an_episode_are_in_the_info_of_its_last_step(scenario: st
         assert terms == pytest.approx({name: values.sum() for name, values in episode.reward_terms.items()})
 
 
+@pytest.mark.parametrize("name", ["two features and an expert", "recorded", "figure eight", "collisions"])
+def test_single_environments_give_the_same_metrics_in_the_last_step(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("unjam.measures.step_metrics.BLOCK_STEPS", 16)
+    arguments = {"horizon": 40, **CASES[name]}
+    environment = RoadVectorEnv(2, backend="", **arguments)
+    environment.reset(seed=3)
+    infos = [environment.step([[action(step, 0, CASES[name])]] * 2)[-1] for step in range(arguments["horizon"])]
+    for row in range(2):
+        expected = next(info["episode_metrics"] for info in infos if info.get("_episode_metrics", [False] * 2)[row])
+        with closing(RoadEnv(**arguments, **({"backend": "batch"} if name == "figure eight" else {}))) as single:
+            single.reset(seed=3 + row)
+            found, step = {}, 0
+            while "episode_metrics" not in found:
+                *_, found = single.step([action(step, 0, CASES[name])])
+                step += 1
+        names = [each for each in expected if not each.startswith("_")]
+        assert found["episode_metrics"] == pytest.approx({each: expected[each][row] for each in names}, abs=1e-9)
+
+
 @pytest.mark.parametrize("exact", [True, False])
 def test_seeds_count_up_and_episodes_can_be_repeated(exact: bool) -> None:
     def run(seed: Any) -> Any:
@@ -225,6 +244,29 @@ def test_gradients_flow_through_tensors_of_many_steps() -> None:
     assert abs(gradient).min() > 1.0
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [{"actuator": {"delay": 0.2, "lag": 0.3}, "expert": "pi"}, {"scenario": "figure-eight", "horizon": 40}],
+    ids=["delay, lag and an expert", "figure eight"],
+)
+def test_after_detach_no_gradient_flows_to_earlier_steps(arguments: dict[str, Any]) -> None:
+    def drive(steps: int, actions: torch.Tensor, environment: RoadVectorEnv) -> torch.Tensor:
+        return [environment.step(actions)[:2] for _ in range(steps)][-1][1]
+
+    cut, whole = (RoadVectorEnv(2, device="cpu", **arguments) for _ in range(2))
+    actions = torch.full((2, 1), 0.2, requires_grad=True)
+    for each in (cut, whole):
+        each.reset(seed=0)
+        assert drive(8, actions, each).requires_grad
+    observations = cut.detach()
+    assert not observations.requires_grad
+    own = actions.detach().requires_grad_()
+    rewards, expected = (drive(5, each, made) for each, made in ((own, cut), (own, whole)))
+    assert torch.equal(rewards, expected)
+    assert torch.autograd.grad(rewards.sum(), (own, actions), retain_graph=True, allow_unused=True)[1] is None
+    assert torch.autograd.grad(expected.sum(), actions)[0].abs().max() > 0.0
+
+
 def test_it_follows_the_conventions_of_gymnasium() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -264,7 +306,10 @@ def test_it_follows_the_conventions_of_gymnasium() -> None:
         ({"backend": "sumo"}, "backend: is not an option of batches; allowed: vectorization_mode='async'"),
         ({"render_mode": "rgb_array"}, "render_mode: is not an option of batches"),
         ({"cavs": 2}, "cavs: several are not allowed here; allowed: 1"),
-        ({"num_envs": 0}, "num_envs: 0 is not allowed; allowed: an integer >= 1"),
+        ({"num_envs": 0}, "num_envs: 0 is not allowed; allowed: an integer from 1 to 1,000,000"),
+        ({"num_envs": True}, "num_envs: True is not allowed; allowed: an integer from 1 to 1,000,000"),
+        ({"num_envs": 10**12}, "num_envs: 1000000000000 is not allowed; allowed: an integer from 1 to 1,000,000"),
+        ({"features": ("local", "expert_memory")}, "features: 'expert_memory' is not allowed; allowed: with an expert"),
         ({"lenght": 230}, "lenght: unknown name"),
         ({"expert": Parrot, "device": "cpu"}, "allowed: one that takes tensors, like 'pi'; or device=''"),
     ],
@@ -278,12 +323,14 @@ def test_what_a_batch_cannot_do_is_refused_in_one_line(arguments: dict[str, Any]
     ("call", "words"),
     [
         (lambda made: made.reset(seed=[1]), "seed: 1 seeds are not allowed; allowed: 2, or a single one"),
-        (lambda made: made.reset(seed=-1), "seed: -1 is not allowed; allowed: >= 0"),
+        (lambda made: made.reset(seed=-1), "seed: -1 is not allowed; allowed: an integer >= 0"),
         (
             lambda made: made.reset(seed="a"),
             "seed: 'a' is not allowed; allowed: an integer, or one for each environment",
         ),
         (lambda made: made.reset(seed=[1, 0.5]), "seed: [1, 0.5] is not allowed; allowed: an integer"),
+        (lambda made: made.reset(options=5), "options: 5 is not allowed; allowed: a dict with 'reset_mask'"),
+        (lambda made: made.detach(), "detach: NumPy arrays have no gradients; allowed: device='cpu'"),
         (lambda made: made.reset(options={"length": 230}), "options: 'length' is not allowed; allowed: 'reset_mask'"),
         (lambda made: made.reset(options={"reset_mask": [1, 0]}), "options: reset_mask is not 2 booleans"),
         (lambda made: made.reset(options={"reset_mask": np.zeros(2, bool)}), "options: reset_mask is not 2 booleans"),
@@ -310,6 +357,10 @@ def test_other_wrong_uses_are_refused() -> None:
         RoadVectorEnv(2, device="nonesuch")
     made = RoadVectorEnv(2, reward=lambda outcome: {"mine": outcome.speeds.mean(-1) / 0.0 * np.array([1.0, 0.0])})
     made.reset(seed=0)
+    numpy_feature = RoadVectorEnv(2, device="cpu", features=("local", lambda state: state.speed))
+    numpy_feature.reset(seed=0)
+    with pytest.raises(InputError, match=r"<lambda>: feature has no gradient; allowed: within torch\.no_grad\(\)"):
+        numpy_feature.step(torch.zeros((2, 1), requires_grad=True))
     with (
         np.errstate(all="ignore"),
         pytest.raises(InputError, match=r"environment 0: term 'mine' is (inf|nan); allowed"),

@@ -10,11 +10,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from unjam.adapters import policy_driver
 from unjam.drivers import PISaturation
 from unjam.drivers.car_following import Constant
 from unjam.drivers.driver import Memory
+from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Actuator, FollowingState, SafetyFilter
 from unjam.drivers.sensors import Sensors
+from unjam.drivers.user_driver import as_driver
 from unjam.errors import InputError
 from unjam.models.differentiable_rings import DifferentiableRings
 from unjam.physics.kinematics import next_speed
@@ -236,6 +239,7 @@ def test_a_ring_counts_until_its_collision() -> None:
         (("rign", [0]), "did you mean 'ring'"),
         (("ring", [0], "cpu", torch.int64), "dtype: 'torch.int64' is not allowed; allowed: torch.float32"),
         (("ring", [-1]), "seed: -1 is not allowed"),
+        (("ring", 5), "seeds: 5 is not allowed; allowed: one or more"),
     ],
 )
 def test_what_is_not_supported_is_refused_in_one_line(arguments: Any, reason: str) -> None:
@@ -244,10 +248,47 @@ def test_what_is_not_supported_is_refused_in_one_line(arguments: Any, reason: st
     assert "\n" not in str(error.value)
 
 
-def test_a_state_of_another_shape_is_refused() -> None:
-    rings = DifferentiableRings(SMALL, [0])
-    with pytest.raises(InputError, match=r"speeds: shape: \(6,\) is not allowed"):
-        rings.set_state(torch.zeros(6), rings.positions)
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda speeds, positions: (speeds[:, 0], positions), r"speeds: shape: \(6,\) is not allowed; allowed: \(6"),
+        (lambda speeds, positions: (speeds / 0.0, positions), "speeds: nan is not allowed; allowed: finite numbers"),
+        (lambda speeds, positions: (speeds, positions / 0.0), "positions: .* is not allowed; allowed: finite numbers"),
+        (lambda speeds, positions: (speeds - 1.0, positions), "speeds: -1.0 is not allowed; allowed: >= 0"),
+        (lambda speeds, positions: ("fast", positions), "speeds: 'str' is not allowed; allowed: a tensor"),
+        (
+            lambda speeds, positions: (speeds, torch.stack([positions[:, 0], positions[:, 1].flip(0)], 1)),
+            "positions: those of ring 1 are not in order; allowed: each vehicle behind the next",
+        ),
+    ],
+)
+def test_a_state_that_no_ring_has_is_refused(change: Callable[..., Any], reason: str) -> None:
+    rings = DifferentiableRings(SMALL, [0, 1])
+    with pytest.raises(InputError, match=reason):
+        rings.set_state(*change(rings.speeds, rings.positions))
+    rings.set_state(rings.speeds.numpy() + 1.0, rings.positions.float())  # pyright: ignore[reportArgumentType]
+    assert rings.speeds.tolist() == [[1.0, 1.0]] * 6
+
+
+def test_a_torch_module_drives_as_in_numpy_and_passes_gradients() -> None:
+    torch.manual_seed(0)
+    driver = policy_driver(torch.nn.Linear(5, 1), expert=PISaturation(window=1.0))
+    rings = DifferentiableRings(SMALL, [0, 1])
+    speeds = (rings.speeds + 1.0).requires_grad_()
+    rings.set_state(speeds, rings.positions)
+    memory, state = rings.initial_memory(driver), rings.local_state()
+    found, _ = driver.act(state, memory)
+    arrays = state.map(lambda values: values.detach().numpy())
+    np.testing.assert_allclose(found.detach(), driver.act(arrays, driver.initial_memory(2))[0], atol=1e-6)
+    (gradient,) = torch.autograd.grad(found.sum(), speeds)
+    assert (gradient.abs().sum(1) > 0.0).tolist() == [True, True, False, False, False, True]
+    for name, other in {"<lambda>": policy_driver(lambda rows: rows[:, 0]), "mine": as_driver(mine)}.items():
+        with pytest.raises(InputError, match=f"driver: '{name}' is not allowed; allowed: one that takes tensors"):
+            rings.initial_memory(other)
+
+
+def mine(state: LocalState) -> Any:
+    return state.speed
 
 
 def test_the_example_of_the_documentation_runs(capsys: pytest.CaptureFixture[str]) -> None:

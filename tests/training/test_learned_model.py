@@ -104,7 +104,7 @@ def test_a_driver_of_numpy_drives_as_one_of_tensors(model: LearnedModel) -> None
 @pytest.mark.parametrize(
     ("wrong", "reason"),
     [
-        (lambda model: model.reset(0), "rows: 0 is not allowed; allowed: >= 1"),
+        (lambda model: model.reset(0), "rows: 0 is not allowed; allowed: an integer >= 1"),
         (lambda model: model.step(torch.zeros(2)), r"acceleration: shape: \(2,\) is not allowed; allowed: \(1,\)"),
         (
             lambda model: model.set_state(model.state()._replace(is_running=torch.ones(2))),

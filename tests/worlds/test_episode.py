@@ -396,8 +396,9 @@ def test_a_driver_cannot_change_its_measurements(road: str, sumo: SumoBackend, t
 def test_a_seed_may_be_any_non_negative_integer(sumo: SumoBackend) -> None:
     first, *others = (run_episode(SHORT_RING, PISaturation(), seed, backend=sumo) for seed in (3, np.int64(3), [3]))
     assert all(np.array_equal(first.speeds, other.speeds) for other in others)
-    with pytest.raises(InputError, match="seed: -1 is not allowed; allowed: >= 0"):
-        run_episode(SHORT_RING, PISaturation(), -1, backend=sumo)
+    for wrong in (-1, "1", 0.5, [0.5]):
+        with pytest.raises(InputError, match=r"seed: .* is not allowed; allowed: an integer >= 0"):
+            run_episode(SHORT_RING, PISaturation(), wrong, backend=sumo)  # pyright: ignore[reportArgumentType]
 
 
 def test_an_episode_in_sumo_draws_its_road_once(monkeypatch: pytest.MonkeyPatch, sumo: SumoBackend) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from unjam.adapters.stable_baselines3_file import read_policy
 from unjam.drivers.car_following import Constant
 from unjam.drivers.observation import FeatureLike, as_features, observation_size
-from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyOutput
+from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyOutput, TensorPolicyDriver
 from unjam.drivers.user_driver import DriverLike, UserFunction, as_driver, object_label
 from unjam.errors import InputError, invalid_value, one_line
 
@@ -34,9 +34,9 @@ def policy_driver(
     Args:
         policy: a function of observations of n CAVs, shape (n, inputs), that returns numbers, shape (n,) or (n, 1); a
             `torch.nn.Module`, of which a copy in evaluation mode is such a function, in the precision and on the device
-            of its parameters; an algorithm or a policy of Stable-Baselines3 whose actions are a `Box` of one number; or
-            the path of the .zip file of a model, which is read without unpickling. The file does not contain the
-            statistics of `VecNormalize`.
+            of its parameters, and also takes tensors, as in `DifferentiableRings`; an algorithm or a policy of
+            Stable-Baselines3 whose actions are a `Box` of one number; or the path of the .zip file of a model, which is
+            read without unpickling. The file does not contain the statistics of `VecNormalize`.
         inputs: its observation in order: names of features such as `local`, `PolicyInput`s, or functions of a
             `LocalState`.
         expert: a driver to which the accelerations are added; None: the policy drives alone.
@@ -50,6 +50,7 @@ def policy_driver(
         MissingPartError: torch is not installed, or cannot read weights safely.
     """
     label, function, size, torch = object_label(policy), policy, None, sys.modules.get("torch")
+    kind = PolicyDriver
     if isinstance(policy, str | Path):
         label, policy = Path(policy).name, read_policy(Path(policy))
     if hasattr(policy, "predict"):
@@ -59,14 +60,14 @@ def policy_driver(
             raise InputError(f"{label}: it is a residual; allowed: policy_driver with its expert, {added_to!r}")
         function, output, size = _predict(policy), _limit_output(output, policy), policy.observation_space.shape[0]
     elif torch is not None and isinstance(policy, torch.nn.Module):
-        function = deepcopy(policy).eval()
+        function, kind = deepcopy(policy).eval().requires_grad_(False), TensorPolicyDriver
     function = replace(UserFunction.from_object(function, "observations"), label=label)
     inner, features = Constant() if expert is None else as_driver(expert, time_step), as_features(inputs)
     described = observation_size(features, inner)
     if size not in (None, described):
         raise InputError(f"inputs: {described} numbers are not allowed; allowed: {size}, the inputs of {label}")
     description = PolicyDescription(features, output)
-    driver = PolicyDriver(lambda rows, memory: (function(rows), memory), label, description, inner, time_step)
+    driver = kind(lambda rows, memory: (function(rows), memory), label, description, inner, time_step)
     driver.evaluate(np.zeros((2, described)), {})
     return driver
 

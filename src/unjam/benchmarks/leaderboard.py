@@ -1,5 +1,6 @@
 """Leaderboards: results of several drivers in one suite, as rows and as a figure."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,16 +17,24 @@ HEADINGS = ("driver", "gain", "unseen", "worst road", "feasible", "steps")
 
 def read_leaderboard(paths: Sequence[Path]) -> dict[str, BenchmarkResult]:
     """Return the results in files by label, the best first; raise `InputError` unless they can be compared."""
-    results: dict[str, BenchmarkResult] = {}
+    results = list[BenchmarkResult]()
     for path in paths:
-        result = read_result(path)
+        results.append(result := read_result(path))
         with naming(f"{path}: "):
             result.check_comparable()
-            if results and result.suite != (suite := next(iter(results.values())).suite):
+            if result.suite != (suite := results[0].suite):
                 raise InputError(f"suite: {result.suite} is not allowed; allowed: {suite}, as in {paths[0]}")
-        label = one_line(result.driver)
-        results[f"{label} ({one_line(path)})" if label in results else label] = result
-    return dict(sorted(results.items(), key=lambda entry: -entry[1].mean_gain().mean))
+    labels = _unique_labels([result.driver for result in results], [path.name for path in paths])
+    return dict(sorted(zip(labels, results, strict=True), key=lambda entry: -entry[1].mean_gain().mean))
+
+
+def _unique_labels(drivers: Sequence[str], files: Sequence[str]) -> list[str]:
+    """Return short labels of one line: the driver, with the file if others have this label, with a number if needed."""
+    labels, marks = ([short_label(one_line(text)) for text in texts] for texts in (drivers, files))
+    counts = Counter(labels)
+    labels = [each if counts[each] == 1 else f"{each} ({mark})" for each, mark in zip(labels, marks, strict=True)]
+    is_unique = len(set(labels)) == len(labels)
+    return labels if is_unique else [f"{number}. {label}" for number, label in enumerate(labels, 1)]
 
 
 def leaderboard_rows(results: Mapping[str, BenchmarkResult]) -> list[tuple[str, ...]]:
@@ -36,7 +45,7 @@ def leaderboard_rows(results: Mapping[str, BenchmarkResult]) -> list[tuple[str, 
         (name, worst), steps = result.worst_road, result.training_steps
         gains = f"{mean.mean:.2f}\n{format_ci(mean, '.2f')}", f"{unseen:.2f}", f"{worst:.2f}\n{name}"
         count = f"{result.feasible_count} of {len(result.roads)}"
-        rows.append((short_label(label), *gains, count, "" if steps is None else f"{steps / 1e6:.2g} M"))
+        rows.append((label, *gains, count, "" if steps is None else f"{steps / 1e6:.2g} M"))
     return rows
 
 
@@ -52,7 +61,7 @@ def leaderboard_figure(results: Mapping[str, BenchmarkResult]) -> Figure:
         axes.plot([mean.mean], [row], "D", color=CAV_PLOT_COLOR, ms=6)
     for reference in (0.0, 1.0):
         axes.axvline(reference, color=MUTED_COLOR, lw=0.8, ls=":")
-    axes.set_yticks(range(len(results)), [short_label(label).replace("$", r"\$") for label in results])
+    axes.set_yticks(range(len(results)), [label.replace("$", r"\$") for label in results])
     axes.invert_yaxis()
     suite = next(iter(results.values())).suite
     axes.set_xlabel(f"gain in {suite}: 0 is the human baseline, 1 the best tuned expert of each road")

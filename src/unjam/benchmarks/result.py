@@ -33,6 +33,8 @@ DIGITS = 7
 """significant digits of stored metrics"""
 MAX_RELATIVE_DIFFERENCE = 1e-4
 """allowed relative difference to reference values of the human baseline"""
+TRAINING_STEPS_UNIT = "environment steps: control steps in the simulator"
+"""unit of `training_steps`, as files say"""
 PARTS = {"all roads": ("training", "combination", "axis"), "training": ("training",), "unseen": ("combination", "axis")}
 """parts of the family by the name of their mean"""
 COUNT, MAX_VALUE = len(FAMILY_TEST_SEEDS), 1e9
@@ -64,7 +66,7 @@ class BenchmarkResult:
     sha256: StrictStr | None
     """hash of the driver: its controller file, or else its parameters, code and weights; None: a Python object"""
     training_steps: StrictInt | None
-    """environment steps of its training or tuning, as its file or its author says; None: unknown"""
+    """control steps in the simulator of its training or tuning, as its file or its author says; None: unknown"""
     manifest: dict[str, Any] = field(repr=False)
     """versions of unjam and SUMO, machine, command"""
     roads: dict[str, RoadRecord] = field(default_factory=dict, repr=False)
@@ -132,7 +134,7 @@ class BenchmarkResult:
 
     def document(self) -> dict[str, Any]:
         """Return the content of the file, a JSON object; with a summary if all roads are finished."""
-        content = asdict(self) | {"seeds": FAMILY_TEST_SEEDS}
+        content = asdict(self) | {"training_steps_unit": TRAINING_STEPS_UNIT, "seeds": FAMILY_TEST_SEEDS}
         return content if self.missing_roads else {"summary": self.summary(), **content}
 
     def check_comparable(self) -> None:
@@ -185,12 +187,15 @@ def read_result(path: Path) -> BenchmarkResult:
     """
     with naming(f"{path}: "):
         try:
-            if not path.is_file() or path.stat().st_size > MAX_FILE_BYTES:
-                raise invalid_value("file", path.name, f"a file of `unjam benchmark`, at most {MAX_FILE_BYTES:,} bytes")
+            if not path.is_file():
+                reason = "it is not a file" if path.exists() else "there is no such file"
+                raise InputError(f"{reason}; allowed: a file of `unjam benchmark`")
+            if path.stat().st_size > MAX_FILE_BYTES:
+                raise InputError(f"it is too large; allowed: at most {MAX_FILE_BYTES:,} bytes")
             content = parse_json(path.read_bytes())
             if not isinstance(content, dict) or content.get("format") != FILE_FORMAT:
                 raise ValueError(f"format: it is not {FILE_FORMAT}")
-            seeds, summary = content.pop("seeds", None), content.pop("summary", None)
+            seeds, summary, _ = (content.pop(name, None) for name in ("seeds", "summary", "training_steps_unit"))
         except INVALID_DATA_ERRORS as error:
             raise InputError(f"it is not a result of `unjam benchmark`: {error}") from None
         result = build_dataclass(BenchmarkResult, content, "result")

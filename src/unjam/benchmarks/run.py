@@ -1,7 +1,8 @@
 """Run a benchmark: the human baseline and a driver on the test seeds of each road of a suite."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ from unjam.manifest import manifest, without_folders
 from unjam.measures.gain import EpisodeRows
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import measure
+from unjam.parameters import check_integer
+from unjam.processes import lock_file
 from unjam.road_family import FAMILY_PREFIX
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
@@ -65,17 +68,18 @@ def benchmark(
         workers: processes; all cores by default. The result does not depend on it.
         backend: `exact`: the batch on rings, for drivers without user code, and SUMO elsewhere; or the simulator of all
             episodes: `sumo`, `batch` or `path.py:name`.
-        training_steps: environment steps that made the driver, unless its file says so.
+        training_steps: environment steps that made the driver, unless its file says so: control steps (decisions of the
+            driver) in the simulator, the calls of `env.step` of all environments together.
         progress: called with a line after each road.
 
     Raises:
-        InputError: an argument is wrong, the driver fails or can drive on no road, or `out` has another result.
+        InputError: an argument is wrong, the driver fails or can drive on no road, or `out` has another result or is
+            being written by another process.
     """
     roads = {name: make_scenario(f"{FAMILY_PREFIX}{name}") for name in find_suite(suite).roads}
-    if workers is not None and workers < 1:
-        raise invalid_value("workers", workers, ">= 1")
-    if training_steps is not None and not 0 <= training_steps <= MAX_TRAINING_STEPS:
-        raise invalid_value("training_steps", training_steps, f"0 to {MAX_TRAINING_STEPS:g}")
+    for name, number, *limits in (("workers", workers, 1), ("training_steps", training_steps, 0, MAX_TRAINING_STEPS)):
+        if number is not None:
+            check_integer(name, number, *limits)
     drivers, reasons = _make_drivers(driver, roads)
     if backend != EXACT_BACKEND:
         with open_backend(backend) as simulator:
@@ -90,13 +94,9 @@ def benchmark(
         manifest={**origin, "command": without_folders(origin["command"]), "backend": backend},
     )
     path = None if out is None else Path(out)
-    if path is not None:
-        if path.is_symlink():
-            raise invalid_value("out", str(path), "a file, and no link")
-        make_folder(path.parent)
-        result = _stored_result(path, result) if os.path.lexists(path) else result
-    written = _content(path)
-    with WorkerPool(workers or os.cpu_count() or 1) as pool:
+    with _locked_result(path), WorkerPool(workers or os.cpu_count() or 1) as pool:
+        if path is not None and os.path.lexists(path):
+            result = _stored_result(path, result)
         for number, name in enumerate(result.missing_roads, len(result.roads) + 1):
             scenario = roads[name]
             human = make_driver(HUMAN_LABEL, scenario.control_step)
@@ -106,20 +106,23 @@ def benchmark(
             record = RoadRecord(used, to_columns(baseline), to_columns(rows), one_line(reasons.get(name, "")))
             result = replace(result, roads={**result.roads, name: record})
             if path is not None:
-                if _content(path) != written:
-                    raise InputError(
-                        f"out: {path} was changed by another process meanwhile; allowed: a file of its own"
-                    )
                 write_result(path, result)
-                written = _content(path)
             row = result.road_rows()[len(result.roads) - 1]
             progress(f"{number} of {len(roads)}: {name}: gain {row['gain']:.2f}, {row['feasible']}")
     return result
 
 
-def _content(path: Path | None) -> bytes:
-    """Return the content of a file; nothing if there is none."""
-    return path.read_bytes() if path is not None and path.is_file() else b""
+@contextmanager
+def _locked_result(path: Path | None) -> Iterator[None]:
+    """Make the folder of a result, and lock its file for this process; None: there is none."""
+    if path is None:
+        yield
+        return
+    if path.is_symlink():
+        raise invalid_value("out", str(path), "a file, and no link")
+    make_folder(path.parent)
+    with lock_file(path.with_name(f".{path.name}.lock"), f"out: {str(path)!r}"):
+        yield
 
 
 def _make_drivers(

@@ -38,7 +38,12 @@ def benchmark_command(
         str, Option(help="Simulator: exact (batch on rings, else sumo), sumo, batch, or your own: path.py:name.")
     ] = "exact",
     training_steps: Annotated[
-        int | None, Option(min=0, help="Environment steps of the training, unless the driver's file says so.")
+        int | None,
+        Option(
+            min=0,
+            help="Environment steps of the training: control steps, the calls of env.step of all environments. "
+            "The driver's own file has priority.",
+        ),
     ] = None,
     json: opt.JsonOption = False,
 ) -> None:
@@ -90,7 +95,7 @@ def _compare(names: list[str], out: Path, json: bool) -> None:
     make_folder(out.parent)
     atomic_write(out, (svg_bytes if out.suffix == ".svg" else png_bytes)(leaderboard.leaderboard_figure(results)))
     if json:
-        print_json({label: result.summary() for label, result in results.items()})
+        print_json({label: {"driver": result.driver, **result.summary()} for label, result in results.items()})
         return
     table = new_table(leaderboard.HEADINGS[:1], leaderboard.HEADINGS[1:])
     table.padding, table.columns[0].overflow = (0, 1, 0, 0), "fold"

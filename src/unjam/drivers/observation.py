@@ -301,6 +301,8 @@ def _user_feature(function: UserFunction) -> Feature:
         like, state = inputs.state.speed, inputs.state
         is_numpy = isinstance(like, np.ndarray)
         if not is_numpy:  # tensors: users' functions take NumPy arrays only
+            if any(values is not None and values.requires_grad for values in state):
+                raise InputError(f"{function.label}: feature has no gradient; allowed: within torch.no_grad()")
             state = state.map(lambda values: values.double().cpu().numpy())
         found = _feature_columns(function, state, size)
         if not (is_finite := np.isfinite(found)).all():

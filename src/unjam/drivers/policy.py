@@ -14,10 +14,11 @@ from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import FEATURES, Feature, NetworkInput, PolicyInput, Scale, unit_factor
+from unjam.drivers.requirements import Requirements
 from unjam.drivers.residual import ExpertWrapper
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import STRICT, Number, build_dataclass, parameter_dataclass
-from unjam.physics.arrays import Array
+from unjam.physics.arrays import Array, namespace
 
 POLICY_KEY = "policy"
 """name in the memory: that of the policy"""
@@ -154,16 +155,23 @@ class PolicyDriver(ExpertWrapper):
 
         Raise `InputError` if they are not finite, or of another shape.
         """
-        rows = len(observation)
+        rows, xp = len(observation), namespace(observation)
         answer, after = self.policy(observation, memory)
-        numbers = np.asarray(answer)
+        numbers = np.asarray(answer) if xp is np else xp.as_tensor(answer)
         if numbers.shape not in ((rows,), (rows, 1)):
             allowed = f"allowed: ({rows},) or ({rows}, 1)"
             raise InputError(f"driver {self.label}: returns shape {numbers.shape} for {rows} CAVs; {allowed}")
-        if not np.isfinite(numbers).all():
-            raise InputError(f"driver {self.label}: returns {numbers[~np.isfinite(numbers)][0]}; allowed: finite")
+        if not (is_finite := xp.isfinite(numbers)).all():
+            raise InputError(f"driver {self.label}: returns {numbers[~is_finite][0]}; allowed: finite")
         return numbers.reshape(rows), after
 
     def describe(self) -> str:
         """Return the name of the policy, after the expert's description if there is one."""
         return self.label if self.expert == Constant() else f"{self.expert.describe()} + {self.label}"
+
+
+@plain_dataclass(frozen=True, eq=False)
+class TensorPolicyDriver(PolicyDriver):
+    """A policy that also takes torch tensors, through which gradients flow from the state to the acceleration."""
+
+    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)

@@ -86,24 +86,29 @@ def last_line(error: BaseException, file: str) -> str:
 
 
 def _as_numpy_function(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of an array, or of a named tuple of arrays; a `torch.nn.Module` receives them as tensors."""
+    """Return a function of an array, or of a named tuple of arrays or tensors.
+
+    A `torch.nn.Module` receives them as tensors of its own type and device; gradients flow through those from tensors.
+    """
     torch: Any = sys.modules.get("torch")  # it is imported where its modules exist; workers run without it
     module: Any = function
     if torch is None or not isinstance(module, torch.nn.Module):
         return function
 
     def call(rows: Any) -> Any:
-        if isinstance(rows[0], torch.Tensor):
-            return module(rows)
-        like = next(module.parameters(), torch.zeros(()))
-        if isinstance(rows, np.ndarray):
-            tensors = torch.as_tensor(rows, dtype=like.dtype, device=like.device)
-        else:
-            found = (None if values is None else torch.tensor(values, device=like.device) for values in rows)
-            tensors = (each.to(like.dtype) if each is not None and each.is_floating_point() else each for each in found)
-            tensors = type(rows)(*tensors)
+        first = rows[0]
+        like = next(module.parameters(), first if isinstance(first, torch.Tensor) else torch.zeros(()))
+
+        def as_own(values: Any) -> Any:
+            tensor = values if isinstance(values, torch.Tensor) else torch.tensor(values)
+            return tensor.to(like) if tensor.is_floating_point() else tensor.to(like.device)
+
+        is_record = hasattr(rows, "_fields")
+        own = type(rows)(*(None if each is None else as_own(each) for each in rows)) if is_record else as_own(rows)
+        if isinstance(first, torch.Tensor):
+            return map_leaves(lambda tensor: tensor.to(first), module(own))
         with torch.no_grad():
-            return map_leaves(lambda tensor: tensor.cpu().numpy(), module(tensors))
+            return map_leaves(lambda tensor: tensor.cpu().numpy(), module(own))
 
     return call
 

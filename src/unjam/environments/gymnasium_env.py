@@ -32,10 +32,12 @@ from unjam.drivers.user_driver import DriverLike
 from unjam.drivers.wrappers import INNER_KEY
 from unjam.environments.threads import CopyableLock, synchronized
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
-from unjam.parameters import merge_changes, nest_keys
+from unjam.measures.step_metrics import StepMetricMeans
+from unjam.parameters import check_integer, merge_changes, nest_keys
 from unjam.physics.arrays import clip, replace_entries
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
+from unjam.scenarios.road import OrderedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import warn_of_reserved_seed
 from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend, open_world
@@ -147,7 +149,10 @@ class RoadStepper:
         reward = reward or self.scenario.reward
         self._reward, self._reward_needs_rows = make_reward(reward), not is_packaged_reward(reward)
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
-        self._driver = ExternalDriver(driver, as_features(features), self.scenario.acceleration_limits)
+        inputs = as_features(features)
+        if not expert and (useless := [name for name in ("expert_acceleration", "expert_memory") if name in inputs]):
+            raise InputError(f"features: {useless[0]!r} is not allowed; allowed: with an expert, like 'pi'")
+        self._driver = ExternalDriver(driver, inputs, self.scenario.acceleration_limits)
         self._backend = backend
         with open_backend(backend) as opened:
             self._check_scenario(self.scenario, opened)
@@ -196,7 +201,7 @@ class RoadStepper:
             self._opened = self._backend_context.enter_context(open_backend(self._backend))
         scenario = self._with_options(options, self._opened) if options else self.scenario
         if seed is not None:
-            self._seed, self._episode_count = seed, 0
+            self._seed, self._episode_count = check_integer("seed", seed, 0), 0
         if self._seed is None:
             self._seed = int(generator.integers(2**31))
         numbers = episode_seed(self._seed, self._episode_count)
@@ -209,10 +214,13 @@ class RoadStepper:
         self._world = world = self._world_context.enter_context(opening)
         self._drive_loop = DriveLoop(world, self._driver)
         self._control_steps = iter(self._drive_loop)
+        self._steps, self._return = 0, 0.0
+        self._metric_means = StepMetricMeans() if isinstance(world.road, OrderedRoad) else None
         self._wait_for_cav()
-        if not world.cav_ids:
-            steps, allowed = scenario.horizon, "allowed: a longer horizon, or more CAVs"
-            raise EpisodeError(f"reset: no CAV enters the road within the horizon, {steps} control steps; {allowed}")
+        if not world.cav_ids or world.has_ended:  # there is no control step that a driver could decide
+            self.end_episode()
+            allowed = f"a horizon of more than {scenario.horizon} control steps, or more CAVs"
+            raise EpisodeError(f"reset: no CAV enters the road before the episode ends; allowed: {allowed}")
         return self._observe()
 
     def step(self, actions: Any) -> RoadStepResult:
@@ -231,16 +239,30 @@ class RoadStepper:
             departed = {name: last_observations[row] for row, name in enumerate(before) if row not in rows}
         time_gaps, speed = time_gap(state.leader_gap, state.speed), state.speed
         if not world.is_scalar:
-            time_gaps, speed = time_gaps[: len(accelerations)], speed[: len(accelerations)]
+            time_gaps, speed = time_gaps[: len(accelerations)], np.array(speed[: len(accelerations)])
+            accelerations = np.array(accelerations)  # a backend may write into its own arrays later
         ends = bool(world.has_crashed), float(world.backlog)
         outcome = Outcome(np.array(world.speeds), accelerations, time_gaps, *ends, speed)
         terms = step_reward_terms(self._reward, outcome, world.control_steps - 1, self._reward_needs_rows)
-        terminated = world.has_crashed
+        terminated, reward = world.has_crashed, sum(terms.values())
+        self._steps, self._return = self._steps + 1, self._return + reward
+        if self._metric_means is not None:
+            self._metric_means.add(outcome)
         if not world.cav_ids:
             self._wait_for_cav()  # a crash of human drivers in the meantime ends the episode, but no CAV has caused it
         truncated = not terminated and (world.has_ended or not world.cav_ids)
-        observations, reward = self._observe(), sum(terms.values())
-        return RoadStepResult(list(world.cav_ids), observations, departed, reward, terms, terminated, truncated)
+        return RoadStepResult(list(world.cav_ids), self._observe(), departed, reward, terms, terminated, truncated)
+
+    def step_info(self, result: RoadStepResult, has_ended: bool) -> dict[str, Any]:
+        """Return `reward_terms` and, at the end of an episode, `episode_metrics`, as `RoadVectorEnv`.
+
+        Where vehicles enter and leave, these are only `return` and `steps`: means over control steps are no metrics.
+        """
+        if not has_ended:
+            return {"reward_terms": result.reward_terms}
+        means = {} if self._metric_means is None else self._metric_means.means()
+        metrics = {"return": self._return, "steps": self._steps, **means}
+        return {"reward_terms": result.reward_terms, "episode_metrics": metrics}
 
     def _wait_for_cav(self) -> None:
         """Continue the simulation until a CAV is on the road, or none will enter before the episode ends."""
@@ -304,6 +326,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
                  ``allowed_speed``, ``distance_to_merge``, ``merge_proximity``, ``lane_speeds``, ``road_speeds``,
                  ``adjacent_lanes``; a `PolicyInput`, ``path.py:name``, or a function of a `LocalState`
     Reward       that of the scenario, or ``reward``; its terms are in ``info["reward_terms"]``
+    Metrics      ``info["episode_metrics"]`` in the last step, as of `RoadVectorEnv`
     Start        ``reset(seed=s)`` starts the same episode as ``unjam drive --seed s``, with its warm-up; on open roads
                  it returns when the CAV has entered, and ``info["control_steps"]`` of the horizon have passed
     Terminated   at a collision
@@ -371,8 +394,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         `options` are changes to the parameters of the scenario, as `changes` of the constructor, for this episode only:
         `reset(options={"length": 230})`. The number of CAVs and the action limit stay.
         """
-        super().reset(seed=seed)
         observations = self._road.reset(seed, self.np_random, options)
+        super().reset(seed=seed)
         world = self._road.world
         return observations[0], {"drawn_values": dict(world.road.drawn_values), "control_steps": world.control_steps}
 
@@ -382,7 +405,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         result = self._road.step([as_action(action, "action")])
         observation = next(iter(result.departed.values())) if result.departed else result.observations[0]
         truncated = result.truncated or (bool(result.departed) and not result.terminated)
-        return observation, result.reward, result.terminated, truncated, {"reward_terms": result.reward_terms}
+        info = self._road.step_info(result, result.terminated or truncated)
+        return observation, result.reward, result.terminated, truncated, info
 
     @property
     def spec(self) -> EnvSpec | None:

@@ -86,12 +86,13 @@ class ParallelRoadEnv(RoadAgents):
             agent: each for agent, each in (leaving | present).items() if agent in previous or not has_ended
         }
         self.agents = [] if has_ended else list(present)
+        info = self._road.step_info(result, has_ended)
         return (
             observations,
             {agent: result.reward if agent in previous else 0.0 for agent in observations},
             dict.fromkeys(observations, result.terminated),
             {agent: result.truncated or (agent in leaving and not result.terminated) for agent in observations},
-            {agent: {"reward_terms": result.reward_terms} for agent in observations},
+            {agent: dict(info) for agent in observations},
         )
 
     def _assign_agents(self, vehicles: Iterable[str]) -> list[str]:

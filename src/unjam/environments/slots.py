@@ -7,7 +7,8 @@ import numpy as np
 from unjam.environments.agents import RoadAgents
 from unjam.environments.gymnasium_env import as_action
 from unjam.environments.threads import synchronized
-from unjam.errors import InputError, invalid_value
+from unjam.errors import InputError
+from unjam.parameters import check_integer
 
 
 class SlottedRoadEnv(RoadAgents):
@@ -25,9 +26,8 @@ class SlottedRoadEnv(RoadAgents):
 
     def __init__(self, environment: Any, slots: int) -> None:
         """Map the agents of a `ParallelRoadEnv` to so many slots."""
-        if not isinstance(slots, int) or isinstance(slots, bool) or slots < 1:
-            raise invalid_value("slots", slots, "an integer >= 1")
-        super().__init__(environment._road, (f"slot_{number}" for number in range(slots)))
+        count = check_integer("slots", slots, 1)
+        super().__init__(environment._road, (f"slot_{number}" for number in range(count)))
         self._environment = environment
         self._cavs: dict[str, str] = {}
         """agent of the environment by occupied slot"""

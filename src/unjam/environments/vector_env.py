@@ -18,9 +18,11 @@ from unjam.drivers.user_driver import DriverLike
 from unjam.environments.gymnasium_env import ExternalDriver, RoadStepper, check_single_cav, episode_seed
 from unjam.errors import InputError, MissingPartError, UnjamError, import_optional, invalid_value
 from unjam.measures.step_metrics import step_metrics
+from unjam.parameters import check_integer
 from unjam.physics.arrays import Array, clip, copy_array, namespace, replace_entries
 from unjam.scenarios import make_scenario
 from unjam.seeds import warn_of_reserved_seed
+from unjam.tree import map_leaves
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, draw_single_normal
 from unjam.worlds.batch.ring.record import as_numpy
 from unjam.worlds.batch.ring.world import RingBatch
@@ -31,6 +33,8 @@ from unjam.worlds.reward import Outcome, RewardLike, validate_reward_terms
 
 EXPERT_CHECK_STEPS = 3
 """random steps in which an expert must drive each row by itself, without a state of its own"""
+MAX_ENVIRONMENTS = 1_000_000
+"""maximum number of environments, of which each takes 2 kB or more"""
 OTHER_MODE = "allowed: vectorization_mode='async', which simulates in SUMO"
 
 
@@ -85,6 +89,12 @@ class _Episodes:
         self._state = self.world.local_state()
         found = self._driver.observation(self._state, self._memory)
         self.observations = clip(found, -MAX_OBSERVATION, MAX_OBSERVATION)
+
+    def detach(self) -> None:
+        """Let no gradients flow through earlier steps."""
+        self.world.detach_state()
+        self._memory = map_leaves(lambda values: values.detach(), self._memory)
+        self.observe()  # the driver keeps what it computes
 
     def replace(self, rows: list[int], source: "_Episodes", source_rows: list[int]) -> None:
         """Go on in some rows with episodes that have just been started."""
@@ -145,8 +155,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         for name in ("backend", "render_mode"):
             if changes.pop(name, None):
                 raise InputError(f"{name}: is not an option of batches; {OTHER_MODE}")
-        if not isinstance(num_envs, int) or num_envs < 1:
-            raise invalid_value("num_envs", num_envs, "an integer >= 1")
+        num_envs = check_integer("num_envs", num_envs, 1, MAX_ENVIRONMENTS)
         made = make_scenario(scenario, changes)
         reason = statistically_unsupported_reason(made)
         if not reason and not issubclass(required_batch_kind(made).world, RingBatch):
@@ -186,7 +195,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode in each environment, or in those of `options["reset_mask"]`, booleans of shape (W,)."""
-        rows, seeds = self._rows_to_reset(options or {}), self._seeds_of_environments(seed)
+        rows, seeds = self._rows_to_reset({} if options is None else options), self._seeds_of_environments(seed)
         warn_of_reserved_seed(*seeds)
         for row in rows:
             given = seeds[row]
@@ -207,6 +216,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         return self._kind.to_single(self._running_episodes.observations), self._start_info(rows)
 
     def _rows_to_reset(self, options: dict[str, Any]) -> list[int]:
+        if not isinstance(options, dict):
+            raise invalid_value("options", options, "a dict with 'reset_mask'")
         if unknown := options.keys() - {"reset_mask"}:
             raise InputError(f"options: {min(unknown)!r} is not allowed; allowed: 'reset_mask'")
         mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)))
@@ -292,6 +303,16 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
                 self._restart(restarted)
                 info |= self._start_info(restarted)
         return self._kind.to_single(episodes.observations), rewards, terminated, truncated, info
+
+    def detach(self) -> Array:
+        """Let no gradients flow to earlier steps from here on, and return the last observations without them, too.
+
+        Raise `InputError` without `device`: NumPy arrays have no gradients.
+        """
+        if self._is_numpy:
+            raise InputError("detach: NumPy arrays have no gradients; allowed: device='cpu' or another device of torch")
+        self._running_episodes.detach()
+        return self._kind.to_single(self._running_episodes.observations)
 
     def _as_actions(self, actions: Any) -> Array:
         if self._is_numpy:

@@ -1,9 +1,9 @@
 """Rings in torch through which gradients flow: from rewards and states back to the CAVs' accelerations."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import SupportsIndex
+from typing import Any, SupportsIndex
 
 import torch
 from torch import Tensor
@@ -65,8 +65,8 @@ class DifferentiableRings(RingBatch):
         check_device(device)
         if dtype not in (torch.float32, torch.float64):
             raise invalid_value("dtype", str(dtype), "torch.float32, torch.float64")
-        road, numbers = make_scenario(scenario), [as_seed(seed) for seed in seeds]
-        if not numbers:
+        road = make_scenario(scenario)
+        if not isinstance(seeds, Iterable) or not (numbers := [as_seed(seed) for seed in seeds]):
             raise invalid_value("seeds", seeds, "one or more")
         if not isinstance(road, Ring):
             raise invalid_value("scenario", road.title, "a ring")
@@ -99,15 +99,39 @@ class DifferentiableRings(RingBatch):
         return self._loop_lengths
 
     def set_state(self, speeds: Tensor, positions: Tensor) -> None:
-        """Move all vehicles [m/s, m], shapes as of `speeds` and `positions`; gradients flow back to both."""
-        for name, values in (("speeds", speeds), ("positions", positions)):
-            if values.shape != self._position.shape:
-                raise invalid_value(f"{name}: shape", tuple(values.shape), str(tuple(self._position.shape)))
-        self._speed, self._position = torch.cat([speeds, speeds[:1]]), positions
-        self._gap = gap_on_loop(positions, positions.roll(-1, 0), self._loop_lengths, VEHICLE_LENGTH)
+        """Move all vehicles [m/s, m], shapes as of `speeds` and `positions`; gradients flow back to both.
+
+        Raise `InputError` if they have another shape, a number is not finite, a speed is negative, or a vehicle is not
+        behind its leader, the next row, within one lap.
+        """
+        speeds, positions = (self._as_motion(*each) for each in (("speeds", speeds), ("positions", positions)))
+        if bool((speeds < 0.0).any()):
+            raise invalid_value("speeds", float(speeds.min()), ">= 0")
+        gaps = gap_on_loop(positions, positions.roll(-1, 0), self._loop_lengths, VEHICLE_LENGTH)
+        laps = ((gaps + VEHICLE_LENGTH).sum(0) / self._loop_lengths).round()
+        if bool((laps != 1.0).any()):
+            ring = int((laps != 1.0).nonzero()[0])
+            raise InputError(f"positions: those of ring {ring} are not in order; allowed: each vehicle behind the next")
+        self._speed, self._position, self._gap = torch.cat([speeds, speeds[:1]]), positions, gaps
+
+    def _as_motion(self, name: str, values: Any) -> Tensor:
+        try:
+            found = self._to_array(values)
+        except (TypeError, ValueError, RuntimeError):
+            raise invalid_value(name, type(values).__name__, "a tensor") from None
+        if found.shape != self._position.shape:
+            raise invalid_value(f"{name}: shape", tuple(found.shape), str(tuple(self._position.shape)))
+        if not bool(found.isfinite().all()):
+            raise invalid_value(name, float(found[~found.isfinite()][0]), "finite numbers")
+        return found
 
     def initial_memory(self, driver: Driver) -> Memory:
-        """Return the memory, as tensors, with which a driver begins to drive all CAVs after the warm-up."""
+        """Return the memory, as tensors, with which a driver begins to drive all CAVs after the warm-up.
+
+        Raise `InputError` if the driver takes only NumPy arrays, which have no gradients.
+        """
+        if driver.requirements().needs_numpy:
+            raise invalid_value("driver", driver.describe(), "one that takes tensors, like 'pi' or a torch.nn.Module")
         memory = initial_batch_memory(driver, len(self.roads), self.cav_count)
         memory = memory if self._history is None else driver.recall(memory, self._history)
         return map_leaves(self._to_array, memory)
@@ -126,8 +150,7 @@ class DifferentiableRings(RingBatch):
 
     def detach(self, memory: Memory | None = None) -> Memory:
         """Let no gradients flow to earlier steps from here on; return the driver's `memory` without them, too."""
-        self._speed, self._position, self._gap = (each.detach() for each in (self._speed, self._position, self._gap))
-        self._actuation.detach()
+        self.detach_state()
         return map_leaves(lambda values: values.detach(), memory or {})
 
 

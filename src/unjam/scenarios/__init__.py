@@ -1,5 +1,6 @@
 """Scenarios: roads, traffic, how an episode starts and ends."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,8 @@ def make_scenario(scenario: ScenarioLike, changes: dict[str, Any] | None = None)
     A dot in a name leads into a group of parameters: `{"safety.time_gap": 1.5, "ramps.0.inflow": 600}`. Raise
     `InputError` for an unknown scenario or parameter, or a value out of range.
     """
+    if not isinstance(changes, Mapping | None):
+        raise invalid_value("scenario options", changes, "a dict of parameters of the scenario")
     changes = nest_keys(changes or {})
     if isinstance(scenario, str) and scenario.endswith(".sumocfg"):
         return load_user_network(scenario, changes)
@@ -80,6 +83,8 @@ def _base_scenario(scenario: ScenarioLike) -> Scenario:
         return scenario
     if isinstance(scenario, type):
         return build_dataclass(scenario, {}, f"scenario {scenario.__name__}")
+    if not isinstance(scenario, str):
+        raise invalid_value("scenario", scenario, "a name, a Scenario, or its class")
     if is_file_reference(scenario):
         return load_python_scenario(scenario)
     if scenario.endswith(".toml"):

@@ -27,6 +27,7 @@ from unjam.measures.metric_table import RowsByDriver, choose_baseline, metric_ta
 from unjam.measures.metrics import METRICS, measure
 from unjam.measures.notes import count_early_ends, episode_notes
 from unjam.measures.statistics import Estimate, paired_difference, summarize
+from unjam.parameters import check_integer
 from unjam.reports.results import EPISODE_ENTRIES, EVALUATION_FILE, pack_episode, to_plot_episode
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
@@ -362,9 +363,9 @@ def drive(
     Raises:
         InputError: an argument is wrong; nothing was started.
     """
-    for name, number, minimum in (("episodes", episodes, 1), ("seed", seed, 0), ("workers", workers, 1)):
-        if number is not None and number < minimum:
-            raise invalid_value(name, number, f">= {minimum}")
+    counts = ("episodes", episodes, 1), ("seed", seed, 0), ("workers", 1 if workers is None else workers, 1)
+    for name, number, minimum in counts:
+        check_integer(name, number, minimum)
     if seed + episodes > TRAINING_SEED_LIMIT:
         raise invalid_value("seed", seed, f"<= {TRAINING_SEED_LIMIT - episodes}: larger ones are reserved")
     if test_seeds and seed:

@@ -14,6 +14,7 @@ from unjam.models.ensemble import torch_generator
 from unjam.models.environment_data import StartIndices
 from unjam.models.rollouts import ModelDynamics, ModelTransition, draw_starts, tensor_driver, tensor_memory, to_device
 from unjam.models.row_world_model import RowWorldModel
+from unjam.parameters import check_integer
 from unjam.training.model_facts import TrainedModel, read_trained_model, trained_model_facts
 from unjam.training.run_folder import read_config
 from unjam.worlds.episode import check_can_drive
@@ -67,9 +68,7 @@ class LearnedModel:
 
         With `episode_starts_only`, they are first states of recorded episodes. Raise `InputError` without any rows.
         """
-        if rows < 1:
-            raise invalid_value("rows", rows, ">= 1")
-        data = self.world_model.data
+        data, rows = self.world_model.data, check_integer("rows", rows, 1)
         return self.reset_at(draw_starts(data, rows, 1, (seed, 0), episode_starts_only=episode_starts_only), seed)
 
     def reset_at(self, start_indices: StartIndices, seed: int = 0) -> LocalState:

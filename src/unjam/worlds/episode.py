@@ -6,7 +6,6 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from operator import index
 from typing import Any, SupportsIndex
 
 import numpy as np
@@ -15,7 +14,8 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.observation import NetworkInput, feature
 from unjam.drivers.requirements import Requirements
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, NoCavError, invalid_value
+from unjam.errors import InputError, NoCavError
+from unjam.parameters import check_integer
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import BackendLike, WorldOptions, check_support, open_backend, open_world
 from unjam.worlds.drive import drive_world
@@ -124,11 +124,9 @@ def seeded_generators(seed: Sequence[int]) -> Iterator[None]:
 
 
 def as_seed(seed: SupportsIndex | Sequence[int]) -> tuple[int, ...]:
-    """Return a seed's integers; raise `InputError` if one is negative."""
-    integers = tuple(map(int, seed)) if isinstance(seed, Sequence | np.ndarray) else (index(seed),)
-    if min(integers, default=0) < 0:
-        raise invalid_value("seed", seed, ">= 0")
-    return integers
+    """Return a seed's integers; raise `InputError` if one is negative or no integer."""
+    numbers: Any = seed if isinstance(seed, Sequence | np.ndarray) else [seed]
+    return tuple(check_integer("seed", number, 0) for number in numbers)
 
 
 def check_can_drive(driver: Driver, scenario: Scenario, label: str = "driver: it") -> None:

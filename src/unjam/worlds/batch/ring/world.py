@@ -236,6 +236,11 @@ class RingBatch:
         if self._figure_eight and source._figure_eight:
             self._figure_eight.replace_roads(roads, source._figure_eight, source_roads)
 
+    def detach_state(self) -> None:
+        """Let no gradients of torch flow through the state so far."""
+        self._speed, self._position, self._gap = (each.detach() for each in (self._speed, self._position, self._gap))
+        self._actuation.detach()
+
     @property
     def speeds(self) -> Array:
         """Speeds of all vehicles with a driver [m/s], shape (vehicles, W)."""
