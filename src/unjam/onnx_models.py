@@ -63,9 +63,12 @@ def parse_model(content: bytes) -> Any:
 
 
 def remove_texts(message: Any) -> None:
-    """Remove the texts of a message, and of all messages nested in it."""
+    """Remove the texts of a message, and of all messages nested in it.
+
+    Also remove the statement of constants that their data are in the graph, which `onnx.save` writes.
+    """
     for each, value in message.ListFields():
-        if each.name in TEXT_FIELDS:
+        if each.name in TEXT_FIELDS or (each.name == "data_location" and value == message.DEFAULT):
             message.ClearField(each.name)
         elif each.message_type is not None:
             for inner in (value,) if hasattr(value, "ListFields") else value:
@@ -94,6 +97,9 @@ def check_model(model: Any, size: int, opsets: range, ir_versions: range) -> Non
 def _check_fields(message: Any) -> None:
     """Raise `InputError` if a message, or one nested in it, sets a field that is not allowed."""
     kind = message.DESCRIPTOR.name
+    if kind == "TensorProto" and message.data_location != message.DEFAULT:
+        allowed = "in the graph, as torch.onnx.export(..., external_data=False) writes it"
+        raise invalid_value("graph: data of a constant", "in another file", allowed)
     for each, value in message.ListFields():
         if each.name not in ALLOWED_FIELDS.get(kind, ()):
             allowed = ", ".join(sorted(ALLOWED_FIELDS.get(kind, ()))) or "no message of this kind"

@@ -46,6 +46,7 @@ def follower() -> Any:
     constants = [constant("time_gap", 1.4), constant("gain", 0.2)]
     made = model(nodes, inputs, [value("acceleration")], constants)
     made.metadata_props.add(key="trained", value="elsewhere")
+    made.graph.initializer[0].data_location = onnx.TensorProto.DEFAULT  # as `onnx.save` does after `onnx.load`
     return made
 
 

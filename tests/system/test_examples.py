@@ -1,3 +1,4 @@
+import os
 import re
 import shutil
 import socket
@@ -10,15 +11,17 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+import unjam
 from tests.controller.test_file import residual
 from tests.controller.test_sample import perceived
 from tests.drivers.test_experts import EXPERTS
 from tests.worlds.sumo.user_networks import straight
+from unjam.adapters import onnx_driver
 from unjam.controller import controller_bytes, packaged_file
 from unjam.controller.file import SAMPLE_PART, replay_states, sample_bytes
 from unjam.drivers import LACC, Driver, FollowerStopper, LocalState, Pacer, PISaturation
 from unjam.drivers.local_state import MAX_OBSERVED_GAP
-from unjam.drivers.registry import driver_from_name
+from unjam.drivers.registry import driver_from_name, is_serializable
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.wrappers import FilteredDriver, HistoryDriver, MixedDriver
 from unjam.worlds.sumo.networks import sumo_program
@@ -26,19 +29,65 @@ from unjam.worlds.sumo.networks import sumo_program
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
+VIDEO_WRITER = """
+class ImageSequenceClip:
+    def __init__(self, frames, fps):
+        self.frames = frames
+
+    def write_videofile(self, path, **options):
+        open(path, "w").write(f"{len(self.frames)} frames")
+"""
+"""stands for moviepy, which only encodes the frames"""
+
+
+def run_example(folder: Path, name: str, *arguments: str) -> str:
+    """Return what an example prints."""
+    command = [sys.executable, str(EXAMPLES / name), *arguments]
+    paths = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, "PYTHONPATH": paths}
+    ran = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "argument", "words"),
+    ("command", "words"),
     [
-        pytest.param("train_ppo.py", 100, "over 3 episodes", marks=pytest.mark.slow),
-        ("plain_loop.py", 1, "episode 0: return"),
+        ("train_ppo.py 100", "over 3 episodes"),
+        ("plain_loop.py 1", "episode 0: return"),
+        ("sb3_vectorized.py 20000", "19,200 steps: mean speed"),
+        ("sb3_vectorized.py 1400 --algorithm sac", "1,408 steps in"),
+        ("shared_policy.py 1 60", "update 0: "),
+        ("offline_dataset.py 1 100", "600 transitions, observations (600, 5)"),
+        ("training_logger.py 2000", "steps, return"),
     ],
 )
-def test_the_examples_run(name: str, argument: int, words: str, tmp_path: Path) -> None:
-    command = [sys.executable, str(EXAMPLES / name), str(argument)]
-    ran = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
-    assert ran.returncode == 0, ran.stderr
-    assert words in ran.stdout
+def test_the_examples_run(command: str, words: str, tmp_path: Path) -> None:
+    assert words in run_example(tmp_path, *command.split())
+
+
+@pytest.mark.slow
+def test_the_example_of_wrappers_records_the_first_episode(tmp_path: Path) -> None:
+    package = tmp_path / "moviepy/video/io"
+    package.mkdir(parents=True)
+    (package / "ImageSequenceClip.py").write_text(VIDEO_WRITER)
+    printed = run_example(tmp_path, "gymnasium_wrappers.py", "12")
+    assert "at most 12 steps, observations of shape (6,)" in printed
+    assert printed.count("at the time 1.00 of the horizon") == 2
+    assert [(path.name, path.read_text()) for path in (tmp_path / "videos").glob("*.mp4")] == [
+        ("ring-episode-0.mp4", "13 frames")
+    ]
+
+
+@pytest.mark.slow
+def test_the_policy_of_the_single_file_drives_as_onnx_and_enters_the_benchmark(tmp_path: Path) -> None:
+    assert "m/s in 64 episodes" in run_example(tmp_path, "ppo_single_file.py", "5")
+    result = unjam.drive("ring", str(tmp_path / "policy.onnx"), episodes=1, scenario_options={"horizon": 100})
+    assert result.mean["collisions"] == 0
+    driver = onnx_driver(tmp_path / "policy.onnx")
+    assert driver.action_repeat == 10
+    assert is_serializable(driver)  # as all drivers that the benchmark runs in batches
 
 
 UNREAD = "human", "gap-maker"

@@ -1,8 +1,34 @@
-"""Policies of other libraries as drivers."""
+"""Policies of other libraries as drivers, and environments for other libraries."""
+
+from typing import TYPE_CHECKING, Any
+
+from gymnasium.vector import VectorEnv
 
 from unjam.adapters.onnx_file import onnx_driver
 from unjam.adapters.policies import policy_driver
 from unjam.drivers.observation import PolicyInput
 from unjam.drivers.policy import PolicyDescription, PolicyMemory, PolicyOutput
+from unjam.errors import missing_package_error
+
+if TYPE_CHECKING:
+    from unjam.adapters.stable_baselines3_env import SB3VecEnv
 
 __all__ = ["PolicyDescription", "PolicyInput", "PolicyMemory", "PolicyOutput", "onnx_driver", "policy_driver"]
+__all__ += ["to_sb3_vec_env"]
+
+
+def to_sb3_vec_env(environment: VectorEnv[Any, Any, Any]) -> "SB3VecEnv":
+    """Return a vector environment of `gymnasium.make_vec` as a `VecEnv` of Stable-Baselines3.
+
+    With equal seeds, observations, rewards, ends and terminal observations are those of a `DummyVecEnv` of
+    `gymnasium.make`. No transition of a buffer belongs to Gymnasium's step between two episodes.
+
+    Raises:
+        InputError: the environment starts the next episode by itself in the same step, or returns tensors.
+        MissingPartError: Stable-Baselines3 is not installed.
+    """
+    try:
+        from unjam.adapters.stable_baselines3_env import SB3VecEnv
+    except ImportError as error:
+        raise missing_package_error(error) from None
+    return SB3VecEnv(environment)

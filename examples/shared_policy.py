@@ -1,0 +1,49 @@
+"""PPO with one policy for all CAVs of the merge, which come and go, in eight slots that stay.
+
+Run: python examples/shared_policy.py [updates] [horizon]. Its agent is that of ppo_single_file.py.
+"""
+
+import sys
+from typing import Any
+
+import numpy as np
+import torch
+from ppo_single_file import Agent
+
+import unjam
+
+UPDATES, HORIZON = (int(text) for text in (*sys.argv[1:], "50", "600")[:2])
+SLOTS = 8
+
+
+def column(values: dict[str, Any]) -> torch.Tensor:
+    """Return the values of all slots as one tensor."""
+    return torch.as_tensor(np.array([*values.values()]))
+
+
+torch.manual_seed(0)
+torch.set_num_threads(1)
+merge = unjam.parallel_env("merge", slots=SLOTS, horizon=HORIZON)
+agent = Agent(inputs=5)
+for update in range(UPDATES):
+    observations, infos = merge.reset(seed=update)
+    steps, total = [], 0.0
+    while merge.agents:
+        observation = column(observations)
+        is_occupied = column({slot: info["is_occupied"] for slot, info in infos.items()})
+        with torch.no_grad():
+            policy = agent.policy(observation)
+            action = policy.sample()
+        actions = dict(zip(merge.agents, action.numpy(), strict=True))  # those of empty slots are ignored
+        observations, rewards, terminations, truncations, infos = merge.step(actions)
+        # The trip of a CAV that leaves ends; its slot has its last observation, and is empty in the next step.
+        has_left = column({slot: info["has_left"] for slot, info in infos.items()})
+        ended = column(terminations) | column(truncations) | has_left
+        reward = column(rewards).float()
+        end = column(observations), column(terminations), ended
+        steps.append((observation, action, policy.log_prob(action), reward, *end, is_occupied))
+        total += reward.max().item()  # the reward is common to all CAVs
+    rows = agent.rollout_rows(steps)
+    agent.learn(*rows)
+    print(f"unjam {unjam.__version__}, update {update}: {len(rows[0])} rows, return {total:.1f}", flush=True)
+merge.close()

@@ -1,0 +1,78 @@
+"""A vector environment of Gymnasium as the `VecEnv` of Stable-Baselines3."""
+
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.wrappers.vector import DictInfoToList
+from stable_baselines3.common.vec_env import VecEnv
+
+from unjam.errors import InputError, invalid_value
+from unjam.physics.arrays import Array
+
+
+class SB3VecEnv(VecEnv):
+    """The environments of a `VectorEnv`, each of which starts its next episode in the step that ends one.
+
+    Gymnasium starts it one step later, in a step that ignores its action. Here `reset` starts it with a mask, so that
+    Stable-Baselines3 never sees this step; the last observation is in the `terminal_observation` of the info.
+    """
+
+    def __init__(self, environment: VectorEnv[Any, Any, Any]) -> None:
+        """Check the environment."""
+        mode = environment.metadata.get("autoreset_mode")
+        if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
+            raise invalid_value("environment: autoreset_mode", mode, "NEXT_STEP or DISABLED")
+        if device := getattr(environment.unwrapped, "_device", ""):
+            raise invalid_value("environment: device", device, "'', NumPy arrays")
+        self._environment = DictInfoToList(environment)
+        self._actions = np.zeros(0)
+        super().__init__(environment.num_envs, environment.single_observation_space, environment.single_action_space)
+
+    def reset(self) -> Array:
+        """Start an episode in each environment, of the seeds and with the options that were set before."""
+        options = self._options[0]
+        if any(each != options for each in self._options):
+            raise InputError("options: different ones are not allowed; allowed: the same for all environments")
+        seeds: Any = None if all(seed is None for seed in self._seeds) else self._seeds
+        observations, self.reset_infos = self._environment.reset(seed=seeds, options=dict(options))
+        self._reset_seeds()
+        self._reset_options()
+        return observations
+
+    def step_async(self, actions: Array) -> None:
+        """Store the actions of the next step, shape (W, 1)."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
+        """Advance one control step, and start the next episode of environments whose episode has ended."""
+        observations, rewards, terminated, truncated, infos = self._environment.step(self._actions)
+        has_ended = terminated | truncated
+        for info, is_truncated in zip(infos, truncated & ~terminated, strict=True):
+            info["TimeLimit.truncated"] = bool(is_truncated)
+        if has_ended.any():
+            last = observations
+            observations, started = self._environment.reset(options={"reset_mask": has_ended.copy()})
+            for row in np.flatnonzero(has_ended):
+                infos[row]["terminal_observation"], self.reset_infos[row] = last[row], started[row]
+        return observations, rewards.astype(np.float32), has_ended, infos
+
+    def close(self) -> None:
+        """Close the environments; may be called twice."""
+        self._environment.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return an attribute of the vector environment for each of some environments."""
+        return [getattr(self._environment, attr_name) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refuse, as the environments are one object."""
+        raise invalid_value("set_attr", attr_name, "arguments of gymnasium.make_vec")
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Refuse, as the environments are one object."""
+        raise invalid_value("env_method", method_name, "methods of the vector environment")
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        """Return that no environment has a wrapper of its own."""
+        return [False for _ in self._get_indices(indices)]
