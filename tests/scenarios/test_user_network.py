@@ -309,5 +309,5 @@ def test_traffic_that_sumo_makes_otherwise_is_noted(tmp_path: Path) -> None:
 
 
 def test_sources_of_speeds_that_only_motorways_have_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"roadside.source: 'cavs' is not allowed on a user network; allowed: 'vehicles'"):
+    with pytest.raises(InputError, match=r"roadside.source: 'cavs' is not allowed here; allowed: 'vehicles'"):
         own(tmp_path, penetration_rate=0.5, **{"roadside.source": "cavs"})

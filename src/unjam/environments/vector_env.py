@@ -170,7 +170,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         if expert and not device:
             check_driver(made_expert, steps=EXPERT_CHECK_STEPS)
         self._make_kind = partial(_torch_kind, device=device) if device else _numpy_kind
-        self._exact, self._device, self._is_numpy, self.num_envs = exact, device, not device, num_envs
+        self._exact, self.device, self._is_numpy, self.num_envs = exact, device, not device, num_envs
         self._kind = self._make_array_kind((0,))
         self.single_observation_space, self.single_action_space = self._road.observation_space, self._road.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -188,7 +188,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         try:
             return self._make_kind(self._exact, seed)
         except (RuntimeError, AssertionError):  # of torch
-            message = f"device: {self._device!r} is not available to torch; allowed: 'cpu', or '' for NumPy"
+            message = f"device: {self.device!r} is not available to torch; allowed: 'cpu', or '' for NumPy"
             raise MissingPartError(message) from None
 
     def reset(

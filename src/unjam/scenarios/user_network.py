@@ -92,7 +92,7 @@ class UserNetwork(Scenario):
             raise ValueError(str(error)) from None
         used = ", ".join(sorted(files.used_types))
         if self.roadside.source != "vehicles":
-            raise ValueError(f"roadside.source: {self.roadside.source!r} is not allowed on a user network; allowed: 'vehicles'")
+            raise ValueError(f"roadside.source: {self.roadside.source!r} is not allowed here; allowed: 'vehicles'")
         for name in self.cav_classes:
             if name not in ROAD_CLASSES:
                 raise ValueError(f"cav_classes: {name!r} is not allowed; allowed: {', '.join(ROAD_CLASSES)}")
