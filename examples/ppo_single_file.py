@@ -82,7 +82,7 @@ def main(updates: int) -> None:
                 print(f"update {update}: mean speed {speeds.mean():.2f} m/s in {len(speeds)} episodes", flush=True)
         agent.learn(*agent.rollout_rows(steps))
     shapes = {"dynamic_shapes": ({0: torch.export.Dim("n")},), "external_data": False, "verbose": False}
-    torch.onnx.export(agent.actor, (observation,), "policy.onnx", **shapes)
+    torch.onnx.export(agent.actor.eval(), (observation,), "policy.onnx", **shapes)
     description = {"inputs": INPUTS, "output": {"limits": [-1.0, 1.0]}, "time_step": 1.0}
     Path("policy.toml").write_text(tomli_w.dumps(description))
 

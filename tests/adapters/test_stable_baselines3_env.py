@@ -89,6 +89,8 @@ def test_what_one_object_cannot_do_is_refused_in_one_line() -> None:
         to_sb3_vec_env(same_step)
     with pytest.raises(InputError, match="device: 'cpu' is not allowed; allowed: '', NumPy arrays"):
         made(device="cpu")
+    with pytest.raises(InputError, match="environment: 'unjam/Ring-v0' is not allowed; allowed: an env"):
+        to_sb3_vec_env("unjam/Ring-v0")  # pyright: ignore[reportArgumentType]
     environment = made()
     with pytest.raises(InputError, match="set_attr: 'horizon' is not allowed"):
         environment.set_attr("horizon", 3)

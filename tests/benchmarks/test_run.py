@@ -7,10 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from stable_baselines3 import PPO
 
 import unjam
+from tests.adapters.test_stable_baselines3 import Space
+from tests.adapters.test_stable_baselines3_file import save
 from unjam.benchmarks.result import read_result
 from unjam.benchmarks.suites import SUITES, Suite
+from unjam.controller.file import sha256_of_file
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario
 
@@ -57,7 +61,8 @@ def test_a_second_call_drives_only_the_missing_roads(
     assert document["training_steps_unit"] == "environment steps: control steps in the simulator"
     first = read_result(file).roads[ROADS[0]]
     result = unjam.benchmark("pi", suite, file, workers=1, progress=lines.append)
-    assert [line.partition(": gain")[0] for line in lines] == [f"1 of 2: {ROADS[0]}", f"2 of 2: {ROADS[1]}"]
+    again = "1 of 2 roads are in a.json, and are not driven again"
+    assert [line.partition(": gain")[0] for line in lines] == [f"1 of 2: {ROADS[0]}", again, f"2 of 2: {ROADS[1]}"]
     assert result.roads[ROADS[0]] == first
     assert not result.missing_roads
     monkeypatch.setattr("unjam.benchmarks.run._drive_road", None)  # nothing is driven
@@ -81,6 +86,17 @@ def test_code_of_users_drives_one_road_at_a_time(suite: str, tmp_path: Path, mon
     Path("given.json").write_text("")
     with pytest.raises(InputError, match=r"given\.json"):
         unjam.benchmark(namespace["idle"], "ring", "given.json")
+
+
+@pytest.mark.long
+def test_a_result_of_a_model_file_continues_only_with_the_same_file(suite: str, tmp_path: Path) -> None:
+    file = save(PPO("MlpPolicy", Space(), seed=0, device="cpu"), tmp_path)
+    first = unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1)
+    assert first.sha256 == sha256_of_file(file)
+    assert unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1) == first
+    save(PPO("MlpPolicy", Space(), seed=1, device="cpu"), tmp_path)
+    with pytest.raises(InputError, match="hash of the driver"):
+        unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1)
 
 
 @pytest.mark.long

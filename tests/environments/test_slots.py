@@ -79,5 +79,7 @@ def test_an_occupied_slot_needs_a_valid_action() -> None:
         environment.step({"slot_1": [0.0]})
     with pytest.raises(InputError, match="step: slot_0 is not numbers: 'x'"):
         environment.step({"slot_0": "x"})
+    with pytest.raises(InputError, match="step: slot: 'slot_7' is not allowed; allowed: slot_0, slot_1"):
+        environment.step({"slot_0": [0.0], "slot_7": [0.0]})
     environment.step({"slot_0": [0.0]})
     environment.close()

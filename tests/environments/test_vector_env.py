@@ -311,6 +311,7 @@ def test_it_follows_the_conventions_of_gymnasium() -> None:
         ({"num_envs": 10**12}, "num_envs: 1000000000000 is not allowed; allowed: an integer from 1 to 1,000,000"),
         ({"features": ("local", "expert_memory")}, "features: 'expert_memory' is not allowed; allowed: with an expert"),
         ({"lenght": 230}, "lenght: unknown name"),
+        ({"exact": "no"}, "exact: 'no' is not allowed; allowed: True or False"),
         ({"expert": Parrot, "device": "cpu"}, "allowed: one that takes tensors, like 'pi'; or device=''"),
     ],
 )

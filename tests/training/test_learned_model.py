@@ -106,6 +106,13 @@ def test_a_driver_of_numpy_drives_as_one_of_tensors(model: LearnedModel) -> None
     [
         (lambda model: model.reset(0), "rows: 0 is not allowed; allowed: an integer >= 1"),
         (lambda model: model.step(torch.zeros(2)), r"acceleration: shape: \(2,\) is not allowed; allowed: \(1,\)"),
+        (lambda model: model.step(torch.tensor([torch.nan])), "acceleration: nan is not allowed; allowed: finite"),
+        (lambda model: model.roll_out(FOLLOWER, 0), "control_steps: 0 is not allowed; allowed: an integer >= 1"),
+        (
+            lambda model: model.set_state(model.state()._replace(is_running=torch.tensor([torch.nan]))),
+            "state: is_running: 'nan' is not allowed; allowed: numbers",
+        ),
+        (lambda model: unjam.load_world_model(3), "run: 3 is not allowed; allowed: a run folder"),  # pyright: ignore
         (
             lambda model: model.set_state(model.state()._replace(is_running=torch.ones(2))),
             r"state: shape of is_running: \(2,\) is not allowed; allowed: \(1,\)",

@@ -8,7 +8,7 @@ from unjam.adapters.onnx_file import onnx_driver
 from unjam.adapters.policies import policy_driver
 from unjam.drivers.observation import PolicyInput
 from unjam.drivers.policy import PolicyDescription, PolicyMemory, PolicyOutput
-from unjam.errors import missing_package_error
+from unjam.errors import invalid_value, missing_package_error
 
 if TYPE_CHECKING:
     from unjam.adapters.stable_baselines3_env import SB3VecEnv
@@ -27,6 +27,8 @@ def to_sb3_vec_env(environment: VectorEnv[Any, Any, Any]) -> "SB3VecEnv":
         InputError: the environment starts the next episode by itself in the same step, or returns tensors.
         MissingPartError: Stable-Baselines3 is not installed.
     """
+    if not isinstance(environment, VectorEnv):
+        raise invalid_value("environment", environment, "an environment of gymnasium.make_vec")
     try:
         from unjam.adapters.stable_baselines3_env import SB3VecEnv
     except ImportError as error:

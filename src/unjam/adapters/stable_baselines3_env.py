@@ -23,7 +23,7 @@ class SB3VecEnv(VecEnv):
         mode = environment.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
             raise invalid_value("environment: autoreset_mode", mode, "NEXT_STEP or DISABLED")
-        if device := getattr(environment.unwrapped, "_device", ""):
+        if device := getattr(environment.unwrapped, "device", ""):
             raise invalid_value("environment: device", device, "'', NumPy arrays")
         self._environment = DictInfoToList(environment)
         self._actions = np.zeros(0)

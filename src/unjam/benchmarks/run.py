@@ -20,7 +20,7 @@ from unjam.benchmarks.result import (
 )
 from unjam.benchmarks.suites import DEFAULT_SUITE, find_suite
 from unjam.controller import DEFAULT_DRIVER, controller_hash, controller_path, make_driver
-from unjam.controller.file import read_controller, sha256_of
+from unjam.controller.file import read_controller, sha256_of, sha256_of_file
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable, user_code_recipes
 from unjam.drivers.user_driver import DriverLike, as_driver
@@ -97,6 +97,7 @@ def benchmark(
     with _locked_result(path), WorkerPool(workers or os.cpu_count() or 1) as pool:
         if path is not None and os.path.lexists(path):
             result = _stored_result(path, result)
+            progress(f"{len(result.roads)} of {len(roads)} roads are in {path.name}, and are not driven again")
         for number, name in enumerate(result.missing_roads, len(result.roads) + 1):
             scenario = roads[name]
             human = make_driver(HUMAN_LABEL, scenario.control_step)
@@ -166,11 +167,11 @@ def _is_free_of_user_code(driver: Driver) -> bool:
 
 
 def _driver_hash(label: str, driver: Driver) -> str | None:
-    """Return the SHA-256 of a controller's file, else of the recipe, code and weights; None for a Python object."""
+    """Return the SHA-256 of a file of the driver, else of recipe, code and weights; None for a Python object."""
     if found := label and controller_hash(label):
         return found
     if not is_serializable(driver):
-        return None
+        return sha256_of_file(Path(label)) if label and Path(label).is_file() else None
     recipe, arrays = driver_recipe(driver)
     for part in user_code_recipes(recipe):  # the hash of the code is there, too
         part["path"] = Path(part["path"]).name

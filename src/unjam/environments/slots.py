@@ -7,7 +7,7 @@ import numpy as np
 from unjam.environments.agents import RoadAgents
 from unjam.environments.gymnasium_env import as_action
 from unjam.environments.threads import synchronized
-from unjam.errors import InputError
+from unjam.errors import InputError, unknown_name
 from unjam.parameters import check_integer
 
 
@@ -51,6 +51,8 @@ class SlottedRoadEnv(RoadAgents):
             return {}, {}, {}, {}, {}
         if missing := [slot for slot in self._cavs if slot not in actions]:
             raise InputError(f"step: no action for {', '.join(missing)}; allowed: one for each occupied slot")
+        if unknown := actions.keys() - set(self.possible_agents):
+            raise unknown_name("step: slot", min(unknown, key=str), self.possible_agents)
         before = self._cavs
         commands = dict.fromkeys(self._environment.agents, 0.0)
         commands |= {name: as_action(actions[slot], slot) for slot, name in before.items()}

@@ -156,6 +156,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             if changes.pop(name, None):
                 raise InputError(f"{name}: is not an option of batches; {OTHER_MODE}")
         num_envs = check_integer("num_envs", num_envs, 1, MAX_ENVIRONMENTS)
+        if not isinstance(exact, bool):
+            raise invalid_value("exact", exact, "True or False")
         made = make_scenario(scenario, changes)
         reason = statistically_unsupported_reason(made)
         if not reason and not issubclass(required_batch_kind(made).world, RingBatch):

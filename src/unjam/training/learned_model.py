@@ -95,6 +95,8 @@ class LearnedModel:
         ):
             if tuple(values.shape) != shape:
                 raise invalid_value(f"state: shape of {name}", tuple(values.shape), str(shape))
+            if bool(values.isnan().any()):
+                raise invalid_value(f"state: {name}", "nan", "numbers")
         self._generator.set_state(state.generator_state)
         self._state = state
 
@@ -106,6 +108,8 @@ class LearnedModel:
         observed, drawn, is_running, _ = self._state
         if tuple(acceleration.shape) != tuple(observed.speed.shape):
             raise invalid_value("acceleration: shape", tuple(acceleration.shape), str(tuple(observed.speed.shape)))
+        if not bool((is_finite := acceleration.isfinite()).all()):
+            raise invalid_value("acceleration", float(acceleration[~is_finite][0]), "finite numbers")
         limits = self.world_model.scenario.acceleration_limits
         transition = self._dynamics.step(observed, limits.clip(acceleration.to(observed.speed)), drawn)
         still_running = is_running * ~transition.crashed
@@ -116,8 +120,9 @@ class LearnedModel:
     def roll_out(self, driver: DriverLike, control_steps: int) -> ModelTrajectories:
         """Let a driver drive all rows from the present state on; it remembers nothing of the time before.
 
-        Raise `InputError` if it needs what rows do not have, or returns a value that is not finite.
+        Raise `InputError` if it needs what rows do not have, or returns a value that is not finite, or without steps.
         """
+        check_integer("control_steps", control_steps, 1)
         scenario, rows = self.world_model.scenario, len(self._state.observed.speed)
         made = as_driver(driver, scenario.control_step)
         check_can_drive(made, scenario)
@@ -130,8 +135,7 @@ class LearnedModel:
             states.append(transition.state)
             rewards.append(transition.reward)
         stacked = states[0].map(lambda *values: torch.stack(values, 1), *states[1:])
-        empty = self._state.is_running.new_zeros((rows, 0))
-        return ModelTrajectories(stacked, torch.stack(rewards, 1) if rewards else empty, self._state.is_running == 0.0)
+        return ModelTrajectories(stacked, torch.stack(rewards, 1), self._state.is_running == 0.0)
 
     def error_report(self) -> dict[str, Any]:
         """Return how well the model agrees with episodes of which no network learned: the facts of `unjam model`.
@@ -148,6 +152,8 @@ def load_world_model(run: Path | str) -> LearnedModel:
     Raise `InputError` if it is no run folder, is damaged, has no checkpoint yet, or has no model of rows: its
     `model.model_ratio` is 0, `model.kind` is `road`, its agent learns no model, or it has several tasks.
     """
+    if not isinstance(run, Path | str):
+        raise invalid_value("run", run, "a run folder")
     folder = Path(run)
     config = read_config(folder)
     if config.model.kind == "road" and config.model.model_ratio > 0:
