@@ -45,21 +45,13 @@ def test_the_word_doctype_in_a_comment_is_harmless(tmp_path: Path) -> None:
     assert read_sumo_files(path).used_types == {"car"}
 
 
-@pytest.mark.long
-def test_a_file_that_unpacks_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sumo_files, "MAX_READER_MEMORY", 150 * 2**20)
+@pytest.mark.parametrize("file", ["road.net.xml", "road.rou.xml", "road.rou.xml.gz"])
+def test_a_huge_element_is_refused_before_it_takes_time_or_memory(file: str, tmp_path: Path) -> None:
     path = configuration(tmp_path)
-    bomb = b'<routes name="' + b"a" * 200_000_000 + b'"/>'
-    (tmp_path / "road.rou.xml.gz").write_bytes(gzip.compress(bomb, 1))
-    path.write_text(path.read_text().replace("road.rou.xml", "road.rou.xml.gz"))
-    assert "road.rou.xml.gz: cannot be read: out of memory" in refusal_message(path)
-
-
-@pytest.mark.parametrize("file", ["road.net.xml", "road.rou.xml"])
-def test_a_huge_element_is_refused_before_it_takes_time(file: str, tmp_path: Path) -> None:
-    path = configuration(tmp_path)
-    content = (tmp_path / file).read_text().replace(' id="', f' id="{"a" * 9_000_000}', 1)
-    (tmp_path / file).write_text(content)
+    content = (tmp_path / file.removesuffix(".gz")).read_text().replace(' id="', f' id="{"a" * 9_000_000}', 1).encode()
+    (tmp_path / file).write_bytes(gzip.compress(content, 1) if file.endswith(".gz") else content)
+    if file.endswith(".gz"):
+        path.write_text(path.read_text().replace("road.rou.xml", file))
     assert re.fullmatch(f"{file}: line \\d+ is too long; allowed: .* 4,194,304 bytes", refusal_message(path))
 
 
