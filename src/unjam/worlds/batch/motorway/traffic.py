@@ -20,9 +20,11 @@ from unjam.worlds.batch.motorway.vehicles import (
     NO_ADVICE,
     LaneNeighbors,
     MotorwayVehicles,
+    as_rows,
     find_road_neighbors,
     neighbors_on_lane,
     sort_vehicles,
+    sorted_rows,
 )
 from unjam.worlds.batch.noise import DrawNormal
 
@@ -168,9 +170,10 @@ class BatchMotorways:
 
     def step(self) -> MotorwayVehicles:
         """Simulate one step, and return the vehicles that have left."""
-        moved = sort_vehicles(self._moved_vehicles())
+        moved = self._moved_vehicles()
         has_left = moved.position >= self.geometry.length
-        self.vehicles = moved.select(~has_left)
+        order = sorted_rows(moved)
+        self.vehicles = moved.select(order[~has_left[order]])
         if len(self.vehicles.road):
             self.vehicles = change_lanes(self.vehicles, self.geometry, self._step)
         self.time += self._step
@@ -202,12 +205,12 @@ class BatchMotorways:
         # EIDMs desire the allowed speed, and drive a little faster or slower; IDMs never drive faster.
         max_speed = np.where(vehicles.is_eidm, vehicles.speed_cap, allowed)
         safe = np.minimum(np.minimum(speed + vehicles.max_acceleration * step, max_speed), follow)
-        may_be_free = safe > speed - LEADER_BRAKING_THRESHOLD * step
+        may_be_free = as_rows(safe > speed - LEADER_BRAKING_THRESHOLD * step)
         free = drivers.select(may_be_free).desired_speed(
             speed[may_be_free], free_gap[may_be_free], next_allowed[may_be_free], step
         )
         # Of the leader and the allowed speed, drivers obey the one that requires more braking without coolness.
-        is_free = may_be_free.copy()
+        is_free = np.zeros(len(speed), bool)
         is_free[may_be_free] = free.uncooled_acceleration < uncooled[may_be_free] + eidm.EIDM_EPSILON
         safe[may_be_free] = np.where(is_free[may_be_free], np.minimum(safe[may_be_free], free.speed), safe[may_be_free])
         effective_gap = np.where(is_free, FREE_DRIVING_GAP, eidm.eidm_effective_gap(gap, drivers.parameters))
