@@ -10,6 +10,12 @@ from unjam.environments.threads import synchronized
 from unjam.errors import InputError, invalid_value
 
 
+def check_slots(slots: Any) -> None:
+    """Raise `InputError` unless `slots` is a number of slots."""
+    if not isinstance(slots, int) or isinstance(slots, bool) or slots < 1:
+        raise invalid_value("slots", slots, "an integer >= 1")
+
+
 class SlottedRoadEnv(RoadAgents):
     """A `ParallelRoadEnv` with the agents slot_0, slot_1, ..., all of which exist for the whole episode.
 
@@ -25,8 +31,7 @@ class SlottedRoadEnv(RoadAgents):
 
     def __init__(self, environment: Any, slots: int) -> None:
         """Map the agents of a `ParallelRoadEnv` to so many slots."""
-        if not isinstance(slots, int) or isinstance(slots, bool) or slots < 1:
-            raise invalid_value("slots", slots, "an integer >= 1")
+        check_slots(slots)
         super().__init__(environment._road, (f"slot_{number}" for number in range(slots)))
         self._environment = environment
         self._cavs: dict[str, str] = {}

@@ -6,10 +6,11 @@ Sources: SUMO's MSVehicle (`planMoveInternal`), MSLane (`insertVehicle`), MSLCM_
 """
 
 from collections.abc import Callable, Sequence
+from typing import Self
 
 import numpy as np
 
-from unjam.physics.arrays import Array, clamp_min
+from unjam.physics.arrays import Array, clamp_min, replace_padded_rows
 from unjam.scenarios.motorway_road import MAIN_ROUTE, MotorwayRoad
 from unjam.scenarios.road import VehicleType
 from unjam.scenarios.scenario import CruiseControl
@@ -53,7 +54,7 @@ class InsertionQueue:
     """
 
     def __init__(self, roads: Sequence[MotorwayRoad]) -> None:
-        self._roads, self._geometry = roads, roads[0].geometry
+        self._roads, self._geometry = list(roads), roads[0].geometry
         ramp_of_route = {name: number - 1 for number, name in enumerate(self._geometry.route_names)}
         self._ramp_count = len(self._geometry.ramps)
         shape = self._ramp_count + self._geometry.lane_count, len(roads)
@@ -68,6 +69,15 @@ class InsertionQueue:
                 self._entry_numbers[origin, index, counts[origin, index]] = number
                 counts[origin, index] += 1
         self._next = np.zeros(shape, np.intp)
+
+    def replace_roads(self, roads: Sequence[int], source: Self, source_roads: Sequence[int], time: float) -> None:
+        """Continue on some roads with the vehicles that wait in another queue, as if their roads started at `time`."""
+        times, numbers = source._entry_times + time, source._entry_numbers
+        self._entry_times = replace_padded_rows(self._entry_times, roads, times, source_roads, np.inf)
+        self._entry_numbers = replace_padded_rows(self._entry_numbers, roads, numbers, source_roads, 0)
+        self._next[:, roads] = source._next[:, source_roads]
+        for own, other in zip(roads, source_roads, strict=True):
+            self._roads[own] = source._roads[other]
 
     @property
     def entry_counts(self) -> np.ndarray:
@@ -167,6 +177,11 @@ class BatchMotorways:
         if self._cached_neighbors is None or self._cached_neighbors[0] is not lane:
             self._cached_neighbors = lane, find_road_neighbors(self.vehicles, self.geometry)
         return self._cached_neighbors[1]
+
+    def replace_roads(self, roads: Sequence[int], source: Self, source_roads: Sequence[int]) -> None:
+        """Continue on some roads with empty ones of another batch that has not been stepped."""
+        self.vehicles = self.vehicles.select(~np.isin(self.vehicles.road, roads))
+        self.insertion_queue.replace_roads(roads, source.insertion_queue, source_roads, self.time)
 
     def step(self) -> MotorwayVehicles:
         """Simulate one step, and return the vehicles that have left."""
