@@ -113,7 +113,7 @@ def test_the_horizon_truncates_and_does_not_terminate(name: str) -> None:
 
 @pytest.mark.parametrize("expert", ["", "pi"])
 def test_on_the_merge_the_episode_ends_when_the_cav_leaves(expert: str) -> None:
-    environment = RoadEnv("merge", cavs=1, horizon=200, expert=expert)
+    environment = RoadEnv("merge", horizon=200, expert=expert)  # one CAV by default
     observation, _ = environment.reset(seed=1)
     seen, ends = [observation], []
     while not ends or ends[-1] == (False, False):
@@ -126,7 +126,7 @@ def test_on_the_merge_the_episode_ends_when_the_cav_leaves(expert: str) -> None:
     assert ends[-1] == (False, True)
     np.testing.assert_array_equal(seen[-1], seen[-2])  # what it saw before it left
     with pytest.raises(InputError, match="cavs"):
-        RoadEnv("merge")
+        RoadEnv("merge", cavs=2)
     environment.close()
 
 

@@ -300,7 +300,7 @@ def test_it_follows_the_conventions_of_gymnasium() -> None:
         ),
         (
             {"scenario": "on-ramp", "cavs": 1},
-            "scenario: motorway is not possible in a batch (vehicles enter and leave); allowed: vec",
+            "scenario: motorway is not possible in a batch (vehicles enter and leave: slots are required, for instance",
         ),
         ({"actuation": "flow"}, "actuation: flow is not allowed in a batch; allowed: raw, or shielded"),
         ({"backend": "sumo"}, "backend: is not an option of batches; allowed: vectorization_mode='async'"),

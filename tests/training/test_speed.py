@@ -19,6 +19,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(speed, "RING_SIZES", {22: 200, 66: 100})
     monkeypatch.setattr(speed, "BATCH_VEHICLES", 2200)
     monkeypatch.setattr(speed, "STEPS_PER_ROUND", 20)
+    monkeypatch.setattr(speed, "MOTORWAYS", 20)
     monkeypatch.setattr(speed, "VECTOR_ENVIRONMENTS", ((50, False),))
 
 
@@ -61,6 +62,7 @@ def test_benchmark_has_rates_and_ratios_and_restores_cores() -> None:
     vector = parts["vector environment of 50 rings"]
     assert vector["reference"] == "vector environment of 50 rings: batch alone"
     assert parts["vector environment of 50 rings, compared with SUMO"]["ratio"] > 2.0
+    assert parts["vector environment of 20 on-ramps"]["ratio"] > 1.0
     assert (found["rounds"], messages) == (1, ["round 1 of 1"])
     assert cores is None or os.sched_getaffinity(0) == cores
 

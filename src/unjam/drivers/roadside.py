@@ -1,6 +1,7 @@
 """Roadside information: mean speeds by lane and section, and congestion, as delayed and smoothed I2V messages."""
 
 from collections import deque
+from collections.abc import Sequence
 from math import exp, prod
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -68,6 +69,11 @@ class RoadsideMessages:
         self._delay_queue.append(measurement)
         if not self.latest.size or self._loss_rate == 0 or self._generator.random() >= self._loss_rate:
             self.latest = self._delay_queue[0]
+
+    def replace_roads(self, roads: Sequence[int], source: "RoadsideMessages", source_roads: Sequence[int]) -> None:
+        """Continue on some roads with the messages of other roads, to which only one was sent."""
+        for values in (self._mean, *self._delay_queue):
+            values[roads] = source.latest[source_roads]  # pyright: ignore[reportOptionalSubscript]
 
 
 DENSITY_AVERAGING_TIME = 60.0
@@ -186,6 +192,11 @@ class SpeedMeasurement:
         else:
             means = self._detector_means(vehicles)
         return np.pad(means, ((0, 0), (0, 0), (0, SECTIONS_AHEAD)), constant_values=self._allowed_speed)
+
+    def clear_roads(self, roads: Sequence[int]) -> None:
+        """Forget what CAVs have measured on some roads."""
+        for totals in self._window:
+            totals[:, roads] = 0.0
 
     def _detector_means(self, vehicles: MeasuredVehicles) -> Floats:
         """Return what the nearest detector of each section has published."""

@@ -7,13 +7,16 @@ from unjam.road_family import FAMILY, FAMILY_PREFIX
 ENVIRONMENT_ARGUMENTS = {
     "unjam/Ring-v0": {"scenario": "ring"},
     "unjam/FigureEight-v0": {"scenario": "figure-eight"},
-    "unjam/Merge-v0": {"scenario": "merge", "cavs": 1},
-    "unjam/OnRamp-v0": {"scenario": "on-ramp", "cavs": 1},
+    "unjam/Merge-v0": {"scenario": "merge"},
+    "unjam/OnRamp-v0": {"scenario": "on-ramp"},
     "unjam/Recorded-v0": {"scenario": "recorded"},
     "unjam/UserNetwork-v0": {"scenario": "my.sumocfg", "cavs": 1},
-    **{f"unjam/{name}-v1": {"scenario": f"{FAMILY_PREFIX}{name}", "cavs": 1} for name in FAMILY},
+    **{
+        f"unjam/{name}-v1": {"scenario": f"{FAMILY_PREFIX}{name}"} | ({"cavs": 1} if "cavs" in road.options else {})
+        for name, road in FAMILY.items()
+    },
 }
-"""arguments of `RoadEnv`, by the Gymnasium id of the environment; roads of benchmarks have one CAV there"""
+"""arguments of `RoadEnv`, by the Gymnasium id of the environment; closed roads of benchmarks have one CAV there"""
 
 
 def register_environments() -> None:
@@ -21,6 +24,6 @@ def register_environments() -> None:
     for name, arguments in ENVIRONMENT_ARGUMENTS.items():
         if name not in registry:
             single, vector = (
-                f"unjam.environments.{each}" for each in ("gymnasium_env:RoadEnv", "vector_env:RoadVectorEnv")
+                f"unjam.environments.{each}" for each in ("gymnasium_env:RoadEnv", "slotted_vector_env:make_vector_env")
             )
             register(name, single, vector_entry_point=vector, kwargs=arguments)

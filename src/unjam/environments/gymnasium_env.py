@@ -70,6 +70,12 @@ def episode_seed(seed: int, episode_count: int) -> tuple[int, ...]:
     return (seed, episode_count) if episode_count else (seed,)
 
 
+def no_cav_error(scenario: Scenario) -> EpisodeError:
+    """Return the error for an episode without a control step that a driver could decide."""
+    allowed = f"a horizon of more than {scenario.horizon} control steps, or more CAVs"
+    return EpisodeError(f"reset: no CAV enters the road before the episode ends; allowed: {allowed}")
+
+
 def check_single_cav(scenario: Scenario) -> None:
     """Raise `InputError` unless a scenario has one CAV."""
     if getattr(scenario, "cavs", None) != 1:
@@ -141,10 +147,18 @@ class RoadStepper:
         expert: str | DriverLike = "",
         features: Sequence[FeatureLike] = ("local",),
         backend: BackendLike = "sumo",
+        has_single_cav: bool = False,
     ) -> None:
-        """Prepare a scenario, with arguments as `RoadEnv`; the first `reset` opens the backend."""
+        """Prepare a scenario, with arguments as `RoadEnv`; the first `reset` opens the backend.
+
+        `has_single_cav`: one CAV replaces a penetration rate.
+        """
+        made = make_scenario(scenario, changes)
+        if has_single_cav and getattr(made, "cavs", 1) is None:
+            changes = {**changes, "cavs": 1}
+            made = make_scenario(scenario, changes)
         self._base, self._changes = scenario, changes
-        self.scenario = self.episode_scenario = make_scenario(scenario, changes)
+        self.scenario = self.episode_scenario = made
         """that of the constructor; `episode_scenario` is that of the last reset, with its options"""
         reward = reward or self.scenario.reward
         self._reward, self._reward_needs_rows = make_reward(reward), not is_packaged_reward(reward)
@@ -219,8 +233,7 @@ class RoadStepper:
         self._wait_for_cav()
         if not world.cav_ids or world.has_ended:  # there is no control step that a driver could decide
             self.end_episode()
-            allowed = f"a horizon of more than {scenario.horizon} control steps, or more CAVs"
-            raise EpisodeError(f"reset: no CAV enters the road before the episode ends; allowed: {allowed}")
+            raise no_cav_error(scenario)
         return self._observe()
 
     def step(self, actions: Any) -> RoadStepResult:
@@ -313,6 +326,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     ``gymnasium.make("unjam/Ring-v0")``, ``"unjam/FigureEight-v0"``, ``"unjam/Merge-v0"``, ``"unjam/OnRamp-v0"``,
     ``"unjam/Recorded-v0"``, with any parameter of the scenario:
     ``gymnasium.make("unjam/Ring-v0", scenario="ring-jammed", length=(230, 230))``.
+    On roads with ends one CAV replaces the penetration rate.
     On a user network the CAV is the first that the penetration rate selects, and SUMO runs in a sandboxed process:
     ``gymnasium.make("unjam/UserNetwork-v0", scenario="my.sumocfg", penetration_rate=0.1)``.
 
@@ -380,7 +394,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         if render_mode == "human" and backend != "sumo":
             raise invalid_value("render_mode", render_mode, "rgb_array, except with backend='sumo'")
         backend = "sumo-gui" if render_mode == "human" else backend
-        self._road = RoadStepper(scenario, changes, reward, expert, features, backend)
+        self._road = RoadStepper(scenario, changes, reward, expert, features, backend, has_single_cav=True)
         check_single_cav(self._road.scenario)
         self.observation_space = self._road.observation_space
         self.action_space = self._road.action_space

@@ -8,6 +8,7 @@ from operator import index
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -21,6 +22,7 @@ from unjam.measures.step_metrics import step_metrics
 from unjam.parameters import check_integer
 from unjam.physics.arrays import Array, clip, copy_array, namespace, replace_entries
 from unjam.scenarios import make_scenario
+from unjam.scenarios.scenario import Scenario
 from unjam.seeds import warn_of_reserved_seed
 from unjam.tree import map_leaves
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, draw_single_normal
@@ -63,15 +65,15 @@ def _torch_kind(is_exact: bool, seed: Sequence[int], device: str) -> _ArrayKind:
     return _ArrayKind(to_array, draw, lambda values: values.float(), torch.no_grad)
 
 
-def _with_masks(values: dict[str, Any], mask: Array) -> dict[str, Any]:
+def with_masks(values: dict[str, Any], mask: Array) -> dict[str, Any]:
     """Return values of environments together with Gymnasium's masks, which say for which of them they are."""
     return values | {f"_{name}": mask for name in values}
 
 
-class _Episodes:
+class Episodes:
     """Episodes on the roads of a batch, and the driver of their CAVs."""
 
-    def __init__(self, world: RingBatch, driver: ExternalDriver, to_array: ArrayFactory) -> None:
+    def __init__(self, world: Any, driver: ExternalDriver, to_array: ArrayFactory) -> None:
         """Start the episodes, with their warm-up."""
         self.world, self._driver, self._memory = world, driver, start_batch_drive(world, driver, to_array).memory
         self.observe()
@@ -96,7 +98,7 @@ class _Episodes:
         self._memory = map_leaves(lambda values: values.detach(), self._memory)
         self.observe()  # the driver keeps what it computes
 
-    def replace(self, rows: list[int], source: "_Episodes", source_rows: list[int]) -> None:
+    def replace(self, rows: list[int], source: Any, source_rows: list[int]) -> None:
         """Go on in some rows with episodes that have just been started."""
         self.world.replace_roads(rows, source.world, source_rows)
         self._driver.replace_rows(rows, source._driver, source_rows)
@@ -126,6 +128,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         "render_modes": [],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
+    _step_sums = staticmethod(step_metrics)
+    """returns what is summed over the control steps of an episode, by name, shape (W,)"""
 
     def __init__(
         self,
@@ -159,12 +163,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         if not isinstance(exact, bool):
             raise invalid_value("exact", exact, "True or False")
         made = make_scenario(scenario, changes)
-        reason = statistically_unsupported_reason(made)
-        if not reason and not issubclass(required_batch_kind(made).world, RingBatch):
-            reason = "vehicles enter and leave"
-        if reason:
+        if reason := statistically_unsupported_reason(made) or self._unsupported_reason(made):
             raise InputError(f"scenario: {made.title} is not possible in a batch ({reason}); {OTHER_MODE}")
-        check_single_cav(made)
         self._road = RoadStepper(scenario, changes, reward, expert, features, "batch")
         made_expert = self._road.copy_driver().expert
         if device and made_expert.requirements().needs_numpy:
@@ -174,17 +174,30 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         self._make_kind = partial(_torch_kind, device=device) if device else _numpy_kind
         self._exact, self.device, self._is_numpy, self.num_envs = exact, device, not device, num_envs
         self._kind = self._make_array_kind((0,))
-        self.single_observation_space, self.single_action_space = self._road.observation_space, self._road.action_space
+        self.single_observation_space = self._space_of_environment(self._road.observation_space)
+        self.single_action_space = self._space_of_environment(self._road.action_space)
+        self._actions_shape = num_envs, *self.single_action_space.shape
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._seeds: list[int | None] = [None] * num_envs
         self._episode_counts = [0] * num_envs
         """episodes of each environment since that seed, prepared ones included"""
-        self._episodes: _Episodes | None = None
-        self._prepared: dict[int, tuple[_Episodes, int]] = {}
+        self._episodes: Episodes | None = None
+        self._prepared: dict[int, tuple[Episodes, int]] = {}
         """the next episode of an environment, as a row of started episodes"""
         self._ended_rows: list[int] = []
         """environments whose episode ended in the last step"""
+
+    def _unsupported_reason(self, scenario: Scenario) -> str:
+        """Return why this class has no environment of a scenario that batches simulate; empty if it has one."""
+        if not issubclass(required_batch_kind(scenario).world, RingBatch):
+            return "vehicles enter and leave: slots are required, for instance slots=8"
+        check_single_cav(scenario)
+        return ""
+
+    def _space_of_environment(self, space: spaces.Box) -> spaces.Box:
+        """Return the space of one environment, given that of one CAV."""
+        return space
 
     def _make_array_kind(self, seed: Sequence[int]) -> _ArrayKind:
         try:
@@ -245,17 +258,19 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             raise InputError(f"seed: {len(seeds)} seeds are not allowed; allowed: {self.num_envs}, or a single one")
         return seeds
 
-    def make_batch(self, rows: Sequence[int]) -> RingBatch:
+    def make_batch(self, rows: Sequence[int]) -> Any:
         """Return a batch of the next episodes of some environments, which has not been started."""
         seeds = [episode_seed(self._seeds[row] or 0, self._episode_counts[row]) for row in rows]
         for row in rows:
             self._episode_counts[row] += 1
-        kind, scenarios = self._kind, [self._road.scenario] * len(rows)
-        batch: Any = required_batch_kind(self._road.scenario).world
-        return batch(scenarios, seeds, kind.to_array, keep_record=False, draw=kind.draw)
+        return self._make_world(required_batch_kind(self._road.scenario).world, seeds)
 
-    def _start_episodes(self, rows: list[int]) -> _Episodes:
-        return _Episodes(self.make_batch(rows), self._road.copy_driver(), self._kind.to_array)
+    def _make_world(self, kind: Any, seeds: list[tuple[int, ...]]) -> Any:
+        scenarios, arrays = [self._road.scenario] * len(seeds), self._kind
+        return kind(scenarios, seeds, arrays.to_array, keep_record=False, draw=arrays.draw)
+
+    def _start_episodes(self, rows: list[int]) -> Episodes:
+        return Episodes(self.make_batch(rows), self._road.copy_driver(), self._kind.to_array)
 
     def _restart(self, rows: list[int]) -> None:
         """Go on in some environments with their next episodes.
@@ -266,7 +281,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             missing = [row for row in range(self.num_envs) if row not in self._prepared]
             started = self._start_episodes(missing)
             self._prepared |= {row: (started, index) for index, row in enumerate(missing)}
-        groups = defaultdict[_Episodes, list[tuple[int, int]]](list)
+        groups = defaultdict[Episodes, list[tuple[int, int]]](list)
         for row in rows:
             source, source_row = self._prepared.pop(row)
             groups[source].append((row, source_row))
@@ -277,7 +292,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             self._totals[name] = replace_entries(total, rows, self._zeros, rows)
 
     @property
-    def _running_episodes(self) -> _Episodes:
+    def _running_episodes(self) -> Episodes:
         if self._episodes is None:
             raise UnjamError("no episode is running: call reset first")
         return self._episodes
@@ -293,14 +308,14 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             rewards = namespace(rewards).where(has_stepped, rewards, 0.0)
         terminated = outcome.has_crashed & has_stepped
         truncated = episodes.world.completed_roads & has_stepped & ~terminated
-        info = _with_masks({"reward_terms": _with_masks(terms, has_stepped)}, has_stepped)
+        info = with_masks({"reward_terms": with_masks(terms, has_stepped)}, has_stepped)
         with self._kind.no_gradient():
-            for name, values in {"return": rewards, **step_metrics(outcome)}.items():
+            for name, values in {"return": rewards, **self._step_sums(outcome)}.items():
                 self._totals[name] = self._totals[name] + values
             ended = terminated | truncated
             self._ended_rows = np.flatnonzero(as_numpy(ended)).tolist() if bool(ended.any()) else []
             if self._ended_rows:
-                info |= _with_masks({"episode_metrics": _with_masks(self._metrics(ended), ended)}, ended)
+                info |= with_masks({"episode_metrics": with_masks(self._metrics(outcome, ended), ended)}, ended)
             if restarted:
                 self._restart(restarted)
                 info |= self._start_info(restarted)
@@ -319,18 +334,21 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
     def _as_actions(self, actions: Any) -> Array:
         if self._is_numpy:
             actions = as_numbers(actions, "step: actions")
-        allowed = (self.num_envs, 1), (self.num_envs,)
-        if np.shape(actions) not in allowed:
-            raise InputError(f"step: actions of shape {np.shape(actions)} are not allowed; allowed: {allowed[0]}")
-        found = self._kind.to_array(actions).reshape(-1)
-        if rows := self._ended_rows:  # their actions are ignored
-            found = replace_entries(found, rows, self._zeros, rows)
+        shape = self._actions_shape
+        if np.shape(actions) not in (shape, shape[:-1]):
+            raise InputError(f"step: actions of shape {np.shape(actions)} are not allowed; allowed: {shape}")
+        found = self._without_ignored(self._kind.to_array(actions).reshape(shape[:-1]))
         if self._is_numpy and not np.isfinite(found).all():
-            row = int(np.argmin(np.isfinite(found)))
+            index = tuple(np.argwhere(~np.isfinite(found))[0])
             raise InputError(
-                f"step: actions: {found[row]} of environment {row} is not allowed; allowed: finite numbers"
+                f"step: actions: {found[index]} of environment {index[0]} is not allowed; allowed: finite numbers"
             )
         return found
+
+    def _without_ignored(self, actions: Array) -> Array:
+        """Return actions with zeros in place of those that are ignored: those of episodes that have ended."""
+        rows = self._ended_rows
+        return replace_entries(actions, rows, namespace(actions).zeros_like(actions), rows) if rows else actions
 
     def _reward_terms(self, outcome: Outcome) -> dict[str, Array]:
         reward = self._road.reward
@@ -340,12 +358,16 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             return terms
         return validate_reward_terms(reward, outcome, row_name="environment")
 
-    def _metrics(self, ended: Array) -> dict[str, Array]:
+    def _metrics(self, outcome: Outcome, ended: Array) -> dict[str, Array]:
         """Return the metrics of the episodes that have ended, zeros for others."""
         steps = self._running_episodes.world.control_step_counts
-        means = {name: total / steps for name, total in self._totals.items() if name != "return"}
-        metrics = {"return": self._totals["return"], "steps": steps, **means}
+        sums = {name: total for name, total in self._totals.items() if name != "return"}
+        metrics = {"return": self._totals["return"], "steps": steps, **self._episode_metrics(sums, outcome, steps)}
         return {name: namespace(values).where(ended, values, 0.0) for name, values in metrics.items()}
+
+    def _episode_metrics(self, sums: dict[str, Array], outcome: Outcome, steps: Array) -> dict[str, Array]:
+        """Return metrics of episodes, given the sums over their control steps, and the outcome of the last one."""
+        return {name: total / steps for name, total in sums.items()}
 
     def _mask(self, rows: list[int]) -> Array:
         """Return which environments are among `rows`, shape (W,)."""
@@ -359,4 +381,4 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             values = np.zeros(self.num_envs)
             values[rows] = [roads[row].drawn_values[name] for row in rows]
             drawn[name] = self._kind.to_array(values)
-        return _with_masks({"drawn_values": _with_masks(drawn, is_new)}, is_new)
+        return with_masks({"drawn_values": with_masks(drawn, is_new)}, is_new)

@@ -1,4 +1,4 @@
-"""Metrics of episodes that are means over control steps, without the record of an episode."""
+"""Metrics of episodes from sums over control steps, without the record of an episode."""
 
 from collections import defaultdict
 
@@ -53,3 +53,29 @@ class StepMetricMeans:
                 self._totals[name] += float(values.sum())
             self._count += rows
             self._block.clear()
+
+
+def open_road_sums(outcome: Outcome) -> dict[str, Array]:
+    """Return what `open_road_metrics` needs of control steps: its sums over an episode, shape (rows,) each."""
+    present = (~np.isnan(outcome.speeds)).sum(-1)
+    return {"speeds": np.nansum(outcome.speeds, -1), "present": present, "under_way": present + outcome.backlog}
+
+
+def open_road_metrics(
+    sums: dict[str, Array], last: Outcome, entered: Array, remaining: Array, control_step: float
+) -> dict[str, Array]:
+    """Return metrics of episodes on roads with ends by their names in `METRICS`, shape (rows,) each.
+
+    Args:
+        sums: those of `open_road_sums`.
+        last: the outcome of the last control step.
+        entered: number of vehicles that have entered.
+        remaining: planned control steps that were not made; after a collision, vehicles under way count in them.
+        control_step: [s].
+    """
+    lost = open_road_sums(last)["under_way"] * remaining * last.has_crashed
+    return {
+        "mean_speed": sums["speeds"] / clamp_min(sums["present"], 1),
+        "travel_time": (sums["under_way"] + lost) * control_step / clamp_min(entered + last.backlog, 1),
+        "insertion_backlog_veh": last.backlog,
+    }

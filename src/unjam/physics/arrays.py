@@ -110,6 +110,20 @@ def replace_columns(values: Any, columns: Any, source: Any, source_columns: Any)
     return replace_entries(values, np.s_[..., columns], source, np.s_[..., source_columns])
 
 
+def replace_padded_rows(values: Any, rows: Any, source: Any, source_rows: Any, padding: Any) -> Any:
+    """Return a NumPy array (..., n, m) with rows of `source` (..., k, l) in place of some of its own.
+
+    The shorter one gets columns of `padding` at the end.
+    """
+    width = max(values.shape[-1], source.shape[-1])
+    found, other = (
+        np.pad(each, [(0, 0)] * (each.ndim - 1) + [(0, width - each.shape[-1])], constant_values=padding)
+        for each in (values, source)
+    )
+    found[..., rows, :] = other[..., source_rows, :]
+    return found
+
+
 def as_column(array: Array) -> Array:
     """Return an array of shape (n,) as (n, 1); a float as a tuple of one."""
     return (array,) if type(array) is float else array[..., None]

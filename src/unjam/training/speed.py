@@ -23,6 +23,8 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.residual import ResidualDriver
+from unjam.environments.pettingzoo_env import parallel_env
+from unjam.environments.slotted_vector_env import SlottedRoadVectorEnv
 from unjam.environments.vector_env import RoadVectorEnv
 from unjam.learners.settings import PolicySettings
 from unjam.manifest import manifest
@@ -58,6 +60,16 @@ BENCHMARK_SCENARIOS = ("ring", "figure-eight", "merge")
 """scenarios that are compared with plain SUMO"""
 VECTOR_ENVIRONMENTS = ((1024, False), (4096, False), (1024, True))
 """numbers of rings in vector environments, and whether they equal SUMO exactly"""
+MOTORWAYS, FILLING_STEPS, MOTORWAY_STEPS = 256, 150, 20
+"""number of motorways in a vector environment, control steps before they are measured, and in each round"""
+BUSY_ON_RAMP: dict[str, Any] = {
+    "scenario": "on-ramp",
+    "slots": 8,
+    "expert": "cruise",
+    "peak": (0, 1200),
+    "horizon": 1200,
+}
+"""arguments of environments of motorways: some 120 vehicles are on each after `FILLING_STEPS`"""
 STEPS_PER_ROUND = 100
 METERS_PER_VEHICLE = 245 / 22
 VEHICLES_PER_RING = 22
@@ -70,6 +82,8 @@ SUMO_PART, EPISODE_PART = "SUMO alone", "run_episode"
 """what other parts are related to, after the name of a scenario"""
 ENVIRONMENT_PART = "ring: env.step"
 """part of the Gymnasium environment in SUMO, to which vector environments are related"""
+SLOTS_PART = "on-ramp: env.step with slots"
+"""part of the PettingZoo environment in SUMO, to which vector environments of motorways are related"""
 
 
 class Part(NamedTuple):
@@ -96,6 +110,7 @@ def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: N
         torch.set_num_threads(1)
         driver = make_benchmark_driver(SCENARIOS["ring"].control_step)
         batches = {vehicles: start_batch(BATCH_VEHICLES // vehicles, vehicles, driver) for vehicles in RING_SIZES}
+        motorways = motorway_rates(MOTORWAYS)
         vectors = list(itertools.starmap(VectorBenchmark, VECTOR_ENVIRONMENTS))
         with Simulation() as simulation:  # writes network files and fills caches
             episode, *_ = [_run_episode(SCENARIOS[name], 0, simulation) for name in BENCHMARK_SCENARIOS]
@@ -103,7 +118,8 @@ def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: N
         for number in range(1, rounds + 1):
             on_message(f"round {number} of {rounds}")
             vector_rates = itertools.chain.from_iterable(vector.measure() for vector in vectors)
-            for part, rate in itertools.chain(_measure_round(number, driver, episode, batches), vector_rates):
+            sumo_rates = _measure_round(number, driver, episode, batches)
+            for part, rate in itertools.chain(sumo_rates, vector_rates, itertools.islice(motorways, 1)):
                 rates[part].append(rate)
     finally:
         if cores is not None:
@@ -133,6 +149,7 @@ def _measure_round(
         yield Part(f"{own}, network in every step", sumo), _episode_rate(ring, number, simulation, 0.0)
         yield Part(f"{own} without safety filter", own), _episode_rate(unfiltered, number, simulation)
         yield Part(ENVIRONMENT_PART, sumo), _environment_rate(ring, number, simulation)
+        yield Part(SLOTS_PART), _slots_rate(number, simulation)
         yield Part("ring: audit of an episode", own), steps_per_second(partial(_repeat_audit, episode), ring.horizon)
         for rows, steps in ROLLOUT_SIZES:
             name = f"learned model: {rows:,} rollouts of {steps} control steps"
@@ -175,6 +192,32 @@ class VectorBenchmark:
         return steps_per_second(
             lambda: deque((step() for _ in range(STEPS_PER_ROUND)), 0), self.rings * STEPS_PER_ROUND
         )
+
+
+def motorway_rates(roads: int) -> Iterator[tuple[Part, float]]:
+    """Yield the speed of a vector environment of busy on-ramps, in roads times steps per second, again and again."""
+    environment = SlottedRoadVectorEnv(roads, **BUSY_ON_RAMP)
+    environment.reset(seed=0)
+    actions = np.zeros((roads, BUSY_ON_RAMP["slots"]), np.float32)
+
+    def advance(steps: int) -> None:
+        deque((environment.step(actions) for _ in range(steps)), 0)
+
+    advance(FILLING_STEPS)
+    while True:
+        rate = steps_per_second(partial(advance, MOTORWAY_STEPS), roads * MOTORWAY_STEPS)
+        yield Part(f"vector environment of {roads:,} on-ramps", SLOTS_PART), rate
+
+
+def _slots_rate(seed: int, simulation: Simulation) -> float:
+    """Return control steps per second of the same environment in SUMO, after as many control steps."""
+    environment = parallel_env(**BUSY_ON_RAMP, backend=SumoBackend(simulation))
+    environment.reset(seed=seed)
+    actions, world = dict.fromkeys(environment.agents, 0.0), environment._road.world
+    while world.control_steps < FILLING_STEPS:
+        environment.step(actions)
+    steps = range(world.control_steps, FILLING_STEPS + STEPS_PER_ROUND)
+    return steps_per_second(lambda: deque((environment.step(actions) for _ in steps), 0), len(steps))
 
 
 def _run_episode(scenario: Scenario, seed: int, simulation: Simulation, action_duration: float = 1.0) -> Episode:

@@ -4,8 +4,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar, cast
 
-import numpy as np
-
 from unjam.drivers.local_state import LocalState
 from unjam.errors import UnjamError
 from unjam.physics.arrays import Floats
@@ -104,7 +102,7 @@ class SingleMotorway(_SingleRoad, MotorwayBatch):
     @property
     def backlog(self) -> int:
         """The insertion backlog now."""
-        return int(self._log.backlogs[-1][0])
+        return int(self.backlogs[0])
 
     @property
     def expects_cavs(self) -> bool:
@@ -118,14 +116,6 @@ class SingleMotorway(_SingleRoad, MotorwayBatch):
     def scene(self) -> RoadScene:
         """Raise `UnjamError`: a batch has no geometry of motorways."""
         raise UnjamError("render: the batch draws no pictures of motorways; allowed: backend='sumo'")
-
-    def last_applied_acceleration(self) -> Floats:
-        """Return the CAVs' accelerations in the last control step [m/s2]; zero for those that have left."""
-        before, after = (states.speed for states in self._log.states[-2:])
-        remaining, changes = self.remaining_rows, np.zeros(len(before))
-        rows = np.arange(len(before)) if remaining is None else np.array(remaining, np.intp)
-        changes[rows] = after[: len(rows)] - before[rows]
-        return changes / self.scenario.control_step
 
 
 SINGLE_ROADS: dict[type, Any] = {

@@ -90,11 +90,12 @@ def eidm_acceleration(speed: Array, gap_ratio: Array, parameters: IDMArrays) -> 
     free = highest * (1.0 - square * square)
     near = highest * (1.0 - gap_ratio * gap_ratio)
     far = free * (1.0 - np.exp(np.log(clamp_max(gap_ratio, 1.0)) * (2.0 * highest / clamp_min(free, 1e-6))))
-    is_near, is_too_fast = gap_ratio >= 1.0, speed_ratio > 1.0
+    is_near = gap_ratio >= 1.0
     acceleration = np.where(is_near, near, far)
-    if bool(is_too_fast.any()):
-        slowing = -braking * (1.0 - np.exp(-np.log(clamp_min(speed_ratio, 1.0)) * (4.0 * highest / braking)))
-        acceleration = np.where(is_too_fast, np.where(is_near, slowing + near, slowing), acceleration)
+    if len(rows := np.flatnonzero(speed_ratio > 1.0)):
+        highest, braking = highest[rows], braking[rows]
+        slowing = -braking * (1.0 - np.exp(-np.log(speed_ratio[rows]) * (4.0 * highest / braking)))
+        acceleration[rows] = np.where(is_near[rows], slowing + near[rows], slowing)
     return acceleration
 
 

@@ -20,6 +20,7 @@ from unjam.worlds.batch.motorway.vehicles import (
     NO_VEHICLE,
     MotorwayDrivers,
     MotorwayVehicles,
+    as_rows,
     find_neighbors,
     find_road_neighbors,
     neighbors_on_lane,
@@ -297,9 +298,9 @@ def _speed_gain_changes(
     gain, keep, is_fast = vehicles.speed_gain, vehicles.keep_right, speed >= UNCONGESTED_SPEED
     # Vehicles do not pass on the right: behind a slower vehicle on the left lane, they slow down or change to the left.
     difference = np.maximum(own_speed - allowed_speed(speed_limit, ahead.row), speed - ahead.speed)
-    is_held_back = may_change & is_left & ahead.is_present & is_fast & (difference > 0.0)
+    is_held_back = as_rows(may_change & is_left & ahead.is_present & is_fast & (difference > 0.0))
     max_speed, must_brake_soon, advice = own_speed, speed < 0.0, vehicles.adjacent_advice
-    if bool(is_held_back.any()):
+    if len(is_held_back):
         safe, brakes_soon = _speed_behind_left_leader(vehicles, context, is_held_back, difference[is_held_back])
         advice, max_speed = advice.copy(), own_speed.copy()
         advice[is_held_back] = np.minimum(advice[is_held_back], (safe - speed[is_held_back]) / step)
@@ -310,15 +311,15 @@ def _speed_gain_changes(
     # Anticipated speeds on both lanes.
     accelerates = ahead.is_present & (vehicles.acceleration[ahead.row] > 0.0)
     accelerates = accelerates | (leader.is_present & (vehicles.acceleration[leader.row] > 0.0))
+    faster, faster_drivers = as_rows(accelerates), drivers.select(accelerates)
 
     def anticipated_speed(neighbor: Neighbor, end_distance: Array) -> Array:
         gap = np.where(neighbor.is_present, neighbor.gap, end_distance)
         leader_speed = np.where(neighbor.is_present, neighbor.speed, 0.0 * speed)
         anticipated = drivers.safe_speed(gap, leader_speed, vehicles.braking[neighbor.row], step)
-        later = (speed + vehicles.max_acceleration * (1.0 - step))[accelerates]
-        gap = (gap + vehicles.minimum_gap)[accelerates]
-        own_drivers = drivers.select(accelerates)
-        anticipated[accelerates] = own_drivers.follow_speed(later, gap, leader_speed[accelerates], step)
+        later = (speed + vehicles.max_acceleration * (1.0 - step))[faster]
+        gap = (gap + vehicles.minimum_gap)[faster]
+        anticipated[faster] = faster_drivers.follow_speed(later, gap, leader_speed[faster], step)
         return anticipated
 
     there = np.minimum(target_speed, anticipated_speed(ahead, remaining))
@@ -376,13 +377,15 @@ def _speed_behind_left_leader(
 
 def _has_change_conflict(vehicles: MotorwayVehicles, changes_lane: Array, geometry: MotorwayGeometry) -> Array:
     """Return which vehicles would change into a gap of the right lane into which a vehicle merges from the ramp."""
-    position = vehicles.position
-    merges = changes_lane & (vehicles.lane == 0)
+    merges, conflict = changes_lane & (vehicles.lane == 0), np.zeros(len(changes_lane), bool)
     if not bool(merges.any()):
-        return merges
+        return conflict
+    rows = np.flatnonzero(np.isin(vehicles.road, vehicles.road[merges]))
+    vehicles, merges = vehicles.select(rows), merges[rows]
     neighbors = find_neighbors(vehicles._replace(lane=np.where(merges, 1, vehicles.lane)), 2)
-    ahead, behind = (neighbors_on_lane(each, 1 + 0 * vehicles.lane) for each in neighbors)
-    min_distance = 2.0 * (geometry.vehicle_length + vehicles.minimum_gap)
+    ahead, behind = (each[1] for each in neighbors)
+    position, min_distance = vehicles.position, 2.0 * (geometry.vehicle_length + vehicles.minimum_gap)
     is_tight_ahead = (ahead >= 0) & merges[ahead] & (position[ahead] - position < min_distance)
     is_tight_behind = (behind >= 0) & merges[behind] & (position - position[behind] < min_distance)
-    return changes_lane & (vehicles.lane == 2) & (is_tight_ahead | is_tight_behind)
+    conflict[rows] = changes_lane[rows] & (vehicles.lane == 2) & (is_tight_ahead | is_tight_behind)
+    return conflict

@@ -6,10 +6,11 @@ Sources: SUMO's MSVehicle (`planMoveInternal`), MSLane (`insertVehicle`), MSLCM_
 """
 
 from collections.abc import Callable, Sequence
+from typing import Self
 
 import numpy as np
 
-from unjam.physics.arrays import Array, clamp_min
+from unjam.physics.arrays import Array, clamp_min, replace_padded_rows
 from unjam.scenarios.motorway_road import MAIN_ROUTE, MotorwayRoad
 from unjam.scenarios.road import VehicleType
 from unjam.scenarios.scenario import CruiseControl
@@ -20,9 +21,11 @@ from unjam.worlds.batch.motorway.vehicles import (
     NO_ADVICE,
     LaneNeighbors,
     MotorwayVehicles,
+    as_rows,
     find_road_neighbors,
     neighbors_on_lane,
     sort_vehicles,
+    sorted_rows,
 )
 from unjam.worlds.batch.noise import DrawNormal
 
@@ -51,7 +54,7 @@ class InsertionQueue:
     """
 
     def __init__(self, roads: Sequence[MotorwayRoad]) -> None:
-        self._roads, self._geometry = roads, roads[0].geometry
+        self._roads, self._geometry = list(roads), roads[0].geometry
         ramp_of_route = {name: number - 1 for number, name in enumerate(self._geometry.route_names)}
         self._ramp_count = len(self._geometry.ramps)
         shape = self._ramp_count + self._geometry.lane_count, len(roads)
@@ -66,6 +69,15 @@ class InsertionQueue:
                 self._entry_numbers[origin, index, counts[origin, index]] = number
                 counts[origin, index] += 1
         self._next = np.zeros(shape, np.intp)
+
+    def replace_roads(self, roads: Sequence[int], source: Self, source_roads: Sequence[int], time: float) -> None:
+        """Continue on some roads with the vehicles that wait in another queue, as if their roads started at `time`."""
+        times, numbers = source._entry_times + time, source._entry_numbers
+        self._entry_times = replace_padded_rows(self._entry_times, roads, times, source_roads, np.inf)
+        self._entry_numbers = replace_padded_rows(self._entry_numbers, roads, numbers, source_roads, 0)
+        self._next[:, roads] = source._next[:, source_roads]
+        for own, other in zip(roads, source_roads, strict=True):
+            self._roads[own] = source._roads[other]
 
     @property
     def entry_counts(self) -> np.ndarray:
@@ -166,11 +178,17 @@ class BatchMotorways:
             self._cached_neighbors = lane, find_road_neighbors(self.vehicles, self.geometry)
         return self._cached_neighbors[1]
 
+    def replace_roads(self, roads: Sequence[int], source: Self, source_roads: Sequence[int]) -> None:
+        """Continue on some roads with empty ones of another batch that has not been stepped."""
+        self.vehicles = self.vehicles.select(~np.isin(self.vehicles.road, roads))
+        self.insertion_queue.replace_roads(roads, source.insertion_queue, source_roads, self.time)
+
     def step(self) -> MotorwayVehicles:
         """Simulate one step, and return the vehicles that have left."""
-        moved = sort_vehicles(self._moved_vehicles())
+        moved = self._moved_vehicles()
         has_left = moved.position >= self.geometry.length
-        self.vehicles = moved.select(~has_left)
+        order = sorted_rows(moved)
+        self.vehicles = moved.select(order[~has_left[order]])
         if len(self.vehicles.road):
             self.vehicles = change_lanes(self.vehicles, self.geometry, self._step)
         self.time += self._step
@@ -202,12 +220,12 @@ class BatchMotorways:
         # EIDMs desire the allowed speed, and drive a little faster or slower; IDMs never drive faster.
         max_speed = np.where(vehicles.is_eidm, vehicles.speed_cap, allowed)
         safe = np.minimum(np.minimum(speed + vehicles.max_acceleration * step, max_speed), follow)
-        may_be_free = safe > speed - LEADER_BRAKING_THRESHOLD * step
+        may_be_free = as_rows(safe > speed - LEADER_BRAKING_THRESHOLD * step)
         free = drivers.select(may_be_free).desired_speed(
             speed[may_be_free], free_gap[may_be_free], next_allowed[may_be_free], step
         )
         # Of the leader and the allowed speed, drivers obey the one that requires more braking without coolness.
-        is_free = may_be_free.copy()
+        is_free = np.zeros(len(speed), bool)
         is_free[may_be_free] = free.uncooled_acceleration < uncooled[may_be_free] + eidm.EIDM_EPSILON
         safe[may_be_free] = np.where(is_free[may_be_free], np.minimum(safe[may_be_free], free.speed), safe[may_be_free])
         effective_gap = np.where(is_free, FREE_DRIVING_GAP, eidm.eidm_effective_gap(gap, drivers.parameters))

@@ -28,6 +28,11 @@ MIN_IDM_STOP_DISTANCE = 0.01
 """distance below which an IDM stands [m]"""
 
 
+def as_rows(index: Array) -> Array:
+    """Return the rows of a mask, or rows as they are: many columns are selected by rows in half the time."""
+    return np.flatnonzero(index) if index.dtype == np.bool_ else index
+
+
 class MotorwayVehicles(NamedTuple):
     """All vehicles."""
 
@@ -81,6 +86,7 @@ class MotorwayVehicles(NamedTuple):
 
     def select(self, index: Array) -> "MotorwayVehicles":
         """Return some of the vehicles, or all in another order."""
+        index = as_rows(index)
         return self.map(lambda values: values[index])
 
     def replace_rows(self, rows: Array, **values: Any) -> "MotorwayVehicles":
@@ -108,6 +114,7 @@ class MotorwayDrivers(NamedTuple):
 
     def select(self, index: Array) -> "MotorwayDrivers":
         """Return some of the drivers."""
+        index = as_rows(index)
         parameters = IDMArrays(*(each if type(each) is float else each[index] for each in self.parameters))
         return MotorwayDrivers(parameters, DriverErrors(*(each[index] for each in self.errors)), self.is_eidm[index])
 
@@ -160,8 +167,8 @@ class MotorwayDrivers(NamedTuple):
         self, eidm_values: Array, idm_function: Callable[..., Array], *values: Array, **options: float
     ) -> Array:
         """Return the values of EIDM drivers, and those of `idm_function` for the others."""
-        is_idm = ~self.is_eidm
-        if not bool(is_idm.any()):
+        is_idm = as_rows(~self.is_eidm)
+        if not len(is_idm):
             return eidm_values
         found = eidm_values + 0.0
         found[is_idm] = idm_function(*(each[is_idm] for each in values), self.select(is_idm).parameters, **options)
@@ -204,18 +211,26 @@ def find_rows(numbers: Array, vehicles: MotorwayVehicles) -> Array:
     return np.where(own[rows] == numbers, rows, NO_VEHICLE)
 
 
+def sorted_rows(vehicles: MotorwayVehicles) -> Array:
+    """Return the rows of the vehicles road by road, from front to back."""
+    return (vehicles.road * 1e6 - vehicles.position).argsort(stable=True)
+
+
 def sort_vehicles(vehicles: MotorwayVehicles) -> MotorwayVehicles:
     """Return the vehicles road by road, from front to back."""
-    key = vehicles.road * 1e6 - vehicles.position
-    return vehicles if bool((key[1:] >= key[:-1]).all()) else vehicles.select(key.argsort(stable=True))
+    return vehicles.select(sorted_rows(vehicles))
 
 
 def find_neighbors(vehicles: MotorwayVehicles, lane_count: int) -> LaneNeighbors:
     """Return the neighbors of sorted vehicles."""
-    road, is_on_lane = vehicles.road, vehicles.lane == np.arange(lane_count)[:, None]
-    reverse = _previous_rows(is_on_lane[:, ::-1], road[::-1])[:, ::-1]
-    followers = np.where(reverse >= 0, len(road) - 1 - reverse, NO_VEHICLE)
-    return LaneNeighbors(_previous_rows(is_on_lane, road), followers)
+    road, count = vehicles.road, len(vehicles.road)
+    found = np.empty((2, lane_count, count), np.intp)
+    for lane, (leaders, followers) in enumerate(found.swapaxes(0, 1)):
+        rows = np.flatnonzero(vehicles.lane == lane)
+        distances = np.diff(np.concatenate([[-1], rows, [count]]))
+        leaders[:] = np.concatenate([[NO_VEHICLE], rows]).repeat(distances)[:-1]
+        followers[:] = np.concatenate([rows, [NO_VEHICLE]]).repeat(distances)[1:]
+    return LaneNeighbors(*np.where((found >= 0) & (road[found] == road), found, NO_VEHICLE))
 
 
 def find_road_neighbors(vehicles: MotorwayVehicles, geometry: MotorwayGeometry) -> LaneNeighbors:
@@ -226,13 +241,6 @@ def find_road_neighbors(vehicles: MotorwayVehicles, geometry: MotorwayGeometry) 
         for rows in found:
             rows[0, (vehicles.lane == 0) & (ramp[rows[0]] != ramp)] = NO_VEHICLE
     return found
-
-
-def _previous_rows(is_on_lane: Array, road: Array) -> Array:
-    """Return for each lane the last row before each row with a vehicle on this lane of the same road."""
-    last = np.maximum.accumulate(np.where(is_on_lane, np.arange(len(road)), NO_VEHICLE), 1)
-    previous = np.concatenate([0 * last[:, :1] + NO_VEHICLE, last[:, :-1]], 1)
-    return np.where((previous >= 0) & (road[previous] == road), previous, NO_VEHICLE)
 
 
 def neighbors_on_lane(neighbors: Array, lane: Array) -> Array:

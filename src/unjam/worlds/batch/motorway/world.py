@@ -13,7 +13,7 @@ from unjam.drivers.command import Command, batch_commanded_accelerations, comman
 from unjam.drivers.local_state import LocalState, observe_neighbor
 from unjam.drivers.roadside import MeasuredVehicles, RoadSections, RoadsideMessages, SpeedMeasurement
 from unjam.errors import InputError
-from unjam.physics.arrays import Array, Floats
+from unjam.physics.arrays import Array, Floats, replace_padded_rows
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_road import MotorwayRoad
@@ -23,6 +23,7 @@ from unjam.worlds.batch.motorway.traffic import NO_SPEED_CAP, BatchMotorways, Le
 from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, find_rows, neighbors_on_lane, vehicle_numbers
 from unjam.worlds.batch.noise import ArrayFactory
 from unjam.worlds.record import Episode
+from unjam.worlds.reward import Outcome, time_gap
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam.worlds.world import DriverLog, ProgressCallback
 
@@ -54,10 +55,14 @@ class MotorwayBatch:
         seeds: Sequence[Sequence[int]],
         explore: Sequence[float] | None = None,
         replay: ReplayOptions | None = None,
+        keep_record: bool = True,
     ) -> None:
-        """Take empty roads, one for each seed; `explore` is the factor of exploration noise on each."""
+        """Take empty roads, one for each seed; `explore` is the factor of exploration noise on each.
+
+        `keep_record`: whether to keep whole episodes, some 10 MB for each road and 1,000 control steps.
+        """
         self._exploration_scales = np.ones(len(seeds)) if explore is None else np.array(explore)
-        self.scenario, self._seeds, self._replay = scenario, seeds, replay
+        self.scenario, self._seeds, self._replay, self._keep_record = scenario, seeds, replay, keep_record
         drawn = [scenario.draw_from_seed(seed) for seed in seeds]
         self.roads = [cast(MotorwayRoad, road) for road, _ in drawn]
         generator_seeds = [others[:2] for _, others in drawn] if replay is None else replay.seeds
@@ -80,6 +85,12 @@ class MotorwayBatch:
         """road and entry of each CAV as one number, in order of entry"""
         self._cav_entry_counts = np.zeros(len(seeds))
         """number of CAVs that have entered each road"""
+        self._start_steps = np.zeros(len(seeds), np.intp)
+        """number of control steps of the batch before the episode of each road"""
+        self.backlogs = np.zeros(len(seeds), np.intp)
+        """insertion backlog of each road now"""
+        self._cav_speeds_before = np.zeros(0)
+        """speeds of the CAVs before the last control step [m/s]"""
         self._is_controlled, self._has_time_gap_commands = False, False
         self._episode_noise: Floats | None = None
         """per-episode exploration noise of each road"""
@@ -110,12 +121,13 @@ class MotorwayBatch:
         return cls(scenario, [task.seed for task in tasks], explore=explore)
 
     @property
-    def _cav_roads(self) -> NDArray[np.intp]:
+    def cav_roads(self) -> NDArray[np.intp]:
+        """The index of the road of each CAV, shape (CAVs,)."""
         return self._cav_numbers // NUMBERS_PER_ROAD
 
     def values_of_cavs(self, values: Array) -> Array:
         """Return for each CAV the value of its road; values have the shape (W,)."""
-        return values[self._cav_roads]
+        return values[self.cav_roads]
 
     @property
     def has_ended(self) -> bool:
@@ -127,6 +139,43 @@ class MotorwayBatch:
         """Whether vehicles touched on each road, shape (W,)."""
         return self._log.end_steps < NO_END_STEP
 
+    @property
+    def control_step_counts(self) -> NDArray[np.intp]:
+        """Number of control steps in the episode of each road, shape (W,)."""
+        return self.control_steps - self._start_steps
+
+    @property
+    def completed_roads(self) -> NDArray[np.bool_]:
+        """Whether each road has reached its horizon, or no CAV will be on it again, shape (W,)."""
+        present = np.bincount(self.cav_roads, minlength=len(self.roads))
+        has_no_more = (present == 0) & (self._cav_entry_counts == self._is_cav.sum(1))
+        return has_no_more | (self.control_step_counts >= self.scenario.horizon)
+
+    @property
+    def entry_counts(self) -> NDArray[np.intp]:
+        """Number of vehicles that have entered each road, shape (W,)."""
+        return self._traffic.insertion_queue.entry_counts
+
+    def replace_roads(self, roads: Sequence[int], source: Self, source_roads: Sequence[int]) -> None:
+        """Continue on some roads with those of another batch that has just been started, which are empty.
+
+        `roads` and `source_roads` have equal lengths. Both batches keep no record, and have the same scenario. Roadside
+        information must not be that of detectors, whose intervals are those of the batch.
+        """
+        rows = np.flatnonzero(~np.isin(self.cav_roads, roads))
+        self._cav_numbers, self.cav_count = self._cav_numbers[rows], len(rows)
+        self._local_state = self._local_state.select(rows).as_read_only()
+        for own, other in zip(roads, source_roads, strict=True):
+            self.roads[own] = source.roads[other]
+            self._human_generators[own] = source._human_generators[other]
+            self._exploration_generators[own] = source._exploration_generators[other]
+        self._is_cav = replace_padded_rows(self._is_cav, roads, source._is_cav, source_roads, False)
+        self._cav_entry_counts[roads], self._start_steps[roads] = 0.0, self.control_steps
+        self._log.end_steps[roads], self.backlogs[roads] = NO_END_STEP, 0
+        self._traffic.replace_roads(roads, source._traffic, source_roads)
+        self._measurement.clear_roads(roads)
+        self._messages.replace_roads(roads, source._messages, source_roads)
+
     def local_state(self) -> LocalState:
         """Return what the CAVs observe now: arrays of shape (CAVs,)."""
         return self._local_state
@@ -134,6 +183,7 @@ class MotorwayBatch:
     def advance(self, command: Command | None) -> None:
         """Simulate one control step with the same command throughout; None: the CAVs stay human."""
         scenario, traffic, accelerations = self.scenario, self._traffic, None
+        self._cav_speeds_before = self._local_state.speed
         if self._is_controlled:
             accelerations = batch_commanded_accelerations(command, self.limits, self.cav_count, self.control_steps)
             self._set_time_gaps(command)
@@ -141,6 +191,8 @@ class MotorwayBatch:
             if accelerations is not None:
                 self._apply_set_speeds(np.asarray(accelerations))
             arrived = traffic.step()
+            if not self._keep_record:
+                continue
             vehicles = traffic.vehicles
             leader_rows = neighbors_on_lane(traffic.neighbors.leaders, vehicles.lane)
             cav_rows = find_rows(self._cav_numbers, vehicles)
@@ -193,8 +245,9 @@ class MotorwayBatch:
         gaps = np.where(row >= 0, gaps, np.nan)
         touching = vehicles.road[gaps < CONTACT_GAP]
         self._log.end_steps[touching] = np.minimum(self._log.end_steps[touching], self.control_steps)
-        backlog = traffic.insertion_queue.backlog(traffic.time - self.scenario.simulation_step)
-        self._log.record_control_step(vehicles, gaps, backlog, self._cav_numbers, self._local_state)
+        self.backlogs = traffic.insertion_queue.backlog(traffic.time - self.scenario.simulation_step)
+        if self._keep_record:
+            self._log.record_control_step(vehicles, gaps, self.backlogs, self._cav_numbers, self._local_state)
 
     def _exact_state(self) -> LocalState:
         traffic, vehicles = self._traffic, self._traffic.vehicles
@@ -202,7 +255,7 @@ class MotorwayBatch:
         roads, _, lane, position, speed = (each[rows] for each in vehicles[:5])
 
         def neighbor_state(neighbors: NDArray[np.intp], lane_offset: int, direction: float) -> tuple[Floats, Floats]:
-            row = neighbors_on_lane(neighbors, vehicles.lane + lane_offset)[rows]
+            row = neighbors_on_lane(neighbors[:, rows], lane + lane_offset)
             gap = direction * (vehicles.position[row] - position) - geometry.vehicle_length
             return observe_neighbor(row >= 0, gap, vehicles.speed[row], speed)
 
@@ -229,9 +282,37 @@ class MotorwayBatch:
         )
         return state.as_read_only()
 
+    def last_applied_acceleration(self) -> Floats:
+        """Return the CAVs' accelerations in the last control step [m/s2]; zero for those that have left."""
+        before, after = self._cav_speeds_before, self._local_state.speed
+        remaining, changes = self.remaining_rows, np.zeros(len(before))
+        rows = np.arange(len(before)) if remaining is None else np.array(remaining, np.intp)
+        changes[rows] = after[: len(rows)] - before[rows]
+        return changes / self.scenario.control_step
+
+    def last_outcome(self) -> Outcome:
+        """Return the outcome of the last control step, a row for each road; CAVs that have just entered are absent."""
+        vehicles, state, accelerations = self._traffic.vehicles, self._local_state, self.last_applied_acceleration()
+        if self.remaining_rows is not None:
+            accelerations = accelerations[self.remaining_rows]
+        count = len(accelerations)
+        by_cav = accelerations, time_gap(state.leader_gap, state.speed)[:count], state.speed[:count]
+        accelerations, time_gaps, cav_speeds = self._by_road(self.cav_roads[:count], *by_cav)
+        (speeds,) = self._by_road(vehicles.road, vehicles.speed)
+        return Outcome(speeds, accelerations, time_gaps, self.crashed_roads, self.backlogs, cav_speeds)
+
+    def _by_road(self, roads: NDArray[np.intp], *values: Floats) -> Floats:
+        """Return values of some vehicles by road, shape (values, W, most vehicles of a road); NaN: no more."""
+        counts = np.bincount(roads, minlength=len(self.roads))
+        order = np.argsort(roads, kind="stable")
+        columns = np.arange(len(roads)) - np.repeat(np.cumsum(counts) - counts, counts)
+        table = np.full((len(values), len(counts), counts.max()), np.nan)
+        table[:, roads[order], columns] = np.array(values)[:, order]
+        return table
+
     def noise(self, episode_noise_size: int = 0) -> Floats:
         """Return standard normal noise for one action, shape (CAVs,), or of the episode, see `World.noise`."""
-        roads, generators = self._cav_roads, self._exploration_generators
+        roads, generators = self.cav_roads, self._exploration_generators
         if episode_noise_size:
             if self._episode_noise is None:
                 self._episode_noise = np.stack([each.standard_normal(episode_noise_size) for each in generators])

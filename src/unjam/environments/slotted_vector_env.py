@@ -1,0 +1,180 @@
+"""Many motorways of a batch as a Gymnasium vector environment with fixed slots for their CAVs."""
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from unjam.drivers.driver import carry_over_memory
+from unjam.drivers.observation import FeatureLike
+from unjam.drivers.user_driver import DriverLike
+from unjam.environments.gymnasium_env import ExternalDriver, no_cav_error
+from unjam.environments.vector_env import Episodes, RoadVectorEnv, with_masks
+from unjam.errors import InputError
+from unjam.measures.step_metrics import open_road_metrics, open_road_sums
+from unjam.parameters import check_integer
+from unjam.physics.arrays import Array, Floats
+from unjam.scenarios.motorway import Motorway
+from unjam.scenarios.scenario import Scenario
+from unjam.worlds.batch.motorway.world import MotorwayBatch
+from unjam.worlds.batch.support import required_batch_kind
+from unjam.worlds.reward import Outcome, RewardLike
+
+NO_SLOT = -1
+"""slot of CAVs that find no slot free"""
+
+
+class SlottedEpisodes(Episodes):
+    """Episodes on W motorways, the driver of their CAVs, and the slots of these, S on each road."""
+
+    def __init__(self, world: MotorwayBatch, driver: ExternalDriver, slots: int) -> None:
+        """Start the episodes with empty roads; raise `EpisodeError` if one will have no CAV."""
+        if not all(road.cav_ids for road in world.roads):
+            raise no_cav_error(world.scenario)
+        self._shape = len(world.roads), slots
+        self._slots = np.zeros(0, np.intp)
+        """slot of each CAV on a road, or `NO_SLOT`"""
+        self._departed: tuple[NDArray[Any], ...] = *np.zeros((2, 0), np.intp), np.zeros((0, 1))
+        """road, slot and last observation of the CAVs that left their slots in the last control step"""
+        super().__init__(world, driver, np.asarray)
+
+    def advance(self, actions: Array) -> Outcome:
+        """Advance one control step with actions of shape (W, S), and return its outcome."""
+        roads, slots = self.world.cav_roads, self._slots
+        outcome = super().advance(np.where(slots == NO_SLOT, 0.0, actions[roads, slots]))
+        remaining = self.world.remaining_rows
+        rows = np.arange(len(slots)) if remaining is None else np.array(remaining, np.intp)
+        left = np.setdiff1d(np.flatnonzero(slots != NO_SLOT), rows)
+        self._departed = roads[left], slots[left], self._row_observations[left]
+        self._update_rows(rows)
+        return outcome
+
+    def _update_rows(self, rows: NDArray[np.intp]) -> None:
+        """Keep some rows of the CAVs; those that have entered since, behind them, get the first free slots."""
+        new_roads, is_free = self.world.cav_roads[len(rows) :].tolist(), ~self.is_occupied
+        slots = self._slots[rows].tolist()
+        for road in new_roads:
+            free = np.flatnonzero(is_free[road])[:1]
+            is_free[road, free] = False
+            slots += free.tolist() or [NO_SLOT]
+        self._slots, new = np.array(slots, np.intp), len(new_roads)
+        self._memory = carry_over_memory(self._memory, rows, self._driver.initial_memory(new), new)
+
+    def observe(self) -> None:
+        """Let the driver observe the current state, once in each control step."""
+        super().observe()
+        has_slot = self._slots != NO_SLOT
+        own, departed = (self.world.cav_roads[has_slot], self._slots[has_slot]), self._departed[:2]
+        rows: Floats = self.observations
+        self._row_observations = rows
+        self.is_occupied, self.has_left = np.zeros((2, *self._shape), bool)
+        self.is_occupied[own], self.has_left[departed] = True, True
+        self.observations = np.zeros((*self._shape, rows.shape[1]))
+        self.observations[own], self.observations[departed] = rows[has_slot], self._departed[2]
+
+    def replace(self, rows: list[int], source: Any, source_rows: list[int]) -> None:
+        """Go on in some rows with episodes that have just been started."""
+        stays = np.flatnonzero(~np.isin(self.world.cav_roads, rows))
+        self._slots, self._memory = self._slots[stays], carry_over_memory(self._memory, stays, {}, 0)
+        is_shown = ~np.isin(self._departed[0], rows)
+        self._departed = tuple(each[is_shown] for each in self._departed)
+        self.world.replace_roads(rows, source.world, source_rows)
+        self.observe()
+
+
+class SlottedRoadVectorEnv(RoadVectorEnv):
+    """W motorways with S slots each for CAVs that come and go, simulated together without SUMO.
+
+    ``gymnasium.make_vec("unjam/OnRamp-v0", num_envs=64, slots=8)``. Slots are those of `SlottedRoadEnv`, seeds and
+    restarts those of `RoadVectorEnv`. Episodes have the same distribution as SUMO's.
+
+    ============  ==================================================================================================
+    Roads         motorways with 1 or 2 lanes and any number of on-ramps; their CAVs are a share of the cars
+    Observations  (W, S, n); zeros in empty slots
+    Actions       (W, S, 1); those of empty slots are ignored
+    Rewards       (W,): the reward of each road, which its CAVs share. ``info["slot_rewards"]``, (W, S), is this reward
+                  for the CAVs that acted in the step, and 0 in the other slots
+    Steps         each is one control step, also without CAVs: an episode begins with an empty road. `SlottedRoadEnv`
+                  skips control steps without CAVs
+    Ends          terminated at a collision; truncated at the horizon, or when no CAV will be on the road again
+    ``info``      ``is_occupied`` and ``has_left``, (W, S), ``slot_rewards``, ``reward_terms``; at the end of an episode
+                  ``episode_metrics``: ``return``, ``steps``, ``mean_speed``, ``travel_time``, ``insertion_backlog_veh``
+    ============  ==================================================================================================
+    """
+
+    _step_sums = staticmethod(open_road_sums)
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        slots: int = 8,
+        scenario: str = "on-ramp",
+        reward: RewardLike = "",
+        expert: str | DriverLike = "",
+        features: Sequence[FeatureLike] = ("local",),
+        **changes: Any,
+    ) -> None:
+        """Prepare the environments; `slots` are those of each road, other arguments as of `RoadVectorEnv`.
+
+        Raises:
+            InputError: an argument is wrong, or a batch cannot simulate the scenario.
+        """
+        slots = check_integer("slots", slots, 1)
+        for name in ("exact", "device"):
+            if name in changes:
+                raise InputError(f"{name}: is not an option of motorways; they are NumPy's, in double precision")
+        self._slots = slots
+        super().__init__(num_envs, scenario, reward, expert, features, **changes)
+
+    def _unsupported_reason(self, scenario: Scenario) -> str:
+        if not issubclass(required_batch_kind(scenario).world, MotorwayBatch):
+            return "its vehicles stay: slots are only allowed on motorways"
+        if (source := cast(Motorway, scenario).roadside.source) == "detectors":
+            return f"roadside.source: {source} is not allowed with slots; allowed: vehicles, cavs, none"
+        return ""
+
+    def _space_of_environment(self, space: spaces.Box) -> spaces.Box:
+        return cast(spaces.Box, batch_space(space, self._slots))
+
+    def _make_world(self, kind: type[MotorwayBatch], seeds: list[tuple[int, ...]]) -> MotorwayBatch:
+        return kind(cast(Motorway, self._road.scenario), seeds, keep_record=False)
+
+    def _start_episodes(self, rows: list[int]) -> SlottedEpisodes:
+        return SlottedEpisodes(self.make_batch(rows), self._road.copy_driver(), self._slots)
+
+    def _without_ignored(self, actions: Array) -> Array:
+        is_occupied = cast(SlottedEpisodes, self._running_episodes).is_occupied
+        return np.where(is_occupied, super()._without_ignored(actions), 0.0)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start episodes, as `RoadVectorEnv.reset`."""
+        observations, info = super().reset(seed=seed, options=options)
+        return observations, info | self._slot_info()
+
+    def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Advance one control step with actions of shape (W, S, 1) [m/s2]; restart episodes that ended before it."""
+        has_acted = cast(SlottedEpisodes, self._running_episodes).is_occupied
+        *values, rewards, terminated, truncated, info = super().step(actions)
+        slot_rewards = np.where(has_acted, rewards[:, None], 0.0)
+        return *values, rewards, terminated, truncated, info | self._slot_info(slot_rewards=slot_rewards)
+
+    def _slot_info(self, **values: Array) -> dict[str, Any]:
+        episodes = cast(SlottedEpisodes, self._running_episodes)
+        masks = {"is_occupied": episodes.is_occupied, "has_left": episodes.has_left}
+        return with_masks(masks | values, np.ones(self.num_envs, bool))
+
+    def _episode_metrics(self, sums: dict[str, Array], outcome: Outcome, steps: Array) -> dict[str, Array]:
+        world, scenario = self._running_episodes.world, self._road.scenario
+        return open_road_metrics(sums, outcome, world.entry_counts, scenario.horizon - steps, scenario.control_step)
+
+
+def make_vector_env(num_envs: int = 1, slots: int | None = None, **arguments: Any) -> RoadVectorEnv:
+    """Return the vector environment of a scenario; with `slots`, a `SlottedRoadVectorEnv`."""
+    if slots is None:
+        return RoadVectorEnv(num_envs, **arguments)
+    return SlottedRoadVectorEnv(num_envs, slots, **arguments)
