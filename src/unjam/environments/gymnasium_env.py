@@ -14,27 +14,15 @@ from numpy.typing import NDArray
 
 from unjam.controller import make_expert
 from unjam.drivers.car_following import Constant
-from unjam.drivers.command import Command, Limits, as_numbers
-from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler, replace_memory_rows
-from unjam.drivers.local_state import LocalState
-from unjam.drivers.observation import (
-    MAX_OBSERVATION,
-    FeatureInputs,
-    FeatureLike,
-    NetworkInput,
-    as_features,
-    compute_observation,
-    feature,
-    observation_size,
-)
-from unjam.drivers.requirements import Requirements, RoadInterface, merge_requirements
+from unjam.drivers.command import as_numbers
+from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features, observation_size
 from unjam.drivers.user_driver import DriverLike
-from unjam.drivers.wrappers import INNER_KEY
+from unjam.environments.external_driver import ExternalDriver
 from unjam.environments.threads import CopyableLock, synchronized
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
 from unjam.measures.step_metrics import StepMetricMeans
 from unjam.parameters import check_integer, merge_changes, nest_keys
-from unjam.physics.arrays import clip, replace_entries
+from unjam.physics.arrays import clip
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.scenarios.road import OrderedRoad
@@ -80,44 +68,6 @@ def check_single_cav(scenario: Scenario) -> None:
     """Raise `InputError` unless a scenario has one CAV."""
     if getattr(scenario, "cavs", None) != 1:
         raise InputError("cavs: several are not allowed here; allowed: 1; use unjam.parallel_env")
-
-
-class ExternalDriver(Driver):
-    """An expert with external additions to its accelerations: `actions`, set before each decision."""
-
-    def __init__(self, expert: Driver, features: tuple[NetworkInput, ...], limits: Limits) -> None:
-        """Let `expert` drive within `limits`; `features` are the external observation."""
-        self.expert, self.features, self._limits = expert, features, limits
-        self.inner_drivers = {INNER_KEY: expert}
-        self.actions: Any = np.zeros(0)
-        """additions to the accelerations [m/s2], shape (CAVs,), or a float in a world with `is_scalar`"""
-
-    def requirements(self, road: RoadInterface | None = None) -> Requirements:
-        """Return those of the expert and of the features."""
-        return merge_requirements(
-            self.expert.requirements(road), *(feature(each).requirements for each in self.features)
-        )
-
-    def replace_rows(self, rows: Any, source: "ExternalDriver", source_rows: Any) -> None:
-        """Let some CAVs go on with the last observation of CAVs of another driver of this kind."""
-        own, other = (each._expert_acceleration for each in (self, source))
-        self._expert_acceleration = replace_entries(own, rows, other, source_rows)
-        self._next_memory = replace_memory_rows(self._next_memory, rows, source._next_memory, source_rows)
-
-    def observation(self, state: LocalState, memory: Memory) -> Any:
-        """Return the external observation as `compute_observation`, and store the expert's acceleration."""
-        acceleration, after = self.expert.act(state, memory[INNER_KEY])
-        self._expert_acceleration, self._next_memory = self._limits.clip(acceleration), {INNER_KEY: after}
-        inputs = FeatureInputs(state, self._expert_acceleration, self.expert, after)
-        return compute_observation(self.features, inputs)
-
-    def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
-        """Return the sum of the stored expert acceleration and the actions."""
-        if not isinstance(state.speed, float) and not len(state.speed):
-            return Decision(Command(np.zeros(0)), np.zeros(0), np.zeros(0), None, memory)
-        acceleration = self._limits.clip(self._expert_acceleration + self.actions)
-        command = Command(acceleration, self.expert.time_gaps(state, memory[INNER_KEY]))
-        return Decision(command, self._expert_acceleration, self.actions, None, self._next_memory)
 
 
 class RoadStepResult(NamedTuple):

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from unjam.drivers.driver import carry_over_memory
 from unjam.drivers.observation import FeatureLike
 from unjam.drivers.user_driver import DriverLike
-from unjam.environments.gymnasium_env import ExternalDriver, no_cav_error
+from unjam.environments.external_driver import ExternalDriver
+from unjam.environments.gymnasium_env import no_cav_error
 from unjam.environments.vector_env import Episodes, RoadVectorEnv, with_masks
 from unjam.errors import InputError
 from unjam.measures.step_metrics import open_road_metrics, open_road_sums

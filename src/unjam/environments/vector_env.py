@@ -16,7 +16,8 @@ from unjam.drivers.check import check_driver
 from unjam.drivers.command import as_numbers
 from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike
 from unjam.drivers.user_driver import DriverLike
-from unjam.environments.gymnasium_env import ExternalDriver, RoadStepper, check_single_cav, episode_seed
+from unjam.environments.external_driver import ExternalDriver
+from unjam.environments.gymnasium_env import RoadStepper, check_single_cav, episode_seed
 from unjam.errors import InputError, MissingPartError, UnjamError, import_optional, invalid_value
 from unjam.measures.step_metrics import step_metrics
 from unjam.parameters import check_integer
