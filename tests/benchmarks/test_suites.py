@@ -45,16 +45,17 @@ def test_an_unknown_suite_is_refused_with_the_names() -> None:
 
 @pytest.mark.parametrize("name", FAMILY)
 def test_each_road_is_a_scenario_and_an_environment(name: str) -> None:
-    assert gymnasium.spec(f"unjam/{name}-v1").kwargs == {"scenario": f"family/{name}", "cavs": 1}
+    assert gymnasium.spec(f"unjam/{name}-v1").kwargs["scenario"] == f"family/{name}"
     road = make_scenario(f"family/{name}", {"horizon": 7})
     assert road == make_scenario(FAMILY[name].scenario, {**FAMILY[name].options, "horizon": 7})
 
 
-def test_an_environment_of_a_road_with_several_cavs_has_one() -> None:
-    environment = gymnasium.make("unjam/ring-33-growing-3-cavs-v1", warmup=10)
+@pytest.mark.parametrize(("name", "vehicles"), [("ring-33-growing-3-cavs", 33), ("figure-eight-14", 14)])
+def test_an_environment_of_a_road_has_one_cav(name: str, vehicles: int) -> None:
+    environment = gymnasium.make(f"unjam/{name}-v1", warmup=10)
     try:
         environment.reset(seed=3)
-        assert len(environment.get_wrapper_attr("_road").world.speeds) == 33
+        assert len(environment.get_wrapper_attr("_road").world.speeds) == vehicles
         assert len(environment.get_wrapper_attr("_road").world.cav_ids) == 1
     finally:
         environment.close()
