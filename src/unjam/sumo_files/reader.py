@@ -271,7 +271,7 @@ def parse_xml(path: Path, parser: Any, chunks: Iterable[bytes]) -> None:
         for chunk in chunks:
             parser.Parse(chunk, False)
             size += len(chunk)
-            # The parser begins an element that is not complete anew with each chunk.
+            # With each chunk the parser reads an incomplete element again from its beginning.
             if size - parser.CurrentByteIndex > MAX_ELEMENT_BYTES:
                 limit = f"an element has at most {MAX_ELEMENT_BYTES:,} bytes"
                 raise BrokenFileError(f"{path.name}: line {parser.CurrentLineNumber} is too long; allowed: {limit}")
