@@ -111,7 +111,8 @@ class RoadStepper:
         self.scenario = self.episode_scenario = made
         """that of the constructor; `episode_scenario` is that of the last reset, with its options"""
         reward = reward or self.scenario.reward
-        self._reward, self._reward_needs_rows = make_reward(reward), not is_packaged_reward(reward)
+        self._reward, self.has_user_reward = make_reward(reward), not is_packaged_reward(reward)
+        """whether the reward is a user's function"""
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
         inputs = as_features(features)
         if not expert and (useless := [name for name in ("expert_acceleration", "expert_memory") if name in inputs]):
@@ -206,7 +207,7 @@ class RoadStepper:
             accelerations = np.array(accelerations)  # a backend may write into its own arrays later
         ends = bool(world.has_crashed), float(world.backlog)
         outcome = Outcome(np.array(world.speeds), accelerations, time_gaps, *ends, speed)
-        terms = step_reward_terms(self._reward, outcome, world.control_steps - 1, self._reward_needs_rows)
+        terms = step_reward_terms(self._reward, outcome, world.control_steps - 1, self.has_user_reward)
         terminated, reward = world.has_crashed, sum(terms.values())
         self._steps, self._return = self._steps + 1, self._return + reward
         if self._metric_means is not None:

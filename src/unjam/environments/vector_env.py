@@ -80,12 +80,12 @@ class Episodes:
         self.observe()
 
     def advance(self, actions: Array) -> Outcome:
-        """Advance one control step with actions of shape (W,), and return its outcome."""
+        """Advance one control step with actions of shape (W,), and return its outcome, whose arrays must not be changed."""
         self._driver.actions = actions
         decision, world = self._driver.decide(self._state, self._memory), self.world
         self._memory = decision.memory
         world.advance(decision.command)
-        return Outcome(*map(copy_array, world.last_outcome()))  # rewards may write into them
+        return world.last_outcome()
 
     def observe(self) -> None:
         """Let the driver observe the current state, once in each control step."""
@@ -353,6 +353,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _reward_terms(self, outcome: Outcome) -> dict[str, Array]:
         reward = self._road.reward
+        if self._road.has_user_reward:  # it may write into the arrays
+            outcome = Outcome(*map(copy_array, outcome))
         terms = reward(outcome)
         is_valid = all(getattr(values, "shape", None) == (self.num_envs,) for values in terms.values())
         if is_valid and (not self._is_numpy or np.isfinite(sum(terms.values())).all()):

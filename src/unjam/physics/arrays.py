@@ -84,8 +84,11 @@ def as_indices(values: Array) -> Array:
 
 
 def copy_array(values: Array) -> Array:
-    """Return a copy, through which gradients flow."""
-    return values.copy() if isinstance(values, np.ndarray) else values.clone()
+    """Return a copy with the same order in memory, through which gradients flow.
+
+    Sums over vehicles take a tenth of the time in the order of the batches.
+    """
+    return values.copy("K") if isinstance(values, np.ndarray) else values.clone()
 
 
 def replace_entries(values: Array, index: Any, source: Array, source_index: Any) -> Array:
