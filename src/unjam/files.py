@@ -136,6 +136,12 @@ def remove(path: Path) -> None:
         folder.remove(path.name)
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Remove unfinished files that killed processes have left in a folder, which no other process writes now."""
+    for leftover in [*filter(is_leftover, folder.glob(".*"))]:
+        remove(leftover)
+
+
 def remove_if_empty(folder: Path) -> None:
     """Remove a folder if it is empty."""
     with suppress(OSError):

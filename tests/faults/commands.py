@@ -5,6 +5,7 @@ import io
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +16,38 @@ import pytest
 
 import unjam
 from tests.faults.outcome import Outcome, one_line
-from tests.faults.processes import start_unjam
+from tests.faults.processes import UNJAM, start_unjam
 from unjam.errors import InputError
 from unjam.processes import is_locked, lock_folder
 from unjam.recordings.loaders import read_trajectories
+from unjam_paper.results_file import read_part
 
 ROAD = ["--length", "60", "--vehicles", "5"]
 TRIAL = {"length": "[60,60]", "vehicles": 5, "horizon": 40}
 SEARCH = [*(f"scenario_options.{name}={value}" for name, value in TRIAL.items()), "trpo.steps_per_iteration=160"]
 SEARCH += ["steps=160", "model.model_ratio=0", "evaluation.validation_episodes=1"]
+SETTINGS = [word for setting in SEARCH for word in ("--set", setting)]
 COMMANDS = {
     "tune": ["tune", "ring", *ROAD, "--set", "horizon=20", "--vary", "window=10,30", "--steps", "3000"],
-    "search": ["search", "ring", *(word for setting in SEARCH for word in ("--set", setting)), "--workers", "1"],
+    "search": ["search", "ring", *SETTINGS, "--workers", "1", "--vary", "trpo.target_kl=0.01,0.02", "--trials", "2"],
+    "reproduce": ["reproduce", "small", "--seeds", "1"],
 }
 COMMANDS["tune"] += ["--expert", "pi", "--max-string-gain", "0"]
-COMMANDS["search"] += ["--vary", "trpo.target_kl=0.01,0.02", "--trials", "2"]
+SMALL_STUDIES = """
+import sys
+import pytest
+sys.path.insert(0, {root!r})
+from tests.paper.conftest import add_small_study
+from unjam.cli import main
+add_small_study(pytest.MonkeyPatch())
+main()
+"""
+"""a program that is the command line with the study `small`"""
+PROGRAMS = {"reproduce": ("-c", SMALL_STUDIES.format(root=str(Path(__file__).parents[2])))}
 RESULTS: dict[str, Callable[[Path], Any]] = {
     "tune": lambda out: (out / "pi.unjam").read_bytes(),
     "search": lambda out: (out / "best.toml").read_text(),
+    "reproduce": lambda out: str(read_part(out / "small.json", "table")),
 }
 """commands that write a folder, and what a repetition must write there again"""
 DAY = 86_400.0
@@ -44,18 +59,19 @@ def killed_commands(count: int, folder: Path, generator: np.random.Generator) ->
     """Kill commands (signal 9) at random times, and repeat them until they end."""
     outcome = Outcome()
     for name, words in COMMANDS.items():
+        start = partial(start_unjam, folder, program=PROGRAMS.get(name, UNJAM))
         started = time.monotonic()
-        assert start_unjam(folder, [*words, "--out", f"{name}-whole"]).wait() == 0
+        assert start([*words, "--out", f"{name}-whole"]).wait() == 0, (folder / "words.txt").read_text()
         duration, whole = time.monotonic() - started, RESULTS[name](folder / f"{name}-whole")
         for number in range(list(COMMANDS).index(name), count, len(COMMANDS)):
             out = folder / f"{name}-{number}"
-            process = start_unjam(folder, [*words, "--out", out.name])
+            process = start([*words, "--out", out.name])
             time.sleep(float(generator.uniform(0.0, duration)))
             process.kill()
             process.wait()
             for written in out.rglob("*.json"):
                 json.loads(written.read_text())
-            assert start_unjam(folder, [*words, "--out", out.name]).wait() == 0, (folder / "words.txt").read_text()
+            assert start([*words, "--out", out.name]).wait() == 0, (folder / "words.txt").read_text()
             assert RESULTS[name](out) == whole
             outcome.happened[f"{name}: no file was half-written, and a repetition had the same result"] += 1
     return outcome

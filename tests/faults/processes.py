@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,8 @@ from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
+UNJAM = "-m", "unjam"
+"""arguments of Python that start the command line"""
 MAX_MEMORY_GROWTH = 20.0
 """maximum growth of the memory of a process over any number of resets [MB]"""
 SIGNALS = {signal.SIGKILL: 0.5, signal.SIGSEGV: 0.45, signal.SIGSTOP: 0.05}
@@ -214,9 +217,9 @@ def killed_runs(count: int, folder: Path, generator: np.random.Generator) -> Out
     return outcome
 
 
-def start_unjam(folder: Path, arguments: list[str]) -> "subprocess.Popen[bytes]":
+def start_unjam(folder: Path, arguments: list[str], program: Sequence[str] = UNJAM) -> "subprocess.Popen[bytes]":
     """Start the command line, with its errors in a file."""
-    command = [sys.executable, "-m", "unjam", *arguments]
+    command = [sys.executable, *program, *arguments]
     with (folder / "words.txt").open("wb") as words:
         return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=words)
 

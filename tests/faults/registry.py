@@ -90,7 +90,9 @@ FAULTS: dict[str, Fault] = {
         quick_count=40,
         long_count=500,
     ),
-    "killed commands": Fault("tune and search killed (signal 9)", killed_commands, 2, 20, is_slow=True),
+    "killed commands": Fault(
+        "tune, search and reproduce killed (signal 9)", killed_commands, quick_count=3, long_count=30, is_slow=True
+    ),
     "clocks": Fault("clock that jumps by up to a day", jumping_clocks, quick_count=2, long_count=50),
     "packed tables": Fault(
         "recorded traffic in files of a few megabytes that unpack to gigabytes, or have a huge line or element",

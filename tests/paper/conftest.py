@@ -42,13 +42,18 @@ SMALL_VARIANTS = {
 def small_study() -> Iterator[pytest.MonkeyPatch]:
     """Add the study `small`."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(STUDIES, "small", SMALL_STUDY)
-        patch.setitem(study.STUDY_ROADS, "small", SMALL)
-        for name, variant in SMALL_VARIANTS.items():
-            patch.setitem(VARIANTS, name, variant)
-        patch.setattr(reproduction, "REFERENCE_DRIVERS", REFERENCES)
-        patch.setitem(TUNED_REFERENCES, "small", TUNED)
+        add_small_study(patch)
         yield patch
+
+
+def add_small_study(patch: pytest.MonkeyPatch) -> None:
+    """Add the study `small` to this process."""
+    patch.setitem(STUDIES, "small", SMALL_STUDY)
+    patch.setitem(study.STUDY_ROADS, "small", SMALL)
+    for name, variant in SMALL_VARIANTS.items():
+        patch.setitem(VARIANTS, name, variant)
+    patch.setattr(reproduction, "REFERENCE_DRIVERS", REFERENCES)
+    patch.setitem(TUNED_REFERENCES, "small", TUNED)
 
 
 @pytest.fixture(scope="module")

@@ -118,7 +118,7 @@ def test_a_damaged_evaluation_is_refused_in_one_line(folder: Path, content: str)
 def test_a_damaged_episode_file_is_refused_in_one_line(folder: Path, keep: int) -> None:
     path = folder / "plot_episodes.safetensors"
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match=r"does not belong to evaluation\.json"):
         read_results(folder)
 
 

@@ -6,6 +6,8 @@ import json
 import os
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
@@ -14,10 +16,14 @@ import torch
 
 from tests.training.test_run import small_config
 from unjam import files
-from unjam.errors import DiskError
+from unjam.drivers import PISaturation
+from unjam.errors import DiskError, InputError
 from unjam.files import append_line, to_json
 from unjam.folders import Folder
+from unjam.reports.results import read_results
+from unjam.scenarios import Ring
 from unjam.training import run_folder
+from unjam.training.evaluate import evaluate, save_evaluation
 from unjam.training.run_folder import (
     PROGRESS_FILE,
     create_run_folder,
@@ -25,6 +31,7 @@ from unjam.training.run_folder import (
     resume_run_folder,
     save_checkpoint,
 )
+from unjam.worlds.worker_pool import WorkerPool
 
 ITERATIONS = 4
 Moment = Literal["before", "half", "after"]
@@ -129,11 +136,11 @@ def content_of(folder: Path) -> Content:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def crash(folder: Path, at: int, moment: Moment, kill: bool) -> Disk:
+def crash(folder: Path, at: int, moment: Moment, kill: bool, command: Callable[[Path], None] = run) -> Disk:
     with pytest.MonkeyPatch.context() as patch:
         disk = Disk(patch, at, moment, kill)
         with suppress(Killed, DiskError):
-            run(folder)
+            command(folder)
         return disk
 
 
@@ -167,3 +174,26 @@ def test_run_resumes_after_two_failures(tmp_path: Path) -> None:
             crash(folder, second, "before", True)
             run(folder)
             assert content_of(folder) == wanted, (first, second)
+
+
+@pytest.mark.long
+def test_an_evaluation_that_replaces_another_is_never_mixed_with_it(tmp_path: Path) -> None:
+    ring = Ring(length=(60, 60), vehicles=5, horizon=20)
+    with WorkerPool(1) as pool:
+        old, new = (evaluate(ring, {"PI": PISaturation()}, [(seed,)], pool) for seed in (1, 2))
+    total = crash(tmp_path / "wanted", 0, "before", False, partial(save_evaluation, evaluation=new, metadata={})).count
+    refused = 0
+    moments: tuple[Moment, ...] = ("before", "half", "after")
+    for kill, moment, at in product((True, False), moments, range(1, total + 1)):
+        folder = tmp_path / f"{kill}-{moment}-{at}"
+        save_evaluation(folder, old, {})
+        crash(folder, at, moment, kill, partial(save_evaluation, evaluation=new, metadata={}))
+        try:
+            found = read_results(folder)
+        except InputError:
+            refused += 1
+        else:
+            assert tuple(found.plot_episodes["PI"].seed) == (found.rows["PI"][0]["seed"],)
+        save_evaluation(folder, new, {})
+        assert content_of(folder) == content_of(tmp_path / "wanted")
+    assert 0 < refused < 3 * total

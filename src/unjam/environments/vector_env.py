@@ -80,7 +80,7 @@ class Episodes:
         self.observe()
 
     def advance(self, actions: Array) -> Outcome:
-        """Advance one control step with actions of shape (W,), and return its outcome, whose arrays must not be changed."""
+        """Advance one control step with actions of shape (W,), and return its outcome, which must not be changed."""
         self._driver.actions = actions
         decision, world = self._driver.decide(self._state, self._memory), self.world
         self._memory = decision.memory

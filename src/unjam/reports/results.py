@@ -4,13 +4,14 @@ import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors.numpy import load_file
+from safetensors.numpy import load
 
 from unjam.errors import InputError, resume_hint
 from unjam.files import INVALID_DATA_ERRORS, read_json_lines
@@ -24,6 +25,8 @@ EVALUATION_FILE = "evaluation.json"
 """metrics of each driver"""
 PLOT_EPISODES_FILE = "plot_episodes.safetensors"
 """arrays of the episodes that figures show"""
+PLOT_EPISODES_HASH = "plot_episodes_sha256"
+"""entry of the evaluation with the hash of that file"""
 MODEL_FILE = "model.json"
 """facts about the learned model of a run"""
 VEHICLE_ARRAYS = ("speeds", "positions", "gaps", "poses", "lane_indices")
@@ -136,7 +139,11 @@ def read_results(folder: Path) -> Results:
     reject_special_files(folder)
     metadata, rows = read_evaluation(folder)
     try:
-        stored, episodes = load_file(folder / PLOT_EPISODES_FILE), {}
+        packed = (folder / PLOT_EPISODES_FILE).read_bytes()
+        if metadata.pop(PLOT_EPISODES_HASH, None) not in (None, sha256(packed).hexdigest()):
+            reason = f"{PLOT_EPISODES_FILE} does not belong to {EVALUATION_FILE}"
+            raise InputError(f"report: {str(folder)!r}: {reason}; allowed: repeat the command that wrote them")
+        stored, episodes = load(packed), {}
         for number, entry in enumerate(metadata.pop("plot_episodes")):
             names = (name for name in (*PLOT_ARRAYS, "is_present") if f"{number}.{name}" in stored)
             arrays = unpack_episode({name: stored[f"{number}.{name}"] for name in names})

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_names, unique_label
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, error_from_name, invalid_value
-from unjam.files import atomic_write, make_folder, to_json
+from unjam.files import atomic_write, make_folder, remove_leftovers, to_json
 from unjam.manifest import manifest
 from unjam.measures.effect import effects_by_driver
 from unjam.measures.feasibility import feasibility_by_driver
@@ -28,7 +29,14 @@ from unjam.measures.metrics import METRICS, measure
 from unjam.measures.notes import count_early_ends, episode_notes
 from unjam.measures.statistics import Estimate, paired_difference, summarize
 from unjam.parameters import check_integer
-from unjam.reports.results import EPISODE_ENTRIES, EVALUATION_FILE, pack_episode, to_plot_episode
+from unjam.reports.results import (
+    EPISODE_ENTRIES,
+    EVALUATION_FILE,
+    PLOT_EPISODES_FILE,
+    PLOT_EPISODES_HASH,
+    pack_episode,
+    to_plot_episode,
+)
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import TRAINING_SEED_LIMIT, held_out_seeds
@@ -242,18 +250,22 @@ def save_evaluation(folder: Path, evaluation: Evaluation, metadata: dict[str, An
     """Write an evaluation into a folder, for reports.
 
     `evaluation.json` has `metadata` and rows, `episodes.parquet` the rows as a table, and `plot_episodes.safetensors`
-    the episodes for figures.
+    the episodes for figures. Where these replace others, a process that is killed may leave some of each: so the first
+    has the hash of the last.
     """
     make_folder(folder)
+    remove_leftovers(folder)
     rows = [{"driver": label, **row} for label, of_driver in evaluation.rows.items() for row in of_driver]
     episodes = [to_plot_episode(label, episode) for label, episode in evaluation.plot_episodes.items()]
     arrays = {
         f"{index}.{name}": array for index, each in enumerate(episodes) for name, array in pack_episode(each).items()
     }
     entries = [{"driver": each.driver, **{name: getattr(each, name) for name in EPISODE_ENTRIES}} for each in episodes]
-    atomic_write(folder / "plot_episodes.safetensors", save(arrays))
+    packed = save(arrays)
+    document = {**metadata, "rows": rows, "plot_episodes": entries, PLOT_EPISODES_HASH: sha256(packed).hexdigest()}
+    atomic_write(folder / PLOT_EPISODES_FILE, packed)
     atomic_write(folder / "episodes.parquet", rows_to_frame(evaluation.rows).to_parquet())
-    atomic_write(folder / EVALUATION_FILE, to_json({**metadata, "rows": rows, "plot_episodes": entries}, indent=1))
+    atomic_write(folder / EVALUATION_FILE, to_json(document, indent=1))
 
 
 def drivers_to_compare(config: RunConfig, folder: Path) -> dict[str, Driver]:

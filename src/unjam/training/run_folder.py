@@ -24,7 +24,16 @@ from unjam.drivers.registry import driver_recipe
 from unjam.drivers.requirements import merge_requirements
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import DiskError, InputError, invalid_value
-from unjam.files import INVALID_DATA_ERRORS, atomic_write, is_leftover, make_folder, remove, remove_if_empty, to_json
+from unjam.files import (
+    INVALID_DATA_ERRORS,
+    atomic_write,
+    is_leftover,
+    make_folder,
+    remove,
+    remove_if_empty,
+    remove_leftovers,
+    to_json,
+)
 from unjam.folders import reject_special_files
 from unjam.manifest import manifest, package_versions
 from unjam.parameters import build_dataclass, read_toml
@@ -277,10 +286,9 @@ def restore_newest_checkpoint(
     if checkpoint and expected and "fingerprint" in checkpoint[0]:
         check_fingerprint(checkpoint[0]["fingerprint"], expected)
     _remove_old_checkpoints(folder / "checkpoint")
-    for leftover in [path for place in progress_folders for path in place.glob(".*") if is_leftover(path)]:
-        remove(leftover)
     iteration = checkpoint[0]["iteration"] if checkpoint else 0
     for place in progress_folders:
+        remove_leftovers(place)
         if (place / PROGRESS_FILE).is_file():
             rows = [to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= iteration]
             atomic_write(place / PROGRESS_FILE, "".join(rows))

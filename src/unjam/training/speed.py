@@ -60,6 +60,8 @@ BENCHMARK_SCENARIOS = ("ring", "figure-eight", "merge")
 """scenarios that are compared with plain SUMO"""
 VECTOR_ENVIRONMENTS = ((1024, False), (4096, False), (1024, True))
 """numbers of rings in vector environments, and whether they equal SUMO exactly"""
+ASYNC_ENVIRONMENTS = 2
+"""number of processes of Gymnasium's own vector environment"""
 MOTORWAYS, FILLING_STEPS, MOTORWAY_STEPS = 256, 150, 20
 """number of motorways in a vector environment, control steps before they are measured, and in each round"""
 BUSY_ON_RAMP: dict[str, Any] = {
@@ -130,7 +132,7 @@ def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: N
         ratios = [a / b for a, b in zip(values, by_name.get(part.reference, ()), strict=False)]
         ratio = median(ratios) if ratios else None
         parts.append({**part._asdict(), "steps_per_s": median(values), "ratio": ratio})
-    return {"rounds": rounds, "parts": parts}
+    return {"manifest": manifest(), "rounds": rounds, "parts": parts}
 
 
 def _measure_round(
@@ -148,7 +150,7 @@ def _measure_round(
             yield Part(f"{name}: {EPISODE_PART}", sumo_part), _episode_rate(scenario, number, simulation)
         yield Part(f"{own}, network in every step", sumo), _episode_rate(ring, number, simulation, 0.0)
         yield Part(f"{own} without safety filter", own), _episode_rate(unfiltered, number, simulation)
-        yield Part(ENVIRONMENT_PART, sumo), _environment_rate(ring, number, simulation)
+        yield Part(ENVIRONMENT_PART, sumo), _environment_rate(ring.horizon, number, simulation)
         yield Part(SLOTS_PART), _slots_rate(number, simulation)
         yield Part("ring: audit of an episode", own), steps_per_second(partial(_repeat_audit, episode), ring.horizon)
         for rows, steps in ROLLOUT_SIZES:
@@ -166,6 +168,10 @@ def _measure_round(
     with Simulation("traci") as simulation:
         rate = _loop_rate(make_benchmark_ring(smallest, TRACI_STEPS), driver, simulation)
         yield Part("driving loop over TraCI", f"driving loop, ring of {smallest} vehicles"), rate
+        rate = _environment_rate(TRACI_STEPS, number, simulation)
+        yield Part("ring: env.step over TraCI", ENVIRONMENT_PART), rate
+    name = f"Gymnasium's async vector environment of {ASYNC_ENVIRONMENTS} rings in SUMO"
+    yield Part(name, ENVIRONMENT_PART), _async_rate(number)
 
 
 class VectorBenchmark:
@@ -236,12 +242,26 @@ def _loop_rate(scenario: Scenario, driver: ResidualDriver, simulation: Simulatio
     return steps_per_second(lambda: deque(DriveLoop(traffic, driver, explore=True), maxlen=0), scenario.horizon)
 
 
-def _environment_rate(scenario: Scenario, seed: int, simulation: Simulation) -> float:
+def _environment_rate(steps: int, seed: int, simulation: Simulation) -> float:
     """Return control steps per second of the Gymnasium environment with random actions; the reset is not timed."""
     environment = gymnasium.make("unjam/Ring-v0", backend=SumoBackend(simulation))
     environment.reset(seed=seed)
-    actions = np.random.default_rng(seed).uniform(-1.0, 1.0, (scenario.horizon, 1)).astype(np.float32)
+    actions = np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, 1)).astype(np.float32)
     return steps_per_second(lambda: deque(map(environment.step, actions), maxlen=0), len(actions))
+
+
+def _async_rate(seed: int) -> float:
+    """Return control steps per second, of all environments together, of processes of Gymnasium on the same core."""
+    environment = gymnasium.make_vec("unjam/Ring-v0", ASYNC_ENVIRONMENTS, vectorization_mode="async")
+    try:
+        environment.reset(seed=seed)
+        actions = np.zeros((ASYNC_ENVIRONMENTS, 1), np.float32)
+        steps = range(STEPS_PER_ROUND)
+        return steps_per_second(
+            lambda: deque((environment.step(actions) for _ in steps), 0), ASYNC_ENVIRONMENTS * len(steps)
+        )
+    finally:
+        environment.close()
 
 
 def _rollout_rate(episode: Episode, scenario: Scenario, driver: ResidualDriver, rows: int, steps: int) -> float:
@@ -348,4 +368,4 @@ def benchmark_batches(device: Device, on_message: MessageCallback = lambda line:
         rate = ring_steps_per_second(batch, rings)
         batches[name].append({"rings": rings, "steps_per_s": rate, "vehicle_steps_per_s": rate * VEHICLES_PER_RING})
     device_name = torch.cuda.get_device_name() if device == "cuda" else "one core"
-    return {"device": device_name, "vehicles": VEHICLES_PER_RING, "batches": batches, "manifest": manifest()}
+    return {"manifest": manifest(), "device": device_name, "vehicles": VEHICLES_PER_RING, "batches": batches}
