@@ -491,3 +491,15 @@ def test_flow_of_a_demand_peak_counts_only_the_peak(peak: tuple[float, float], f
     # A vehicle leaves every second from the sixtieth on; without the peak within the episode all of it counts.
     speeds = np.where(np.arange(101)[:, None] <= np.arange(60, 160), 10.0, np.nan)
     assert metric("outflow_veh_per_h", open_episode(speeds, demand_peak=peak)) == pytest.approx(flow)
+
+
+def test_amplification_is_that_of_waves_in_each_range_of_periods() -> None:
+    times, factors = 0.1 * np.arange(6001), {"long": 1.5, "medium": 0.8, "short": 0.3}
+    waves = {name: np.sin(2 * np.pi * times / period) for name, period in (("long", 100), ("medium", 40), ("short", 8))}
+    recorded = 20.0 + 0.002 * times + sum(waves.values())  # a trend is no wave
+    last = 20.0 + 0.002 * times + sum(factors[name] * np.roll(wave, 30) for name, wave in waves.items())
+    motion = np.stack([np.cumsum(recorded) * 0.1, recorded], -1)[:, None]
+    episode = episode_of(last[:, None], replayed_motion=motion)
+    for name, factor in factors.items():
+        assert metric(f"amplification_{name}", episode) == pytest.approx(factor, rel=0.02)
+        assert np.isnan(metric(f"amplification_{name}", episode_of(steady(4.0))))

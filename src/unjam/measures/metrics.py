@@ -17,6 +17,7 @@ from unjam.measures.platoon_metrics import (
     cav_mean_gap,
     fuel_by_power,
     human_fuel_by_power,
+    period_amplification,
     time_behind_leader,
 )
 from unjam.scenarios.scenario import sumo_seed
@@ -410,6 +411,9 @@ METRICS: dict[str, Metric] = {
     "cav_max_gap": Metric(cav_max_gap, "CAV's largest gap", "m", 1),
     "time_behind_leader": Metric(time_behind_leader, "time behind the recorded vehicle", "s", 1),
     "amplification": Metric(amplification, "speed std of the last over the recorded vehicle", "", 2),
+    "amplification_long": Metric(period_amplification(inf, 60.0), "amplification of periods above 60 s", "", 2),
+    "amplification_medium": Metric(period_amplification(60.0, 20.0), "amplification of periods of 20 to 60 s", "", 2),
+    "amplification_short": Metric(period_amplification(20.0, 4.0), "amplification of periods of 4 to 20 s", "", 2),
     "outflow_veh_per_h": Metric(outflow_veh_per_h, "flow", "veh/h", 0),
     "travel_time": Metric(mean_travel_time, "travel time, departure delay included", "s", 1),
     **{

@@ -1,13 +1,14 @@
 """Metrics of fuel by power, of the gaps of CAVs, and of a platoon behind a recorded vehicle."""
 
-from math import nan
+from collections.abc import Callable
+from math import inf, nan
 from typing import Any
 
 import numpy as np
 
 from unjam.measures.averages import mean_over_cavs, per_kilometer, row_chunks
 from unjam.physics.fuel import fuel_rate
-from unjam.worlds.record import Episode
+from unjam.worlds.record import Episode, Floats
 
 
 def fuel_by_power(episode: Episode) -> float:
@@ -75,3 +76,30 @@ def amplification(episode: Episode) -> float:
         return nan
     spread = float(np.std(episode.replayed_motion[1:, 0, 1]))
     return float(np.std(episode.speeds[1:, 0])) / spread if spread else nan
+
+
+def period_amplification(longest: float, shortest: float) -> Callable[[Episode], float]:
+    """Return the metric that is the amplification of waves with periods between two limits [s]."""
+
+    def ratio(episode: Episode) -> float:
+        if not episode.has_recorded_leader:
+            return nan
+        recorded, last = episode.replayed_motion[1:, 0, 1], episode.speeds[1:, 0]
+        frequencies = np.fft.rfftfreq(len(last), episode.control_step)
+        is_in_band = (frequencies > 1.0 / longest) & (frequencies <= 1.0 / shortest)
+        recorded_spectrum, last_spectrum = (_spectrum(speeds)[is_in_band] for speeds in (recorded, last))
+        energy = float(np.sum(recorded_spectrum**2))
+        return float(np.sqrt(np.sum(last_spectrum**2) / energy)) if energy else nan
+
+    limits = f"above {shortest:g} s" if longest == inf else f"of {shortest:g} to {longest:g} s"
+    ratio.__doc__ = (
+        f"Amplification of waves with periods {limits} from the recorded to the last vehicle; NaN elsewhere."
+    )
+    return ratio
+
+
+def _spectrum(speeds: Floats) -> Floats:
+    """Return the amplitudes of the oscillations of a speed, without its trend, which a Hann window needs."""
+    steps = np.arange(len(speeds))
+    trend = np.polynomial.Polynomial.fit(steps, speeds, 1)(steps)
+    return np.abs(np.fft.rfft((speeds - trend) * np.hanning(len(speeds))))
