@@ -255,6 +255,13 @@ def test_scenarios_and_drivers_are_listed(unjam: Run) -> None:
     drivers = document(unjam("drivers", "--json"))
     assert set(drivers) >= {"human", "idm", "pi", "follower-stopper", "constant"}
     assert all(row["description"] for driver in drivers.values() for row in driver["parameters"])
+    assert document(unjam("drivers", "pi", "--json")) == {"pi": drivers["pi"]}
+    described = unjam("drivers", "unjam:ring-best").stdout
+    assert "pi-from-gap:window=" in described
+    assert "Source: Stern et al. 2018" in unjam("drivers", "pi").stdout
+    refused = unjam("drivers", "nonesuch")
+    assert refused.returncode == 2
+    assert "'nonesuch' is not allowed; allowed: human" in refused.stderr
 
 
 @pytest.mark.parametrize("name", ["ring", "figure-eight", "merge"])

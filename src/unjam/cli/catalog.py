@@ -17,7 +17,7 @@ from unjam.controller import PACKAGED_PREFIX, packaged_file, packaged_names
 from unjam.controller.file import read_controller
 from unjam.drivers.observation import FEATURES
 from unjam.drivers.registry import DRIVERS
-from unjam.errors import InputError
+from unjam.errors import InputError, unknown_name
 from unjam.files import atomic_write, check_parent_folder
 from unjam.measures.gain import MEAN_GAIN
 from unjam.road_family import FAMILY_PREFIX, FAMILY_SCENARIOS
@@ -109,42 +109,57 @@ def _common_facts(scenario: Any) -> list[tuple[str, str]]:
     ]
 
 
-def drivers_command(json: JsonOption = False) -> None:
-    """List the drivers and their parameters, which `--driver name:parameter=value` sets.
+def drivers_command(
+    name: Annotated[str | None, Argument(help="Driver to describe, with its parameters.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """List the drivers, or describe one with its parameters, which `--driver name:parameter=value` sets.
 
-    Example:
+    Examples:
 
     - unjam drivers
+    - unjam drivers pi
     """
-    entries: dict[str, dict[str, Any]] = {
-        name: {"description": (kind.__doc__ or "").strip().splitlines()[0], "parameters": parameter_entries(kind())}
-        for name, kind in DRIVERS.items()
-    }
-    for name in packaged_names():
-        entries[f"{PACKAGED_PREFIX}{name}"] = {"description": _packaged_summary(name), "parameters": []}
+    descriptions = {key: inspect.getdoc(kind) or "" for key, kind in DRIVERS.items()}
+    descriptions |= {f"{PACKAGED_PREFIX}{key}": _packaged_summary(key, name is None) for key in packaged_names()}
+    if name is not None and name not in descriptions:
+        raise unknown_name("driver", name, descriptions)
+    names = descriptions if name is None else [name]
+    parameters = {key: parameter_entries(DRIVERS[key]()) if key in DRIVERS else [] for key in names}
     if json:
+        entries = {
+            key: {"description": descriptions[key].partition("\n")[0], "parameters": parameters[key]} for key in names
+        }
         print_json(entries)
-        return
-    for name, entry in entries.items():
-        console.print(f"[bold]{name}[/bold]  {entry['description']}", markup=True)
-        if rows := [row for row in entry["parameters"] if row["name"] != "time_step"]:
-            console.print(_parameter_table(rows, "parameter"))
-        if name in DRIVERS:
-            console.print()
-    console.print("\nYour own: --driver path.py:name, a function or a class; check it with unjam.check_driver.")
+    elif name is None:
+        table = new_table(("driver", "description"))
+        for key, text in descriptions.items():
+            table.add_row(key, text.partition("\n")[0])
+        console.print(table)
+        console.print("Parameters: unjam drivers NAME. Your own driver: --driver path.py:name, a function or a class.")
+    else:
+        console.print(f"[bold]{name}[/bold]", markup=True)
+        console.print(descriptions[name])
+        if rows := [row for row in parameters[name] if row["name"] != "time_step"]:
+            console.print(_parameter_table(rows, f"parameter (--driver {name}:parameter=value)"))
 
 
-def _packaged_summary(name: str) -> str:
-    """Return a description of a packaged controller and its measured performance, from its manifest."""
+def _packaged_summary(name: str, is_brief: bool) -> str:
+    """Return a description of a packaged controller and its measured performance, from its manifest.
+
+    A brief one is without the parameters of its expert.
+    """
     manifest = read_controller(packaged_file(name)).manifest
+    described = manifest.get("expert", "")
+    expert = described.partition(":")[0] if is_brief else described
     if tuning := manifest.get("tuning"):
         best, default = (f"{tuning[key]['score']:.4g}" for key in ("best", "default"))
         score = tuning["reward"] if tuning["reward"] == MEAN_GAIN else "return"
-        return f"{manifest['expert']}, tuned: {score} {best} on tuning seeds, default parameters {default}"
+        return f"{expert}, tuned: {score} {best} on tuning seeds, default parameters {default}"
     if summary := manifest.get("summary"):
         return summary
-    expert, metrics, scenario = manifest["expert"], manifest["metrics"], manifest["run"]["scenario"]
-    speed, expert_speed = (metrics[label]["mean_speed"]["mean"] for label in ("trained", expert))
+    metrics, scenario = manifest["metrics"], manifest["run"]["scenario"]
+    speed, expert_speed = (metrics[label]["mean_speed"]["mean"] for label in ("trained", described))
     return (
         f"{expert} + residual, trained on {scenario}: mean speed {speed:.2f} m/s on "
         f"{metrics['trained']['episodes']} test seeds, expert {expert_speed:.2f} m/s"
