@@ -61,9 +61,16 @@ def test_an_environment_of_a_road_has_one_cav(name: str, vehicles: int) -> None:
         environment.close()
 
 
-def test_an_unknown_road_of_the_family_has_a_hint() -> None:
-    with pytest.raises(InputError, match=r"'family/ring-22-grwn' is not allowed.*did you mean 'family/ring-22-grown'"):
-        make_scenario("family/ring-22-grwn")
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        *((name, "family/ring-22-grown") for name in ("family/ring-22-grwn", "ring-22-grown", "ring-22-grwn")),
+        *(("figure-eight-15", "family/figure-eight-14"), ("ring-jamed", "ring-jammed"), ("family/ring", "ring")),
+    ],
+)
+def test_an_unknown_road_has_a_hint_with_its_full_name(name: str, hint: str) -> None:
+    with pytest.raises(InputError, match=f"'{name}' is not allowed.*; did you mean '{hint}'"):
+        make_scenario(name)
 
 
 def test_test_seeds_are_public_and_reserved() -> None:
