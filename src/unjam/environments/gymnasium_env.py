@@ -19,7 +19,7 @@ from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features,
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
 from unjam.environments.threads import CopyableLock, synchronized
-from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
+from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, one_line, unknown_name
 from unjam.measures.step_metrics import StepMetricMeans
 from unjam.parameters import check_integer, merge_changes, nest_keys
 from unjam.physics.arrays import clip
@@ -47,9 +47,9 @@ Observations = NDArray[np.float32]
 
 def as_action(action: Any, name: str) -> float:
     """Return the action of one CAV as a number [m/s2]; raise `InputError` unless it is a single finite one."""
-    values = as_numbers(action, f"step: {name}")
+    values = as_numbers(action, f"step: {name}", allowed := "one finite number")
     if values.size != 1 or not isfinite(number := values.item()):
-        raise InputError(f"step: {name}: {action!r:.60} is not allowed; allowed: one finite number")
+        raise InputError(f"step: {name}: {one_line(repr(action), 60)} is not allowed; allowed: {allowed}")
     return number
 
 

@@ -333,17 +333,16 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         return self._kind.to_single(self._running_episodes.observations)
 
     def _as_actions(self, actions: Any) -> Array:
-        if self._is_numpy:
-            actions = as_numbers(actions, "step: actions")
         shape = self._actions_shape
-        if np.shape(actions) not in (shape, shape[:-1]):
-            raise InputError(f"step: actions of shape {np.shape(actions)} are not allowed; allowed: {shape}")
-        found = self._without_ignored(self._kind.to_array(actions).reshape(shape[:-1]))
-        if self._is_numpy and not np.isfinite(found).all():
-            index = tuple(np.argwhere(~np.isfinite(found))[0])
-            raise InputError(
-                f"step: actions: {found[index]} of environment {index[0]} is not allowed; allowed: finite numbers"
-            )
+        allowed = f"finite numbers of shape {shape}"
+        found = as_numbers(actions, "step: actions", allowed, self._kind.to_array)
+        if tuple(found.shape) not in (shape, shape[:-1]):
+            raise InputError(f"step: actions of shape {tuple(found.shape)} are not allowed; allowed: {shape}")
+        found = self._without_ignored(found.reshape(shape[:-1]))
+        if not bool((is_finite := namespace(found).isfinite(found)).all()):
+            index = tuple(np.argwhere(as_numpy(is_finite) == 0.0)[0])
+            reason = f"{float(found[index])} of environment {index[0]} is not allowed"
+            raise InputError(f"step: actions: {reason}; allowed: {allowed}")
         return found
 
     def _without_ignored(self, actions: Array) -> Array:
