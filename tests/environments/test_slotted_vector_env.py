@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import unjam
@@ -254,6 +255,17 @@ def test_actions_are_needed_only_in_occupied_slots() -> None:
         environment.step(np.full((2, 2, 1), np.nan))
     with pytest.raises(InputError, match=re.escape("shape (2, 1) are not allowed; allowed: (2, 2, 1)")):
         environment.step(np.zeros((2, 1)))
+
+
+@pytest.mark.parametrize("arguments", [{}, {"device": "cpu"}, {"scenario": "figure-eight"}, ROAD | {"slots": 2}])
+def test_closed_environments_are_refused_until_new_ones_are_made(arguments: dict[str, Any]) -> None:
+    environment = make_vector_env(2, **arguments)
+    environment.reset(seed=1)
+    environment.close()
+    environment.close()
+    for call in (lambda: environment.step(np.zeros(environment.action_space.shape or ())), environment.reset):
+        with pytest.raises(ClosedEnvironmentError, match=r"are closed; allowed: new ones, of gymnasium\.make_vec"):
+            call()
 
 
 def test_an_episode_without_cavs_is_refused() -> None:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -211,6 +212,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode in each environment, or in those of `options["reset_mask"]`, booleans of shape (W,)."""
+        self._check_open()
         rows, seeds = self._rows_to_reset({} if options is None else options), self._seeds_of_environments(seed)
         warn_of_reserved_seed(*seeds)
         for row in rows:
@@ -292,8 +294,17 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         for name, total in self._totals.items():
             self._totals[name] = replace_entries(total, rows, self._zeros, rows)
 
+    def _check_open(self) -> None:
+        if self.closed:
+            raise ClosedEnvironmentError("the environments are closed; allowed: new ones, of gymnasium.make_vec")
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Release the episodes; `step` and `reset` then raise `ClosedEnvironmentError`."""
+        self._episodes, self._prepared = None, {}
+
     @property
     def _running_episodes(self) -> Episodes:
+        self._check_open()
         if self._episodes is None:
             raise UnjamError("no episode is running: call reset first")
         return self._episodes
