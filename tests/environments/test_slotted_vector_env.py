@@ -268,9 +268,12 @@ def test_closed_environments_are_refused_until_new_ones_are_made(arguments: dict
             call()
 
 
-def test_an_episode_without_cavs_is_refused() -> None:
-    with pytest.raises(EpisodeError, match="no CAV enters the road before the episode ends"):
-        SlottedRoadVectorEnv(2, penetration_rate=0.0, horizon=5).reset(seed=1)
+def test_an_episode_without_cavs_is_refused_with_its_environment() -> None:
+    environment = SlottedRoadVectorEnv(3, 2, **ROAD | {"penetration_rate": 0.1, "horizon": 10})
+    reason = "motorway of seed 4: no CAV enters the road before the episode ends; allowed: a horizon of more than 10"
+    with pytest.raises(EpisodeError, match=f"^reset: environment 2: {reason}"):
+        environment.reset(seed=[3, 7, 4])
+    environment.reset(seed=[3, 7, 3])
 
 
 @pytest.mark.parametrize(

@@ -58,10 +58,10 @@ def episode_seed(seed: int, episode_count: int) -> tuple[int, ...]:
     return (seed, episode_count) if episode_count else (seed,)
 
 
-def no_cav_error(scenario: Scenario) -> EpisodeError:
-    """Return the error for an episode without a control step that a driver could decide."""
+def no_cav_error(scenario: Scenario, episode: str = "") -> EpisodeError:
+    """Return the error for an episode without a control step that a driver could decide; `episode` says which one."""
     allowed = f"a horizon of more than {scenario.horizon} control steps, or more CAVs"
-    return EpisodeError(f"reset: no CAV enters the road before the episode ends; allowed: {allowed}")
+    return EpisodeError(f"reset: {episode}no CAV enters the road before the episode ends; allowed: {allowed}")
 
 
 def check_single_cav(scenario: Scenario) -> None:
