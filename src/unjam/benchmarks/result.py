@@ -113,14 +113,18 @@ class BenchmarkResult:
         return {name: each.mean for name, (each, *_) in self._gains.items()}
 
     def road_rows(self) -> list[dict[str, Any]]:
-        """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend; then the means."""
+        """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend.
+
+        If all roads are finished, the means follow.
+        """
         rows: list[dict[str, Any]] = [
             {"road": name, "part": FAMILY[name].part, **_interval(each), "feasible": verdict}
             | {"backend": self.roads[name].backend, "expert": references()[name]["expert"]}
             for name, (each, _, verdict) in self._gains.items()
         ]
         empty = {"part": "", "feasible": "", "backend": "", "expert": ""}
-        return rows + [{**empty, "road": f"mean, {part}", **_interval(self.mean_gain(part))} for part in PARTS]
+        parts = () if self.missing_roads else PARTS
+        return rows + [{**empty, "road": f"mean, {part}", **_interval(self.mean_gain(part))} for part in parts]
 
     def table(self) -> "pd.DataFrame":
         """Return `road_rows` as a table."""
