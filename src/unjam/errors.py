@@ -146,7 +146,8 @@ def as_unjam_error(error: Exception) -> UnjamError:
 
 def invalid_value(field: str, value: object, allowed: str) -> InputError:
     """Return the error for an invalid value, in the form that all of unjam uses."""
-    return InputError(f"{field}: {value!r} is not allowed; allowed: {allowed}")
+    shown = " ".join(repr(value).splitlines())  # arrays have several lines
+    return InputError(f"{field}: {shown} is not allowed; allowed: {allowed}")
 
 
 def unknown_name(field: str, value: object, names: Iterable[str]) -> InputError:

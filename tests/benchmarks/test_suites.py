@@ -1,6 +1,8 @@
 """Suites: fixed roads, references from the study, and the roads as scenarios and environments."""
 
+import re
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,6 +15,7 @@ from unjam.errors import InputError
 from unjam.measures.gain import MIN_REFERENCE_GAIN, performance
 from unjam.road_family import FAMILY
 from unjam.scenarios import make_scenario
+from unjam.seeds import selection_seeds, tuning_seeds
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.all_roads import suite_references
 
@@ -38,9 +41,12 @@ def test_the_best_expert_gains_on_each_road_of_the_smaller_suites(name: str) -> 
         assert make_scenario(f"family/{road}").is_closed == (name == "closed-roads-v1")
 
 
-def test_an_unknown_suite_is_refused_with_the_names() -> None:
-    with pytest.raises(InputError, match="suite: 'all-roads' is not allowed; allowed: all-roads-v1, closed"):
-        find_suite("all-roads")
+@pytest.mark.parametrize("name", ["all-roads", ["all-roads-v1"], 5])
+def test_an_unknown_suite_is_refused_with_the_names(name: Any) -> None:
+    with pytest.raises(
+        InputError, match=f"suite: {re.escape(repr(name))} is not allowed; allowed: all-roads-v1, closed"
+    ):
+        find_suite(name)
 
 
 @pytest.mark.parametrize("name", FAMILY)
@@ -79,6 +85,10 @@ def test_test_seeds_are_public_and_reserved() -> None:
     with pytest.warns(UserWarning, match="seed=1000039 is reserved for tests"):
         environment.reset(seed=unjam.held_out_seeds(1)[0][0])
     environment.close()
+    for seeds in (unjam.held_out_seeds, selection_seeds, tuning_seeds):
+        for wrong in ({"count": "x"}, {"count": -1}, {"count": 2, "first": None}):
+            with pytest.raises(InputError, match=f"^{list(wrong)[-1]}: .* is not allowed; allowed: an integer >= 0"):
+                seeds(**wrong)
     with pytest.raises(InputError, match="seed"):
         unjam.load_config(changes={"seed": unjam.held_out_seeds(1)[0][0]})
 

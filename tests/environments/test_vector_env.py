@@ -353,6 +353,8 @@ def test_other_wrong_uses_are_refused() -> None:
         MissingPartError, match="device: 'nonesuch' is not available to torch; allowed: 'cpu', or '' for NumPy"
     ):
         RoadVectorEnv(2, device="nonesuch")
+    with pytest.raises(MissingPartError, match=r"device: 1\.5 is not available to torch"):
+        RoadVectorEnv(2, device=1.5)  # pyright: ignore[reportArgumentType]
     made = RoadVectorEnv(2, reward=lambda outcome: {"mine": outcome.speeds.mean(-1) / 0.0 * np.array([1.0, 0.0])})
     made.reset(seed=0)
     numpy_feature = RoadVectorEnv(2, device="cpu", features=("local", lambda state: state.speed))

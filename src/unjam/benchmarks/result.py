@@ -12,7 +12,7 @@ from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr
 from unjam.benchmarks.episodes import FAMILY_METRICS, FAMILY_TEST_SEEDS
 from unjam.benchmarks.suites import Suite, find_suite, references
 from unjam.controller.manifest import first_difference, short_text
-from unjam.errors import InputError, invalid_value, naming
+from unjam.errors import InputError, invalid_value, naming, unknown_name
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, parse_json, to_json
 from unjam.measures import gain
 from unjam.measures.feasibility import FEASIBLE, overall_feasibility
@@ -93,8 +93,10 @@ class BenchmarkResult:
     def mean_gain(self, part: str = "all roads") -> Estimate:
         """Return the mean gain over the finished roads of one of `PARTS`, with its 95 % CI over roads and seeds.
 
-        Roads and seeds are crossed random effects (`estimate_crossed`).
+        Roads and seeds are crossed random effects (`estimate_crossed`). Raise `InputError` for an unknown part.
         """
+        if not isinstance(part, str) or part not in PARTS:
+            raise unknown_name("part", part, PARTS)
         own = [seeds for name, (_, seeds, _) in self._gains.items() if FAMILY[name].part in PARTS[part]]
         return estimate_crossed(own, allows_bimodal=True)
 

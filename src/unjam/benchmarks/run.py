@@ -84,6 +84,10 @@ def benchmark(
     for name, number, *limits in (("workers", workers, 1), ("training_steps", training_steps, 0, MAX_TRAINING_STEPS)):
         if number is not None:
             check_integer(name, number, *limits)
+    if not (out is None or (isinstance(out, str | os.PathLike) and Path(out).name)):
+        raise invalid_value("out", out, "the path of a file")
+    if not callable(progress):
+        raise invalid_value("progress", progress, "a function of a line of text")
     drivers, reasons = _make_drivers(driver, scenarios)
     if backend != EXACT_BACKEND:
         with open_backend(backend) as simulator:

@@ -160,12 +160,13 @@ class RoadStepper:
         `options` are changes to the parameters of the scenario, in addition to those of the constructor, for this
         episode alone.
         """
+        seed = None if seed is None else check_integer("seed", seed, 0)
         warn_of_reserved_seed(seed)
         if self._opened is None:
             self._opened = self._backend_context.enter_context(open_backend(self._backend))
-        scenario = self._with_options(options, self._opened) if options else self.scenario
+        scenario = self.scenario if options is None else self._with_options(options, self._opened)
         if seed is not None:
-            self._seed, self._episode_count = check_integer("seed", seed, 0), 0
+            self._seed, self._episode_count = seed, 0
         if self._seed is None:
             self._seed = int(generator.integers(2**31))
         numbers = episode_seed(self._seed, self._episode_count)

@@ -204,7 +204,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
     def _make_array_kind(self, seed: Sequence[int]) -> _ArrayKind:
         try:
             return self._make_kind(self._exact, seed)
-        except (RuntimeError, AssertionError):  # of torch
+        except (RuntimeError, AssertionError, TypeError):  # of torch
             message = f"device: {self.device!r} is not available to torch; allowed: 'cpu', or '' for NumPy"
             raise MissingPartError(message) from None
 
