@@ -86,7 +86,8 @@ def test_test_seeds_are_public_and_reserved() -> None:
         environment.reset(seed=unjam.held_out_seeds(1)[0][0])
     environment.close()
     for seeds in (unjam.held_out_seeds, selection_seeds, tuning_seeds):
-        for wrong in ({"count": "x"}, {"count": -1}, {"count": 2, "first": None}):
+        cases: list[dict[str, Any]] = [{"count": "x"}, {"count": -1}, {"count": 2, "first": None}]
+        for wrong in cases:
             with pytest.raises(InputError, match=f"^{list(wrong)[-1]}: .* is not allowed; allowed: an integer >= 0"):
                 seeds(**wrong)
     with pytest.raises(InputError, match="seed"):

@@ -295,6 +295,12 @@ def test_wrong_arguments_get_one_clear_line(arguments: Any, words: str) -> None:
         RoadEnv(**arguments)
 
 
+def test_an_expert_without_memory_features_is_noted() -> None:
+    with pytest.warns(UserWarning, match=r"features: 'expert_memory' adds no numbers: the expert idm.* has no memory"):
+        made = RoadEnv(expert="idm", features=("local", "expert_memory"))
+    assert made.observation_space.shape == (5,)
+
+
 def test_gymnasium_knows_the_environments_after_importing_unjam() -> None:
     code = (
         "import unjam, gymnasium; "

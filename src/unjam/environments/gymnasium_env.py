@@ -1,5 +1,6 @@
 """A scenario with external actions, and with one CAV as a Gymnasium environment."""
 
+import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import copy
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from unjam.controller import make_expert
 from unjam.drivers.car_following import Constant
 from unjam.drivers.command import as_numbers
-from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features, observation_size
+from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features, memory_size, observation_size
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
 from unjam.environments.threads import CopyableLock, synchronized
@@ -116,6 +117,9 @@ class RoadStepper:
         inputs = as_features(features)
         if not expert and (useless := [name for name in ("expert_acceleration", "expert_memory") if name in inputs]):
             raise InputError(f"features: {useless[0]!r} is not allowed; allowed: with an expert, like 'pi'")
+        if "expert_memory" in inputs and not memory_size(driver):  # no error: exported policies may name it
+            text = f"features: 'expert_memory' adds no numbers: the expert {driver.describe()} has no memory features"
+            warnings.warn(text, stacklevel=3)
         self._driver = ExternalDriver(driver, inputs, self.scenario.acceleration_limits)
         self._backend = backend
         with open_backend(backend) as opened:
