@@ -116,8 +116,9 @@ def test_code_of_users_drives_one_road_at_a_time(suite: str, tmp_path: Path, mon
 
 @pytest.mark.long
 def test_a_result_of_a_model_file_continues_only_with_the_same_file(suite: str, tmp_path: Path) -> None:
-    file = save(PPO("MlpPolicy", Space(), seed=0, device="cpu"), tmp_path)
-    first = unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1)
+    file, lines = save(PPO("MlpPolicy", Space(), seed=0, device="cpu"), tmp_path), list[str]()
+    first = unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1, progress=lines.append)
+    assert "does not contain its control step: here it acts every 0.1 s" in lines[0]
     assert first.sha256 == sha256_of_file(file)
     assert unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1) == first
     save(PPO("MlpPolicy", Space(), seed=1, device="cpu"), tmp_path)

@@ -20,6 +20,7 @@ from unjam.benchmarks.result import (
 )
 from unjam.benchmarks.suites import DEFAULT_SUITE, Suite, find_suite
 from unjam.controller import DEFAULT_DRIVER, controller_hash, controller_path, make_driver
+from unjam.controller.domain import SB3_SUFFIX, control_step_note
 from unjam.controller.file import read_controller, sha256_of, sha256_of_file
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable, user_code_recipes
@@ -93,6 +94,8 @@ def benchmark(
         with open_backend(backend) as simulator:
             check_support(simulator, *scenarios.values())
     label, first = driver if isinstance(driver, str) else "", next(iter(drivers.values()))
+    if label.endswith(SB3_SUFFIX):
+        progress(control_step_note(label, (road.control_step for road in scenarios.values())))
     origin = manifest()
     result = BenchmarkResult(
         suite=suite,
