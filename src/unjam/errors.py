@@ -119,8 +119,12 @@ def error_from_name(name: str, message: str) -> UnjamError:
 
 
 def one_line(value: object, length: int = 200) -> str:
-    """Return a text of a stranger on one line of at most `length` letters, without control characters."""
-    return printable(" ".join(str(value).split()))[:length]
+    """Return a text of a stranger on one line of at most `length` letters, the last one `…` if more were cut.
+
+    It has no control characters.
+    """
+    text = printable(" ".join(str(value).split()))
+    return text if len(text) <= length else f"{text[: length - 1]}…"
 
 
 def printable(text: str) -> str:
