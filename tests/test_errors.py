@@ -1,9 +1,10 @@
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 
 from unjam.drivers.registry import driver_from_name
-from unjam.errors import InputError
+from unjam.errors import InputError, invalid_value, one_line
 from unjam.scenarios import make_scenario
 from unjam.training.config import load_config
 from unjam.worlds.reward import make_reward
@@ -33,3 +34,11 @@ def test_nothing_is_suggested_without_a_similar_name() -> None:
     with pytest.raises(InputError) as caught:
         make_scenario("xyz")
     assert "did you mean" not in str(caught.value)
+
+
+def test_a_value_of_several_lines_is_shown_on_one() -> None:
+    assert str(invalid_value("x", np.eye(2), "1")) == "x: array([[1., 0.],        [0., 1.]]) is not allowed; allowed: 1"
+
+
+def test_a_long_text_is_cut_visibly() -> None:
+    assert [one_line(f" a\n{'b' * count}", 6) for count in (4, 5)] == ["a bbbb", "a bbb…"]

@@ -119,8 +119,12 @@ def error_from_name(name: str, message: str) -> UnjamError:
 
 
 def one_line(value: object, length: int = 200) -> str:
-    """Return a text of a stranger on one line of at most `length` letters, without control characters."""
-    return printable(" ".join(str(value).split()))[:length]
+    """Return a text of a stranger on one line of at most `length` letters, the last one `…` if more were cut.
+
+    It has no control characters.
+    """
+    text = printable(" ".join(str(value).split()))
+    return text if len(text) <= length else f"{text[: length - 1]}…"
 
 
 def printable(text: str) -> str:
@@ -146,7 +150,8 @@ def as_unjam_error(error: Exception) -> UnjamError:
 
 def invalid_value(field: str, value: object, allowed: str) -> InputError:
     """Return the error for an invalid value, in the form that all of unjam uses."""
-    return InputError(f"{field}: {value!r} is not allowed; allowed: {allowed}")
+    shown = " ".join(repr(value).splitlines())  # arrays have several lines
+    return InputError(f"{field}: {shown} is not allowed; allowed: {allowed}")
 
 
 def unknown_name(field: str, value: object, names: Iterable[str]) -> InputError:

@@ -6,6 +6,8 @@ seeds of the other families begin with their own number.
 
 import warnings
 
+from unjam.parameters import check_integer
+
 TRAINING_SEED_LIMIT = 1_000_000
 """seeds of trainings, and of `unjam drive --seed`, are smaller"""
 TEST_SEED = 1_000_039
@@ -32,14 +34,19 @@ def held_out_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
 
     The roads of `unjam benchmark` have the first ten.
     """
-    return [(TEST_SEED, index) for index in range(first, first + count)]
+    return _numbered_seeds(TEST_SEED, count, first)
 
 
 def selection_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
     """Return selection seeds, from number `first` on."""
-    return [(SELECTION_SEED, index) for index in range(first, first + count)]
+    return _numbered_seeds(SELECTION_SEED, count, first)
 
 
 def tuning_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
     """Return tuning seeds, from number `first` on."""
-    return [(TUNING_SEED, index) for index in range(first, first + count)]
+    return _numbered_seeds(TUNING_SEED, count, first)
+
+
+def _numbered_seeds(family: int, count: int, first: int) -> list[tuple[int, ...]]:
+    count, first = check_integer("count", count, 0), check_integer("first", first, 0)
+    return [(family, index) for index in range(first, first + count)]

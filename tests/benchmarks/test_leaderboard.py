@@ -49,6 +49,8 @@ def test_stored_results_are_ranked_by_their_mean_gain() -> None:
 def test_gains_follow_from_the_rows_and_the_references() -> None:
     result = read_result(PI)
     assert result.gains()["ring-66-growing-2-cavs"] == pytest.approx(1.0, abs=1e-6), "PI is the best expert there"
+    with pytest.raises(InputError, match=r"part: 'unsen' is not allowed; allowed: all roads, .* mean 'unseen'"):
+        result.mean_gain("unsen")
     name, worst = result.worst_road
     assert worst == min(result.gains().values()) == result.gains()[name]
 

@@ -8,12 +8,15 @@ from typing import Any
 
 import pytest
 from stable_baselines3 import PPO
+from typer.testing import CliRunner
 
 import unjam
 from tests.adapters.test_stable_baselines3 import Space
 from tests.adapters.test_stable_baselines3_file import save
-from unjam.benchmarks.result import read_result
+from unjam.benchmarks.leaderboard import read_leaderboard
+from unjam.benchmarks.result import RoadRecord, read_result
 from unjam.benchmarks.suites import SUITES, Suite
+from unjam.cli import app
 from unjam.controller.file import sha256_of_file
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario
@@ -69,6 +72,29 @@ def test_a_second_call_drives_only_the_missing_roads(
     assert unjam.benchmark("pi", suite, file) == result
 
 
+def test_a_trial_on_some_roads_cannot_be_compared_and_can_be_continued(suite: str, tmp_path: Path) -> None:
+    file, runner = tmp_path / "a.json", CliRunner()
+    command = ["benchmark", "pi", "--suite", suite, "--roads", f"family/{ROADS[0]}", "--workers", "1"]
+    ran = runner.invoke(app, [*command, "--out", str(file)])
+    assert ran.exit_code == 0, ran.output
+    assert ROADS[0] in ran.stdout
+    assert "mean, all roads" not in ran.stdout
+    assert "trial: 1 of 2 roads of short; the same command without --roads drives all" in ran.stderr
+    with pytest.raises(InputError, match=r"a\.json: roads: 1 are missing \(figure-eight-14, \.\.\.\)"):
+        read_leaderboard([file])
+    printed = json.loads(runner.invoke(app, [*command, "--json"]).stdout)
+    assert [row["road"] for row in printed["gains"]] == list(printed["roads"]) == [ROADS[0]]
+    assert printed["missing_roads"] == [ROADS[1]]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+    content = json.loads(file.read_text())
+    content["manifest"]["command"] = command
+    file.write_text(json.dumps(content))
+    result = unjam.benchmark("pi", suite, file, workers=1)
+    assert list(result.roads) == list(ROADS)
+    assert "--roads" not in result.manifest["command"]
+    assert result.roads[ROADS[0]] == RoadRecord(**printed["roads"][ROADS[0]])
+
+
 @pytest.mark.long
 def test_code_of_users_drives_one_road_at_a_time(suite: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -90,8 +116,9 @@ def test_code_of_users_drives_one_road_at_a_time(suite: str, tmp_path: Path, mon
 
 @pytest.mark.long
 def test_a_result_of_a_model_file_continues_only_with_the_same_file(suite: str, tmp_path: Path) -> None:
-    file = save(PPO("MlpPolicy", Space(), seed=0, device="cpu"), tmp_path)
-    first = unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1)
+    file, lines = save(PPO("MlpPolicy", Space(), seed=0, device="cpu"), tmp_path), list[str]()
+    first = unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1, progress=lines.append)
+    assert "does not contain its control step: here it acts every 0.1 s" in lines[0]
     assert first.sha256 == sha256_of_file(file)
     assert unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1) == first
     save(PPO("MlpPolicy", Space(), seed=1, device="cpu"), tmp_path)
@@ -113,6 +140,12 @@ def test_a_driver_that_cannot_drive_on_a_road_counts_as_the_human_baseline_there
     [
         ({"driver": "pie"}, "driver: 'pie' is not allowed.*did you mean 'pi'"),
         ({"suite": "short-v2"}, "suite: 'short-v2' is not allowed; allowed: all-roads-v1"),
+        ({"roads": "ring"}, "roads: 'ring' is not allowed; allowed: a list of names of roads of ring"),
+        ({"roads": ["ring-22-grwn"]}, "roads of ring: 'ring-22-grwn' is not allowed; allowed: ring-22-no-warm-up"),
+        ({"roads": ["rnig-22-no-warm-up"]}, "did you mean 'ring-22-no-warm-up'"),
+        *(({"out": out}, f"out: {out!r} is not allowed; allowed: the path of a file") for out in (5, "", b"x")),
+        ({"progress": 5}, "progress: 5 is not allowed; allowed: a function of a line"),
+        ({"suite": {}}, "suite: {} is not allowed; allowed: all-roads-v1"),
         ({"workers": 0}, "workers: 0 is not allowed; allowed: an integer >= 1"),
         ({"workers": "x"}, "workers: 'x' is not allowed; allowed: an integer >= 1"),
         ({"training_steps": 1.5}, "training_steps: 1.5 is not allowed; allowed: an integer from 0 to 9,007"),

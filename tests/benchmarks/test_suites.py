@@ -1,6 +1,8 @@
 """Suites: fixed roads, references from the study, and the roads as scenarios and environments."""
 
+import re
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,6 +15,7 @@ from unjam.errors import InputError
 from unjam.measures.gain import MIN_REFERENCE_GAIN, performance
 from unjam.road_family import FAMILY
 from unjam.scenarios import make_scenario
+from unjam.seeds import selection_seeds, tuning_seeds
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.all_roads import suite_references
 
@@ -38,9 +41,12 @@ def test_the_best_expert_gains_on_each_road_of_the_smaller_suites(name: str) -> 
         assert make_scenario(f"family/{road}").is_closed == (name == "closed-roads-v1")
 
 
-def test_an_unknown_suite_is_refused_with_the_names() -> None:
-    with pytest.raises(InputError, match="suite: 'all-roads' is not allowed; allowed: all-roads-v1, closed"):
-        find_suite("all-roads")
+@pytest.mark.parametrize("name", ["all-roads", ["all-roads-v1"], 5])
+def test_an_unknown_suite_is_refused_with_the_names(name: Any) -> None:
+    with pytest.raises(
+        InputError, match=f"suite: {re.escape(repr(name))} is not allowed; allowed: all-roads-v1, closed"
+    ):
+        find_suite(name)
 
 
 @pytest.mark.parametrize("name", FAMILY)
@@ -61,9 +67,16 @@ def test_an_environment_of_a_road_has_one_cav(name: str, vehicles: int) -> None:
         environment.close()
 
 
-def test_an_unknown_road_of_the_family_has_a_hint() -> None:
-    with pytest.raises(InputError, match=r"'family/ring-22-grwn' is not allowed.*did you mean 'family/ring-22-grown'"):
-        make_scenario("family/ring-22-grwn")
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        *((name, "family/ring-22-grown") for name in ("family/ring-22-grwn", "ring-22-grown", "ring-22-grwn")),
+        *(("figure-eight-15", "family/figure-eight-14"), ("ring-jamed", "ring-jammed"), ("family/ring", "ring")),
+    ],
+)
+def test_an_unknown_road_has_a_hint_with_its_full_name(name: str, hint: str) -> None:
+    with pytest.raises(InputError, match=f"'{name}' is not allowed.*; did you mean '{hint}'"):
+        make_scenario(name)
 
 
 def test_test_seeds_are_public_and_reserved() -> None:
@@ -72,6 +85,11 @@ def test_test_seeds_are_public_and_reserved() -> None:
     with pytest.warns(UserWarning, match="seed=1000039 is reserved for tests"):
         environment.reset(seed=unjam.held_out_seeds(1)[0][0])
     environment.close()
+    for seeds in (unjam.held_out_seeds, selection_seeds, tuning_seeds):
+        cases: list[dict[str, Any]] = [{"count": "x"}, {"count": -1}, {"count": 2, "first": None}]
+        for wrong in cases:
+            with pytest.raises(InputError, match=f"^{list(wrong)[-1]}: .* is not allowed; allowed: an integer >= 0"):
+                seeds(**wrong)
     with pytest.raises(InputError, match="seed"):
         unjam.load_config(changes={"seed": unjam.held_out_seeds(1)[0][0]})
 

@@ -49,5 +49,5 @@ def test_controllers_on_another_road_and_models_without_their_control_step_get_a
     names = ["pi", "human", "unjam:figure-eight-tuned", "unjam:ring-tuned", "ppo.zip"]
     assert controller_notes(road, names, {}) == [
         "unjam:ring-tuned was tuned on the ring, not on the figure-eight",
-        "ppo.zip does not contain its control step: here it acts every 0.1 s",
+        "ppo.zip does not contain its control step: here it acts every 0.1 s, unless policy_driver sets another",
     ]

@@ -295,6 +295,12 @@ def test_wrong_arguments_get_one_clear_line(arguments: Any, words: str) -> None:
         RoadEnv(**arguments)
 
 
+def test_an_expert_without_memory_features_is_noted() -> None:
+    with pytest.warns(UserWarning, match=r"features: 'expert_memory' adds no numbers: the expert idm.* has no memory"):
+        made = RoadEnv(expert="idm", features=("local", "expert_memory"))
+    assert made.observation_space.shape == (5,)
+
+
 def test_gymnasium_knows_the_environments_after_importing_unjam() -> None:
     code = (
         "import unjam, gymnasium; "
@@ -392,6 +398,7 @@ def test_options_of_a_reset_change_the_scenario_for_this_episode() -> None:
         ({"cavs": 2}, "reset: options: cavs: 2 is not allowed; allowed: 1, as in the constructor"),
         ({"action_limit": 3}, "reset: options: action_limit: 3.0 is not allowed; allowed: 1.0, as in the constructor"),
         ([230], "reset: options: [230] is not allowed; allowed: a dict of parameters"),
+        ([], "reset: options: [] is not allowed; allowed: a dict of parameters"),
         (5, "reset: options: 5 is not allowed; allowed: a dict of parameters"),
     ],
 )
@@ -403,7 +410,7 @@ def test_options_that_are_not_parameters_of_this_road_are_refused(options: Any, 
         environment.step(np.zeros(1))  # the episode goes on
 
 
-@pytest.mark.parametrize("seed", ["1", 0.5, -1, True, [1, 2]])
+@pytest.mark.parametrize("seed", ["1", 0.5, -1, True, [1, 2], np.zeros(2)])
 @pytest.mark.parametrize("make", [RoadEnv, unjam.parallel_env])
 def test_seeds_that_are_no_integers_are_refused(make: Callable[..., Any], seed: Any) -> None:
     words = re.escape(f"seed: {seed!r} is not allowed; allowed: an integer >= 0")

@@ -166,9 +166,13 @@ def test_a_collision_terminates_everybody_who_is_there() -> None:
     assert not any(truncated.values())
 
 
-def test_an_agent_whose_action_lacks_is_named() -> None:
+def test_an_agent_whose_action_lacks_or_who_is_unknown_is_named() -> None:
     environment = unjam.parallel_env("ring", **SHORT)
     environment.reset(seed=1)
+    with pytest.raises(InputError, match="step: actions: 5 is not allowed; allowed: a dict with an action for each"):
+        environment.step(5)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="agent: 'cav_1' is not allowed; allowed: cav_0, cav_7, cav_15"):
+        environment.action_space("cav_1")
     with pytest.raises(InputError, match=r"step: no action for cav_7, cav_15; allowed: one for each"):
         environment.step({"cav_0": np.array([0.0])})
     environment.close()

@@ -77,8 +77,10 @@ def test_an_occupied_slot_needs_a_valid_action() -> None:
     environment.reset(seed=0)
     with pytest.raises(InputError, match="step: no action for slot_0; allowed: one for each occupied slot"):
         environment.step({"slot_1": [0.0]})
-    with pytest.raises(InputError, match="step: slot_0 is not numbers: 'x'"):
+    with pytest.raises(InputError, match="step: slot_0 is not numbers: 'x'; allowed: one finite number"):
         environment.step({"slot_0": "x"})
+    with pytest.raises(InputError, match=r"step: slot_0: array\(.*\) is not allowed; allowed: one finite"):
+        environment.step({"slot_0": np.zeros((2, 1))})
     with pytest.raises(InputError, match="step: slot: 'slot_7' is not allowed; allowed: slot_0, slot_1"):
         environment.step({"slot_0": [0.0], "slot_7": [0.0]})
     environment.step({"slot_0": [0.0]})

@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 import unjam
@@ -256,9 +257,23 @@ def test_actions_are_needed_only_in_occupied_slots() -> None:
         environment.step(np.zeros((2, 1)))
 
 
-def test_an_episode_without_cavs_is_refused() -> None:
-    with pytest.raises(EpisodeError, match="no CAV enters the road before the episode ends"):
-        SlottedRoadVectorEnv(2, penetration_rate=0.0, horizon=5).reset(seed=1)
+@pytest.mark.parametrize("arguments", [{}, {"device": "cpu"}, {"scenario": "figure-eight"}, ROAD | {"slots": 2}])
+def test_closed_environments_are_refused_until_new_ones_are_made(arguments: dict[str, Any]) -> None:
+    environment = make_vector_env(2, **arguments)
+    environment.reset(seed=1)
+    environment.close()
+    environment.close()
+    for call in (lambda: environment.step(np.zeros(environment.action_space.shape or ())), environment.reset):
+        with pytest.raises(ClosedEnvironmentError, match=r"are closed; allowed: new ones, of gymnasium\.make_vec"):
+            call()
+
+
+def test_an_episode_without_cavs_is_refused_with_its_environment() -> None:
+    environment = SlottedRoadVectorEnv(3, 2, **ROAD | {"penetration_rate": 0.1, "horizon": 10})
+    reason = "motorway of seed 4: no CAV enters the road before the episode ends; allowed: a horizon of more than 10"
+    with pytest.raises(EpisodeError, match=f"^reset: environment 2: {reason}"):
+        environment.reset(seed=[3, 7, 4])
+    environment.reset(seed=[3, 7, 3])
 
 
 @pytest.mark.parametrize(

@@ -335,9 +335,6 @@ def test_what_a_batch_cannot_do_is_refused_in_one_line(arguments: dict[str, Any]
         (lambda made: made.reset(options={"length": 230}), "options: 'length' is not allowed; allowed: 'reset_mask'"),
         (lambda made: made.reset(options={"reset_mask": [1, 0]}), "options: reset_mask is not 2 booleans"),
         (lambda made: made.reset(options={"reset_mask": np.zeros(2, bool)}), "options: reset_mask is not 2 booleans"),
-        (lambda made: made.step(np.zeros(3)), "step: actions of shape (3,) are not allowed; allowed: (2, 1)"),
-        (lambda made: made.step(np.full((2, 1), np.nan)), "finite"),
-        (lambda made: made.step([["a"], ["b"]]), "step: actions is not numbers"),
     ],
 )
 def test_wrong_calls_are_refused_in_one_line(call: Callable[[Any], Any], words: str) -> None:
@@ -356,6 +353,8 @@ def test_other_wrong_uses_are_refused() -> None:
         MissingPartError, match="device: 'nonesuch' is not available to torch; allowed: 'cpu', or '' for NumPy"
     ):
         RoadVectorEnv(2, device="nonesuch")
+    with pytest.raises(MissingPartError, match=r"device: 1\.5 is not available to torch"):
+        RoadVectorEnv(2, device=1.5)  # pyright: ignore[reportArgumentType]
     made = RoadVectorEnv(2, reward=lambda outcome: {"mine": outcome.speeds.mean(-1) / 0.0 * np.array([1.0, 0.0])})
     made.reset(seed=0)
     numpy_feature = RoadVectorEnv(2, device="cpu", features=("local", lambda state: state.speed))
@@ -409,11 +408,19 @@ def test_reserved_seeds_of_any_environment_are_warned_of() -> None:
         RoadVectorEnv(2, horizon=5).reset(seed=999_999)
 
 
-def test_infinite_actions_are_refused_except_where_they_are_ignored() -> None:
-    made = RoadVectorEnv(2, horizon=5)
+@pytest.mark.parametrize("device", ["", "cpu"])
+def test_wrong_actions_are_refused_in_one_line_except_where_they_are_ignored(device: str) -> None:
+    made, zeros = RoadVectorEnv(2, horizon=5, device=device), np.zeros((2, 1))
     made.reset(seed=1)
-    with pytest.raises(InputError, match="inf of environment 1 is not allowed"):
-        made.step(np.array([[0.0], [np.inf]]))
-    ends = [made.step(np.zeros((2, 1)))[3].all() for _ in range(5)]
+    cases = {
+        "actions: inf of environment 1 is not allowed; allowed: finite numbers of shape (2, 1)": [[0.0], [np.inf]],
+        "actions of shape (3,) are not allowed; allowed: (2, 1)": np.zeros(3),
+        "actions is not numbers: array([['a'], ['b']], dtype='<U1'); allowed: finite": np.array([["a"], ["b"]]),
+        "actions is not numbers: [[0.0], [0.0, 0.0]]; allowed: finite numbers of shape (2, 1)": [[0.0], [0.0, 0.0]],
+    }
+    for words, actions in cases.items():
+        with pytest.raises(InputError, match=f"^step: {re.escape(words)}"):
+            made.step(actions)
+    ends = [made.step(zeros)[3].all() for _ in range(5)]
     assert ends[-1]
     made.step(np.full((2, 1), np.nan))

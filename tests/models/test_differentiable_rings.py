@@ -1,5 +1,6 @@
 """Gradients through rings: finite differences, one-sided ones at kinks, truncation, and the same episodes as others."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -252,10 +253,10 @@ def test_what_is_not_supported_is_refused_in_one_line(arguments: Any, reason: st
     ("change", "reason"),
     [
         (lambda speeds, positions: (speeds[:, 0], positions), r"speeds: shape: \(6,\) is not allowed; allowed: \(6"),
-        (lambda speeds, positions: (speeds / 0.0, positions), "speeds: nan is not allowed; allowed: finite numbers"),
+        (lambda speeds, positions: (speeds / 0.0, positions), "speeds: nan of ring 0 is not allowed; allowed: finite"),
         (lambda speeds, positions: (speeds, positions / 0.0), "positions: .* is not allowed; allowed: finite numbers"),
         (lambda speeds, positions: (speeds - 1.0, positions), "speeds: -1.0 is not allowed; allowed: >= 0"),
-        (lambda speeds, positions: ("fast", positions), "speeds: 'str' is not allowed; allowed: a tensor"),
+        (lambda speeds, positions: ("fast", positions), "speeds is not numbers: 'fast'; allowed: finite numbers"),
         (
             lambda speeds, positions: (speeds, torch.stack([positions[:, 0], positions[:, 1].flip(0)], 1)),
             "positions: those of ring 1 are not in order; allowed: each vehicle behind the next",
@@ -268,6 +269,21 @@ def test_a_state_that_no_ring_has_is_refused(change: Callable[..., Any], reason:
         rings.set_state(*change(rings.speeds, rings.positions))
     rings.set_state(rings.speeds.numpy() + 1.0, rings.positions.float())  # pyright: ignore[reportArgumentType]
     assert rings.speeds.tolist() == [[1.0, 1.0]] * 6
+
+
+@pytest.mark.parametrize(
+    ("accelerations", "reason"),
+    [
+        ([0.0, 0.0, 0.0, math.nan], r"step: acceleration: nan of ring 1 is not allowed; allowed: .* shape \(4,\)"),
+        ([0.0], r"step: acceleration: shape: \(1,\) is not allowed; allowed: \(4,\)"),
+        (["a"] * 4, r"step: acceleration is not numbers: .*; allowed: finite numbers of shape \(4,\)"),
+    ],
+)
+def test_wrong_accelerations_are_refused(accelerations: Any, reason: str) -> None:
+    rings = DifferentiableRings(replace(SMALL, cavs=2), [0, 1])
+    with pytest.raises(InputError, match=reason):
+        rings.step(accelerations)
+    assert rings.step([0.0] * 4).shape == (2,)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_torch_module_drives_as_in_numpy_and_passes_gradients() -> None:

@@ -41,13 +41,13 @@ class ImageSequenceClip:
 
 
 def run_example(folder: Path, name: str, *arguments: str) -> str:
-    """Return what an example prints."""
+    """Return what an example prints, on both streams."""
     command = [sys.executable, str(EXAMPLES / name), *arguments]
     paths = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
     environment = {**os.environ, "PYTHONPATH": paths}
     ran = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert ran.returncode == 0, ran.stderr
-    return ran.stdout
+    return ran.stdout + ran.stderr
 
 
 @pytest.mark.slow
@@ -82,7 +82,11 @@ def test_the_example_of_wrappers_records_the_first_episode(tmp_path: Path) -> No
 
 @pytest.mark.slow
 def test_the_policy_of_the_single_file_drives_as_onnx_and_enters_the_benchmark(tmp_path: Path) -> None:
-    assert "m/s in 64 episodes" in run_example(tmp_path, "ppo_single_file.py", "5")
+    printed = run_example(tmp_path, "ppo_single_file.py", "5")
+    assert "m/s in 64 episodes" in printed
+    assert "warning" not in printed.lower()
+    assert "torchvision" not in printed
+    assert b"site-packages" not in (tmp_path / "policy.onnx").read_bytes(), "a path of this machine"
     result = unjam.drive("ring", str(tmp_path / "policy.onnx"), episodes=1, scenario_options={"horizon": 100})
     assert result.mean["collisions"] == 0
     driver = onnx_driver(tmp_path / "policy.onnx")

@@ -24,6 +24,7 @@ def policy_driver(
     expert: DriverLike | None = None,
     output: PolicyOutput = PolicyOutput(),  # noqa: B008 - frozen
     time_step: float = 0.1,
+    policy_time_step: float | None = None,
 ) -> PolicyDriver:
     """Return a policy as a driver that runs in this process, without exploration.
 
@@ -42,6 +43,8 @@ def policy_driver(
         expert: a driver to which the accelerations are added; None: the policy drives alone.
         output: what its numbers mean; without limits, those of a model's action space.
         time_step: control step of the road [s].
+        policy_time_step: control step with which the policy was trained [s], a multiple of that of the road, for which
+            its action is held; None: that of the road.
 
     Raises:
         InputError: the policy does not take these inputs, returns another shape, has other actions, or is recurrent;
@@ -66,7 +69,7 @@ def policy_driver(
     described = observation_size(features, inner)
     if size not in (None, described):
         raise InputError(f"inputs: {described} numbers are not allowed; allowed: {size}, the inputs of {label}")
-    description = PolicyDescription(features, output)
+    description = PolicyDescription(features, output, policy_time_step)
     driver = kind(lambda rows, memory: (function(rows), memory), label, description, inner, time_step)
     driver.evaluate(np.zeros((2, described)), {})
     return driver

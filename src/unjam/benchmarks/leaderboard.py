@@ -8,7 +8,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from unjam.benchmarks.result import BenchmarkResult, read_result
-from unjam.errors import InputError, naming, one_line
+from unjam.errors import InputError, naming
 from unjam.measures.statistics import format_ci
 from unjam.reports.figures import CAV_PLOT_COLOR, MUTED_COLOR, PLOT_STYLE, TEXT_COLOR, new_figure, short_label
 
@@ -30,7 +30,7 @@ def read_leaderboard(paths: Sequence[Path]) -> dict[str, BenchmarkResult]:
 
 def _unique_labels(drivers: Sequence[str], files: Sequence[str]) -> list[str]:
     """Return short labels of one line: the driver, with the file if others have this label, with a number if needed."""
-    labels, marks = ([short_label(one_line(text)) for text in texts] for texts in (drivers, files))
+    labels, marks = ([short_label(text) for text in texts] for texts in (drivers, files))
     counts = Counter(labels)
     labels = [each if counts[each] == 1 else f"{each} ({mark})" for each, mark in zip(labels, marks, strict=True)]
     is_unique = len(set(labels)) == len(labels)

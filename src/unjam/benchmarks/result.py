@@ -12,7 +12,7 @@ from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr
 from unjam.benchmarks.episodes import FAMILY_METRICS, FAMILY_TEST_SEEDS
 from unjam.benchmarks.suites import Suite, find_suite, references
 from unjam.controller.manifest import first_difference, short_text
-from unjam.errors import InputError, invalid_value, naming
+from unjam.errors import InputError, invalid_value, naming, unknown_name
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, parse_json, to_json
 from unjam.measures import gain
 from unjam.measures.feasibility import FEASIBLE, overall_feasibility
@@ -93,8 +93,10 @@ class BenchmarkResult:
     def mean_gain(self, part: str = "all roads") -> Estimate:
         """Return the mean gain over the finished roads of one of `PARTS`, with its 95 % CI over roads and seeds.
 
-        Roads and seeds are crossed random effects (`estimate_crossed`).
+        Roads and seeds are crossed random effects (`estimate_crossed`). Raise `InputError` for an unknown part.
         """
+        if not isinstance(part, str) or part not in PARTS:
+            raise unknown_name("part", part, PARTS)
         own = [seeds for name, (_, seeds, _) in self._gains.items() if FAMILY[name].part in PARTS[part]]
         return estimate_crossed(own, allows_bimodal=True)
 
@@ -113,14 +115,18 @@ class BenchmarkResult:
         return {name: each.mean for name, (each, *_) in self._gains.items()}
 
     def road_rows(self) -> list[dict[str, Any]]:
-        """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend; then the means."""
+        """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend.
+
+        If all roads are finished, the means follow.
+        """
         rows: list[dict[str, Any]] = [
             {"road": name, "part": FAMILY[name].part, **_interval(each), "feasible": verdict}
             | {"backend": self.roads[name].backend, "expert": references()[name]["expert"]}
             for name, (each, _, verdict) in self._gains.items()
         ]
         empty = {"part": "", "feasible": "", "backend": "", "expert": ""}
-        return rows + [{**empty, "road": f"mean, {part}", **_interval(self.mean_gain(part))} for part in PARTS]
+        parts = () if self.missing_roads else PARTS
+        return rows + [{**empty, "road": f"mean, {part}", **_interval(self.mean_gain(part))} for part in parts]
 
     def table(self) -> "pd.DataFrame":
         """Return `road_rows` as a table."""

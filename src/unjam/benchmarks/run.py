@@ -1,7 +1,7 @@
 """Run a benchmark: the human baseline and a driver on the test seeds of each road of a suite."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +18,14 @@ from unjam.benchmarks.result import (
     to_columns,
     write_result,
 )
-from unjam.benchmarks.suites import DEFAULT_SUITE, find_suite
+from unjam.benchmarks.suites import DEFAULT_SUITE, Suite, find_suite
 from unjam.controller import DEFAULT_DRIVER, controller_hash, controller_path, make_driver
+from unjam.controller.domain import SB3_SUFFIX, control_step_note
 from unjam.controller.file import read_controller, sha256_of, sha256_of_file
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable, user_code_recipes
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, invalid_value, one_line
+from unjam.errors import InputError, invalid_value, one_line, unknown_name
 from unjam.files import make_folder, to_json
 from unjam.manifest import manifest, without_folders
 from unjam.measures.gain import EpisodeRows
@@ -58,6 +59,7 @@ def benchmark(
     backend: str = EXACT_BACKEND,
     training_steps: int | None = None,
     progress: Callable[[str], object] = lambda line: None,
+    roads: Sequence[str] = (),
 ) -> BenchmarkResult:
     """Drive the human baseline and a driver on the test seeds of each road of a suite, and return gains and rows.
 
@@ -71,20 +73,29 @@ def benchmark(
         training_steps: environment steps that made the driver, unless its file says so: control steps (decisions of the
             driver) in the simulator, the calls of `env.step` of all environments together.
         progress: called with a line after each road.
+        roads: names of roads of the suite, for a trial: only these are driven. The result is not finished then, and
+            cannot be compared; `out` can be continued without `roads`.
 
     Raises:
         InputError: an argument is wrong, the driver fails or can drive on no road, or `out` has another result or is
             being written by another process.
     """
-    roads = {name: make_scenario(f"{FAMILY_PREFIX}{name}") for name in find_suite(suite).roads}
+    chosen = _check_roads(roads, find_suite(suite))
+    scenarios = {name: make_scenario(f"{FAMILY_PREFIX}{name}") for name in find_suite(suite).roads}
     for name, number, *limits in (("workers", workers, 1), ("training_steps", training_steps, 0, MAX_TRAINING_STEPS)):
         if number is not None:
             check_integer(name, number, *limits)
-    drivers, reasons = _make_drivers(driver, roads)
+    if not (out is None or (isinstance(out, str | os.PathLike) and Path(out).name)):
+        raise invalid_value("out", out, "the path of a file")
+    if not callable(progress):
+        raise invalid_value("progress", progress, "a function of a line of text")
+    drivers, reasons = _make_drivers(driver, scenarios)
     if backend != EXACT_BACKEND:
         with open_backend(backend) as simulator:
-            check_support(simulator, *roads.values())
+            check_support(simulator, *scenarios.values())
     label, first = driver if isinstance(driver, str) else "", next(iter(drivers.values()))
+    if label.endswith(SB3_SUFFIX):
+        progress(control_step_note(label, (road.control_step for road in scenarios.values())))
     origin = manifest()
     result = BenchmarkResult(
         suite=suite,
@@ -97,9 +108,10 @@ def benchmark(
     with _locked_result(path), WorkerPool(workers or os.cpu_count() or 1) as pool:
         if path is not None and os.path.lexists(path):
             result = _stored_result(path, result)
-            progress(f"{len(result.roads)} of {len(roads)} roads are in {path.name}, and are not driven again")
-        for number, name in enumerate(result.missing_roads, len(result.roads) + 1):
-            scenario = roads[name]
+            progress(f"{len(result.roads)} of {len(scenarios)} roads are in {path.name}, and are not driven again")
+        remaining = [name for name in result.missing_roads if name in chosen]
+        for number, name in enumerate(remaining, len(result.roads) + 1):
+            scenario = scenarios[name]
             human = make_driver(HUMAN_LABEL, scenario.control_step)
             used, rows = human_used, baseline = _drive_road(scenario, human, backend, pool)
             if (own := drivers.get(name)) != human:
@@ -109,8 +121,19 @@ def benchmark(
             if path is not None:
                 write_result(path, result)
             row = result.road_rows()[len(result.roads) - 1]
-            progress(f"{number} of {len(roads)}: {name}: gain {row['gain']:.2f}, {row['feasible']}")
+            progress(f"{number} of {len(scenarios)}: {name}: gain {row['gain']:.2f}, {row['feasible']}")
     return result
+
+
+def _check_roads(roads: Sequence[str], suite: Suite) -> Sequence[str]:
+    """Return the given roads of a suite, whose names may begin with `family/`, or all; `InputError` for others."""
+    if isinstance(roads, str) or not isinstance(roads, Sequence):
+        raise invalid_value("roads", roads, f"a list of names of roads of {suite.name}")
+    names = [str(name).removeprefix(FAMILY_PREFIX) for name in roads]
+    for name in names:
+        if name not in suite.roads:
+            raise unknown_name(f"roads of {suite.name}", name, suite.roads)
+    return names or suite.roads
 
 
 @contextmanager
@@ -204,4 +227,4 @@ def _stored_result(path: Path, new: BenchmarkResult) -> BenchmarkResult:
     for (key, expected), found in zip(identity(new).items(), identity(stored).values(), strict=True):
         if found != expected:
             raise invalid_value(f"out: {path}: {key}", found, f"{expected!r}, to continue it, or a new file")
-    return stored
+    return replace(stored, manifest=stored.manifest | {"command": new.manifest["command"]})

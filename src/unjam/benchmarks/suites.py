@@ -46,7 +46,7 @@ SUITES = {suite.name: suite for suite in _SUITES}
 
 def find_suite(name: str) -> Suite:
     """Return the suite with a name; raise `InputError` if there is none."""
-    if name not in SUITES:
+    if not isinstance(name, str) or name not in SUITES:
         raise unknown_name("suite", name, SUITES)
     return SUITES[name]
 

@@ -45,6 +45,9 @@ def benchmark_command(
             "The driver's own file has priority.",
         ),
     ] = None,
+    roads: Annotated[
+        str, Option(help="Roads of the suite for a trial, joined by commas. Only with --out it can be continued.")
+    ] = "",
     json: opt.JsonOption = False,
 ) -> None:
     """Measure the gain of a driver on the test seeds of a suite: 0 is the human baseline, 1 the best tuned expert.
@@ -52,6 +55,7 @@ def benchmark_command(
     Examples:
 
     - unjam benchmark pi --suite closed-roads-v1
+    - unjam benchmark my_driver.py:gentle --roads ring-22-grown,figure-eight-14
     - unjam benchmark my_driver.py:gentle --suite closed-roads-v1 --out gentle.json
     - unjam benchmark policy.onnx --training-steps 1000000
     - unjam benchmark --compare gentle.json results/benchmark/*.json
@@ -64,13 +68,15 @@ def benchmark_command(
     from unjam.benchmarks.run import benchmark
 
     driver = (names or [DEFAULT_DRIVER])[0]
-    if out is None:
+    chosen = [name.strip() for name in roads.split(",")] if roads else []
+    if out is None and not chosen:
         slug = re.sub(r"[^\w-]+", "-", Path(driver).stem)[:40].strip("-")
         out = Path("runs") / f"benchmark-{suite}-{slug}.json"
     line = (lambda text: None) if json else (lambda text: err_console.print(text, soft_wrap=True))
-    result = benchmark(driver, suite, out, workers, backend, training_steps, line)
+    result = benchmark(driver, suite, out, workers, backend, training_steps, line, chosen)
+    trial = {"missing_roads": result.missing_roads, "gains": result.road_rows()} if result.missing_roads else {}
     if json:
-        print_json(result.document())
+        print_json(trial | result.document())
         return
     table = new_table(("road", "part"), ("gain", "95 % CI"))
     table.add_column("feasible")
@@ -78,8 +84,13 @@ def benchmark_command(
         interval = f"[{row['low']:.2f}, {row['high']:.2f}]"
         table.add_row(row["road"], row["part"], f"{row['gain']:.2f}", interval, row["feasible"])
     console.print(table)
-    err_console.print(f"result: {out}", soft_wrap=True)
-    print_next_command("compare it", "benchmark", "--compare", out, "OTHER.json")
+    if out is not None:
+        err_console.print(f"result: {out}", soft_wrap=True)
+    if trial:
+        driven = f"{len(result.roads)} of {len(result.roads) + len(result.missing_roads)} roads of {suite}"
+        err_console.print(f"trial: {driven}; the same command without --roads drives all", soft_wrap=True)
+    else:
+        print_next_command("compare it", "benchmark", "--compare", out, "OTHER.json")
 
 
 def _compare(names: list[str], out: Path, json: bool) -> None:

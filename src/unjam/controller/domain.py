@@ -38,7 +38,7 @@ def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[
     for name in names:
         if name.endswith(SB3_SUFFIX):
             step = road["simulation_step"] * road["steps_per_control_step"]
-            notes.append(f"{name} does not contain its control step: here it acts every {step:g} s")
+            notes.append(control_step_note(name, {step}))
         controller = _find_controller(name)
         if controller is None:
             continue
@@ -49,6 +49,12 @@ def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[
         if share > OUTSIDE_DOMAIN_THRESHOLD:
             notes.append(f"{name} was outside of its certified domain in {100 * share:.0f} % of control steps")
     return notes
+
+
+def control_step_note(name: str, steps: Iterable[float]) -> str:
+    """Return the note for a model of Stable-Baselines3 on roads with these control steps [s]."""
+    found = " or ".join(f"{step:g}" for step in sorted(set(steps)))
+    return f"{name} does not contain its control step: here it acts every {found} s, unless policy_driver sets another"
 
 
 def _find_controller(driver_name: str) -> Controller | None:

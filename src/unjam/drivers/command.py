@@ -1,13 +1,13 @@
 """Commands of a driver to its vehicles, and the limits that are applied before a command reaches the road."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.errors import InputError
+from unjam.errors import InputError, one_line
 from unjam.physics.arrays import Array, clip, namespace
 
 
@@ -35,12 +35,22 @@ class Limits(NamedTuple):
         return cls(-limit, limit)
 
 
-def as_numbers(answer: Any, label: str) -> NDArray[np.float64]:
-    """Return the answer of a user's code as an array of any shape; raise `InputError` unless it consists of numbers."""
+def _as_doubles(answer: Any) -> NDArray[np.float64]:
+    return np.asarray(answer, np.float64)
+
+
+def as_numbers(
+    answer: Any, label: str, allowed: str = "", to_array: Callable[[Any], Array] = _as_doubles
+) -> NDArray[np.float64]:
+    """Return the answer of a user's code as an array of any shape; raise `InputError` unless it consists of numbers.
+
+    The message says what is `allowed`. `to_array` makes another kind of array.
+    """
     try:
-        return np.asarray(answer, np.float64)
+        return to_array(answer)
     except (TypeError, ValueError, RuntimeError):  # the last for tensors with a gradient
-        raise InputError(f"{label} is not numbers: {answer!r:.60}") from None
+        reason = f"{label} is not numbers: {one_line(repr(answer), 60)}"
+        raise InputError(f"{reason}; allowed: {allowed}" if allowed else reason) from None
 
 
 def answer_as_array(

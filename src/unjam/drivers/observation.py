@@ -339,13 +339,18 @@ def observation_inputs(names: Sequence[NetworkInput], expert: Driver) -> tuple[S
 
 def observation_size(names: Sequence[NetworkInput], expert: Driver) -> int:
     """Return the number of a network's inputs with this expert."""
+    columns = memory_size(expert)  # of the features without a description
+    size = sum(columns if each.inputs is None else len(each.inputs) for each in map(feature, names))
+    if not size:
+        raise InputError("policy.inputs: expert_memory alone is not allowed: the expert has no memory features")
+    return size
+
+
+def memory_size(expert: Driver) -> int:
+    """Return the number of an expert's memory features."""
     state = state_of_ones(LocalState._fields, np.ones)
     acceleration, memory = expert.act(state, expert.initial_memory(1))
     if np.shape(acceleration) != (1,):
         raise InputError(f"driver: acceleration has shape {np.shape(acceleration)}; allowed: one for each CAV")
     remembered = expert.memory_features(memory)
-    columns = 0 if remembered is None else remembered.shape[1]  # of the features without a description
-    size = sum(columns if each.inputs is None else len(each.inputs) for each in map(feature, names))
-    if not size:
-        raise InputError("policy.inputs: expert_memory alone is not allowed: the expert has no memory features")
-    return size
+    return 0 if remembered is None else remembered.shape[1]

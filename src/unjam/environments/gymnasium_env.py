@@ -1,5 +1,6 @@
 """A scenario with external actions, and with one CAV as a Gymnasium environment."""
 
+import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import copy
@@ -15,11 +16,11 @@ from numpy.typing import NDArray
 from unjam.controller import make_expert
 from unjam.drivers.car_following import Constant
 from unjam.drivers.command import as_numbers
-from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features, observation_size
+from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features, memory_size, observation_size
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
 from unjam.environments.threads import CopyableLock, synchronized
-from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
+from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, one_line, unknown_name
 from unjam.measures.step_metrics import StepMetricMeans
 from unjam.parameters import check_integer, merge_changes, nest_keys
 from unjam.physics.arrays import clip
@@ -47,9 +48,9 @@ Observations = NDArray[np.float32]
 
 def as_action(action: Any, name: str) -> float:
     """Return the action of one CAV as a number [m/s2]; raise `InputError` unless it is a single finite one."""
-    values = as_numbers(action, f"step: {name}")
+    values = as_numbers(action, f"step: {name}", allowed := "one finite number")
     if values.size != 1 or not isfinite(number := values.item()):
-        raise InputError(f"step: {name}: {action!r:.60} is not allowed; allowed: one finite number")
+        raise InputError(f"step: {name}: {one_line(repr(action), 60)} is not allowed; allowed: {allowed}")
     return number
 
 
@@ -58,10 +59,10 @@ def episode_seed(seed: int, episode_count: int) -> tuple[int, ...]:
     return (seed, episode_count) if episode_count else (seed,)
 
 
-def no_cav_error(scenario: Scenario) -> EpisodeError:
-    """Return the error for an episode without a control step that a driver could decide."""
+def no_cav_error(scenario: Scenario, episode: str = "") -> EpisodeError:
+    """Return the error for an episode without a control step that a driver could decide; `episode` says which one."""
     allowed = f"a horizon of more than {scenario.horizon} control steps, or more CAVs"
-    return EpisodeError(f"reset: no CAV enters the road before the episode ends; allowed: {allowed}")
+    return EpisodeError(f"reset: {episode}no CAV enters the road before the episode ends; allowed: {allowed}")
 
 
 def check_single_cav(scenario: Scenario) -> None:
@@ -117,6 +118,9 @@ class RoadStepper:
         inputs = as_features(features)
         if not expert and (useless := [name for name in ("expert_acceleration", "expert_memory") if name in inputs]):
             raise InputError(f"features: {useless[0]!r} is not allowed; allowed: with an expert, like 'pi'")
+        if "expert_memory" in inputs and not memory_size(driver):  # no error: exported policies may name it
+            text = f"features: 'expert_memory' adds no numbers: the expert {driver.describe()} has no memory features"
+            warnings.warn(text, stacklevel=3)
         self._driver = ExternalDriver(driver, inputs, self.scenario.acceleration_limits)
         self._backend = backend
         with open_backend(backend) as opened:
@@ -161,12 +165,13 @@ class RoadStepper:
         `options` are changes to the parameters of the scenario, in addition to those of the constructor, for this
         episode alone.
         """
+        seed = None if seed is None else check_integer("seed", seed, 0)
         warn_of_reserved_seed(seed)
         if self._opened is None:
             self._opened = self._backend_context.enter_context(open_backend(self._backend))
-        scenario = self._with_options(options, self._opened) if options else self.scenario
+        scenario = self.scenario if options is None else self._with_options(options, self._opened)
         if seed is not None:
-            self._seed, self._episode_count = check_integer("seed", seed, 0), 0
+            self._seed, self._episode_count = seed, 0
         if self._seed is None:
             self._seed = int(generator.integers(2**31))
         numbers = episode_seed(self._seed, self._episode_count)

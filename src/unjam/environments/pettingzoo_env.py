@@ -70,6 +70,7 @@ class ParallelRoadEnv(RoadAgents):
         """Advance one control step with the actions of all agents."""
         if not self.agents:
             return {}, {}, {}, {}, {}
+        self._check_actions(actions)
         if missing := [agent for agent in self.agents if agent not in actions]:
             raise InputError(f"step: no action for {', '.join(missing)}; allowed: one for each of the agents")
         previous, departed = self.agents, self._departed_agents

@@ -49,6 +49,7 @@ class SlottedRoadEnv(RoadAgents):
         """Advance one control step; empty slots need no action."""
         if not self.agents:
             return {}, {}, {}, {}, {}
+        self._check_actions(actions)
         if missing := [slot for slot in self._cavs if slot not in actions]:
             raise InputError(f"step: no action for {', '.join(missing)}; allowed: one for each occupied slot")
         if unknown := actions.keys() - set(self.possible_agents):

@@ -12,7 +12,7 @@ from unjam.drivers.driver import carry_over_memory
 from unjam.drivers.observation import FeatureLike
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
-from unjam.environments.gymnasium_env import no_cav_error
+from unjam.environments.gymnasium_env import episode_seed, no_cav_error
 from unjam.environments.vector_env import Episodes, RoadVectorEnv, with_masks
 from unjam.errors import InputError
 from unjam.measures.step_metrics import open_road_metrics, open_road_sums
@@ -32,9 +32,7 @@ class SlottedEpisodes(Episodes):
     """Episodes on W motorways, the driver of their CAVs, and the slots of these, S on each road."""
 
     def __init__(self, world: MotorwayBatch, driver: ExternalDriver, slots: int) -> None:
-        """Start the episodes with empty roads; raise `EpisodeError` if one will have no CAV."""
-        if not all(road.cav_ids for road in world.roads):
-            raise no_cav_error(world.scenario)
+        """Start the episodes with empty roads, each of which will have a CAV."""
         self._shape = len(world.roads), slots
         self._slots = np.zeros(0, np.intp)
         """slot of each CAV on a road, or `NO_SLOT`"""
@@ -144,7 +142,13 @@ class SlottedRoadVectorEnv(RoadVectorEnv):
         return kind(cast(Motorway, self._road.scenario), seeds, keep_record=False)
 
     def _start_episodes(self, rows: list[int]) -> SlottedEpisodes:
-        return SlottedEpisodes(self.make_batch(rows), self._road.copy_driver(), self._slots)
+        world: MotorwayBatch = self.make_batch(rows)
+        for row, road in zip(rows, world.roads, strict=True):
+            if not road.cav_ids:
+                seed = episode_seed(self._seeds[row] or 0, self._episode_counts[row] - 1)
+                episode = f"environment {row}: {world.scenario.title} of seed {', '.join(map(str, seed))}: "
+                raise no_cav_error(world.scenario, episode)
+        return SlottedEpisodes(world, self._road.copy_driver(), self._slots)
 
     def _without_ignored(self, actions: Array) -> Array:
         is_occupied = cast(SlottedEpisodes, self._running_episodes).is_occupied

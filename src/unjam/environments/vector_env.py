@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -203,7 +204,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
     def _make_array_kind(self, seed: Sequence[int]) -> _ArrayKind:
         try:
             return self._make_kind(self._exact, seed)
-        except (RuntimeError, AssertionError):  # of torch
+        except (RuntimeError, AssertionError, TypeError):  # of torch
             message = f"device: {self.device!r} is not available to torch; allowed: 'cpu', or '' for NumPy"
             raise MissingPartError(message) from None
 
@@ -211,6 +212,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
         """Start an episode in each environment, or in those of `options["reset_mask"]`, booleans of shape (W,)."""
+        self._check_open()
         rows, seeds = self._rows_to_reset({} if options is None else options), self._seeds_of_environments(seed)
         warn_of_reserved_seed(*seeds)
         for row in rows:
@@ -292,8 +294,17 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         for name, total in self._totals.items():
             self._totals[name] = replace_entries(total, rows, self._zeros, rows)
 
+    def _check_open(self) -> None:
+        if self.closed:
+            raise ClosedEnvironmentError("the environments are closed; allowed: new ones, of gymnasium.make_vec")
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Release the episodes; `step` and `reset` then raise `ClosedEnvironmentError`."""
+        self._episodes, self._prepared = None, {}
+
     @property
     def _running_episodes(self) -> Episodes:
+        self._check_open()
         if self._episodes is None:
             raise UnjamError("no episode is running: call reset first")
         return self._episodes
@@ -333,17 +344,16 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         return self._kind.to_single(self._running_episodes.observations)
 
     def _as_actions(self, actions: Any) -> Array:
-        if self._is_numpy:
-            actions = as_numbers(actions, "step: actions")
         shape = self._actions_shape
-        if np.shape(actions) not in (shape, shape[:-1]):
-            raise InputError(f"step: actions of shape {np.shape(actions)} are not allowed; allowed: {shape}")
-        found = self._without_ignored(self._kind.to_array(actions).reshape(shape[:-1]))
-        if self._is_numpy and not np.isfinite(found).all():
-            index = tuple(np.argwhere(~np.isfinite(found))[0])
-            raise InputError(
-                f"step: actions: {found[index]} of environment {index[0]} is not allowed; allowed: finite numbers"
-            )
+        allowed = f"finite numbers of shape {shape}"
+        found = as_numbers(actions, "step: actions", allowed, self._kind.to_array)
+        if tuple(found.shape) not in (shape, shape[:-1]):
+            raise InputError(f"step: actions of shape {tuple(found.shape)} are not allowed; allowed: {shape}")
+        found = self._without_ignored(found.reshape(shape[:-1]))
+        if not bool((is_finite := namespace(found).isfinite(found)).all()):
+            index = tuple(np.argwhere(as_numpy(is_finite) == 0.0)[0])
+            reason = f"{float(found[index])} of environment {index[0]} is not allowed"
+            raise InputError(f"step: actions: {reason}; allowed: {allowed}")
         return found
 
     def _without_ignored(self, actions: Array) -> Array:

@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, SupportsIndex
+from typing import Any, SupportsIndex, cast
 
 import torch
 from torch import Tensor
 
-from unjam.drivers.command import Command
+from unjam.drivers.command import Command, as_numbers
 from unjam.drivers.driver import Driver, Memory
 from unjam.errors import InputError, invalid_value
 from unjam.models.rollouts import check_device
@@ -104,7 +104,8 @@ class DifferentiableRings(RingBatch):
         Raise `InputError` if they have another shape, a number is not finite, a speed is negative, or a vehicle is not
         behind its leader, the next row, within one lap.
         """
-        speeds, positions = (self._as_motion(*each) for each in (("speeds", speeds), ("positions", positions)))
+        shape = self._position.shape
+        speeds, positions = self._as_tensor("speeds", speeds, shape), self._as_tensor("positions", positions, shape)
         if bool((speeds < 0.0).any()):
             raise invalid_value("speeds", float(speeds.min()), ">= 0")
         gaps = gap_on_loop(positions, positions.roll(-1, 0), self._loop_lengths, VEHICLE_LENGTH)
@@ -114,15 +115,16 @@ class DifferentiableRings(RingBatch):
             raise InputError(f"positions: those of ring {ring} are not in order; allowed: each vehicle behind the next")
         self._speed, self._position, self._gap = torch.cat([speeds, speeds[:1]]), positions, gaps
 
-    def _as_motion(self, name: str, values: Any) -> Tensor:
-        try:
-            found = self._to_array(values)
-        except (TypeError, ValueError, RuntimeError):
-            raise invalid_value(name, type(values).__name__, "a tensor") from None
-        if found.shape != self._position.shape:
-            raise invalid_value(f"{name}: shape", tuple(found.shape), str(tuple(self._position.shape)))
-        if not bool(found.isfinite().all()):
-            raise invalid_value(name, float(found[~found.isfinite()][0]), "finite numbers")
+    def _as_tensor(self, name: str, values: Any, shape: Sequence[int]) -> Tensor:
+        """Return numbers of the user as a tensor; raise `InputError` unless they are finite and have the shape."""
+        allowed = f"finite numbers of shape {tuple(shape)}"
+        found = cast(Tensor, as_numbers(values, name, allowed, self._to_array))
+        if found.shape != tuple(shape):
+            raise invalid_value(f"{name}: shape", tuple(found.shape), str(tuple(shape)))
+        if not bool((is_finite := found.isfinite()).all()):
+            index = int((~is_finite).flatten().nonzero()[0])
+            value, ring = float(found.flatten()[index]), index % len(self.roads)  # the last axis, or its blocks
+            raise InputError(f"{name}: {value} of ring {ring} is not allowed; allowed: {allowed}")
         return found
 
     def initial_memory(self, driver: Driver) -> Memory:
@@ -140,10 +142,11 @@ class DifferentiableRings(RingBatch):
         """Simulate one control step, and return the reward of each ring, shape (W,); `reward_terms` are its terms.
 
         `acceleration` [m/s2], shape (CAVs * W,), is limited to the scenario's limits, and then by the safety filter.
-        After a collision, `crashed_roads`, and after the horizon, the rewards of a ring are zero.
+        After a collision, `crashed_roads`, and after the horizon, the rewards of a ring are zero. Raise `InputError` if
+        the accelerations have another shape, or one is not finite.
         """
         was_running = self._is_running
-        self.advance(Command(acceleration))
+        self.advance(Command(self._as_tensor("step: acceleration", acceleration, (self.cav_count,))))
         terms = self._reward(self.last_outcome())
         self.reward_terms = {name: values * was_running for name, values in terms.items()}
         return torch.stack([*self.reward_terms.values()]).sum(0)

@@ -13,6 +13,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
+from unjam.errors import one_line
 from unjam.reports.results import PlotEpisode, seconds_by_part
 
 SPEED_COLORMAP = "viridis"
@@ -52,8 +53,8 @@ PLOT_STYLE: dict[Any, Any] = {
 
 
 def short_label(label: str) -> str:
-    """Return a driver's label, cut to the width of a title: tuned drivers have many parameters."""
-    return label if len(label) <= MAX_LABEL_LENGTH else f"{label[: MAX_LABEL_LENGTH - 1]}…"
+    """Return a driver's label on one line, cut to the width of a title: tuned drivers have many parameters."""
+    return one_line(label, MAX_LABEL_LENGTH)
 
 
 def new_figure(height: float, width: float = FIGURE_WIDTH) -> Figure:

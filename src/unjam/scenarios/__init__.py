@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from unjam.drivers.user_driver import is_file_reference, object_label
-from unjam.errors import invalid_value, spelling_hint, unknown_name
+from unjam.errors import invalid_value
 from unjam.parameters import build_dataclass, merge_changes, nest_keys
 from unjam.road_family import FAMILY_PREFIX, FAMILY_SCENARIOS
 from unjam.scenarios.figure_eight import FigureEight
@@ -94,11 +95,13 @@ def _base_scenario(scenario: ScenarioLike) -> Scenario:
     if road := FAMILY_SCENARIOS.get(scenario):
         return make_scenario(road.scenario, road.options)
     if scenario not in SCENARIOS:
+        names = {name.removeprefix(FAMILY_PREFIX): name for name in (*FAMILY_SCENARIOS, *SCENARIOS)}
+        close = get_close_matches(scenario.removeprefix(FAMILY_PREFIX), names, 1)
+        hint = f"; did you mean {names[close[0]]!r}?" if close else ""
         if scenario.startswith(FAMILY_PREFIX):
-            hint = spelling_hint(scenario, FAMILY_SCENARIOS)
             raise invalid_value("scenario", scenario, f"one that `unjam scenarios family` lists{hint}")
         others = f"{FAMILY_PREFIX}NAME", "a .sumocfg or .toml file", "path.py:name"
-        raise unknown_name("scenario", scenario, [*SCENARIOS, *others])
+        raise invalid_value("scenario", scenario, f"{', '.join((*SCENARIOS, *others))}{hint}")
     return SCENARIOS[scenario]
 
 
