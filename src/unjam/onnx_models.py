@@ -4,8 +4,12 @@ An untrusted model is only data if it is pure arithmetic: ONNX has loops, functi
 tensors in external files. Therefore anything that is not listed here is refused, at any depth.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from math import prod
+from threading import Timer
 from typing import Any
 
 from unjam.errors import InputError, import_optional, invalid_value, one_line
@@ -47,6 +51,8 @@ TEXT_FIELDS = {"doc_string", "metadata_props", "model_version", "producer_name",
 MAX_MODEL_BYTES = 64 * 2**20
 MAX_TENSOR_NUMBERS = MAX_MODEL_BYTES // 4
 """maximum count of numbers in a constant"""
+MAX_TRIAL_SECONDS = 10.0
+"""maximum time of the trial runs of a model; a network of the usual size needs milliseconds"""
 MAX_RUN_BYTES = 256 * 2**20
 """maximum memory of all running models of this process"""
 
@@ -90,8 +96,14 @@ def check_model(model: Any, size: int, opsets: range, ir_versions: range) -> Non
     graph = model.graph
     if fixed := {each.name for each in graph.initializer} & {each.name for each in graph.input}:
         raise invalid_value("graph: initializer", min(fixed), "constants, not inputs")
+    measured = {each.name for each in graph.input}
+    """what depends on the values of inputs, and not on their shapes alone"""
     for node in graph.node:
         _check_node(node, imported[0][1])
+        if node.op_type != "Shape" and measured.intersection(node.input):
+            measured.update(node.output)
+        if node.op_type == "Expand" and measured.intersection(node.input[1:]):
+            raise invalid_value("graph: shape of Expand", node.input[1], "one that does not depend on observed values")
 
 
 def _check_fields(message: Any) -> None:
@@ -152,13 +164,39 @@ def open_session(content: bytes) -> Any:
 def run_session(session: Any, outputs: list[str] | None, values: dict[str, Any]) -> list[Any]:
     """Return the outputs (None: all) for the values of the inputs; raise `InputError` if it fails."""
     try:
-        return session.run(outputs, values)
+        return session.run(outputs, values, _run_options.get())
     except Exception as error:  # the runtime has its own error classes
         raise _run_error(error) from None
 
 
 def _run_error(error: Exception) -> InputError:
     return InputError(f"graph: cannot be run: {one_line(error)}")
+
+
+_run_options: ContextVar[Any] = ContextVar("run_options", default=None)
+
+
+@contextmanager
+def time_limit() -> Iterator[None]:
+    """Within the context, end all runs of models after `MAX_TRIAL_SECONDS` together, with `InputError`.
+
+    The runtime looks at the clock between two operators.
+    """
+    options = import_optional("onnxruntime").RunOptions()
+    timer = Timer(MAX_TRIAL_SECONDS, setattr, (options, "terminate", True))
+    timer.daemon = True
+    timer.start()
+    token = _run_options.set(options)
+    try:
+        yield
+    except InputError:
+        if options.terminate:
+            reason = f"it has not answered within {MAX_TRIAL_SECONDS:g} s of trial runs"
+            raise InputError(f"graph: {reason}; allowed: a policy that answers at once") from None
+        raise
+    finally:
+        _run_options.reset(token)
+        timer.cancel()
 
 
 @cache

@@ -22,6 +22,7 @@ from tests.adapters.onnx_policies import (
     value,
     write,
 )
+from unjam import onnx_models
 from unjam.adapters import PolicyDescription, PolicyInput, PolicyOutput, onnx_driver
 from unjam.controller import make_driver
 from unjam.drivers.car_following import ACC
@@ -222,6 +223,24 @@ def expand(count: int) -> Change:
     return change
 
 
+def measured_shape(made: Any) -> None:
+    made.graph.node.append(helper.make_node("Cast", ["speed"], ["count"], to=INT64))
+    made.graph.node.add(op_type="Reshape", input=["count", "one"], output=["counts"])
+    made.graph.initializer.append(helper.make_tensor("one", INT64, [1], [-1]))
+    made.graph.node.add(op_type="Expand", input=["gain", "counts"], output=["much"])
+
+
+def slow(made: Any) -> None:
+    made.graph.node[-1].output[0] = "few"
+    made.graph.initializer.append(helper.make_tensor("square", INT64, [2], [2000, 2000]))
+    made.graph.node.add(op_type="Expand", input=["gain", "square"], output=["power_0"])
+    for number in range(2000):
+        product = helper.make_node("MatMul", [f"power_{number}", "power_0"], [f"power_{number + 1}"])
+        made.graph.node.append(product)
+    made.graph.node.append(helper.make_node("ReduceMean", ["power_2000"], ["mean"], keepdims=0))
+    made.graph.node.add(op_type="Add", input=["few", "mean"], output=["acceleration"])
+
+
 def mixing(made: Any) -> None:
     made.graph.node[-1].output[0] = "alone"
     made.graph.node.append(helper.make_node("ReduceMean", ["alone"], ["mean"], axes=[0], keepdims=1))
@@ -235,6 +254,8 @@ HOSTILE: dict[str, tuple[Change, str]] = {
         "graph: shape of constant 'time_gap': [1099511627776] is not allowed; allowed: at most 16,777,216 numbers",
     ),
     "huge intermediate result": (expand(2**33), "graph: cannot be run: "),
+    "size by a speed": (measured_shape, "graph: shape of Expand: 'counts' is not allowed; allowed: one that does not"),
+    "thousands of large products": (slow, "graph: it has not answered within 1 s of trial runs; allowed: a policy"),
     "unknown operator": (change_of(op_type="Loop"), "graph: operator 'Loop' is not allowed; allowed: arithmetic"),
     "another domain": (change_of(domain="com.evil"), "graph: operator 'com.evil.Sub' is not allowed"),
     "control characters": (change_of(op_type="\x1b[31m\n"), r"graph: operator '\x1b[31m\n' is not allowed"),
@@ -273,7 +294,8 @@ def refusal(path: Path) -> str:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_graph_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+def test_a_hostile_graph_is_refused_in_one_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(onnx_models, "MAX_TRIAL_SECONDS", 1.0)
     change, words = HOSTILE[name]
     made = follower()
     change(made)

@@ -108,6 +108,17 @@ def test_nothing_in_a_file_is_executed(tmp_path: Path) -> None:
     assert trap.exists()  # the trap works
 
 
+def test_keys_of_nested_tuples_are_refused_before_torch_hashes_them(tmp_path: Path) -> None:
+    file, content = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path), io.BytesIO()
+    nested: Any = ()
+    for _ in range(60):
+        nested = (nested, nested)
+    torch.save({"key": [nested]}, content)  # a key itself would never end here, either
+    change(file, policy_pth=lambda _: content.getvalue())
+    with pytest.raises(InputError, match=r"driver model\.zip: ValueError: a tuple occurs more than once"):
+        policy_driver(file)
+
+
 def test_serialized_parts_of_the_data_are_not_read(tmp_path: Path) -> None:
     file = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path)
 

@@ -7,6 +7,7 @@ network is rebuilt from the names of its weights.
 import io
 import json
 import os
+import pickletools
 import re
 import zipfile
 from collections.abc import Callable, Sequence
@@ -20,7 +21,7 @@ from gymnasium.spaces import Box
 from unjam.errors import InputError, MissingPartError, import_optional, one_line
 from unjam.physics.arrays import Floats
 
-DATA_PART, POLICY_PART = "data", "policy.pth"
+DATA_PART, POLICY_PART, PICKLE_SUFFIX = "data", "policy.pth", ".pkl"
 MAX_ARCHIVE_BYTES = 64 * 2**20
 """maximum size of an archive, decompressed"""
 SAFE_TORCH = (2, 6)
@@ -110,12 +111,31 @@ def read_policy(path: Path) -> SavedPolicy:
     return SavedPolicy(observed, acted, layers, activation, actor.is_squashed, exported)
 
 
-def _read_parts(content: bytes, names: Sequence[str] = ()) -> dict[str, bytes]:
-    """Return parts of an archive; raise `ValueError` if it is too large."""
+def _read_parts(content: bytes, names: Sequence[str] | None = None) -> dict[str, bytes]:
+    """Return parts of an archive, None: all; raise `ValueError` if it is too large."""
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         if sum(part.file_size for part in archive.infolist()) > MAX_ARCHIVE_BYTES:
             raise ValueError(f"larger than {MAX_ARCHIVE_BYTES} bytes")
-        return {name: archive.read(name) for name in names}
+        return {name: archive.read(name) for name in (archive.namelist() if names is None else names)}
+
+
+def _check_pickles(parts: dict[str, bytes]) -> None:
+    """Raise `ValueError` if a pickle has a tuple more than once.
+
+    Tuples of tuples of the same one are as small in a file as they are large to hash: torch would never end. Shapes of
+    weights are tuples that occur once.
+    """
+    for content in (part for name, part in parts.items() if name.endswith(PICKLE_SUFFIX)):
+        tuples, previous, count = set[str](), "", 0
+        for code, argument, _ in pickletools.genops(content):
+            if code.name in ("BINPUT", "LONG_BINPUT", "PUT", "MEMOIZE"):
+                key = str(count if code.name == "MEMOIZE" else argument)
+                count += 1
+                if "TUPLE" in previous:
+                    tuples.add(key)
+            elif code.name in ("BINGET", "LONG_BINGET", "GET") and str(argument) in tuples:
+                raise ValueError("a tuple occurs more than once among its weights")
+            previous = code.name
 
 
 def _read_weights(content: bytes) -> dict[str, Floats]:
@@ -123,7 +143,7 @@ def _read_weights(content: bytes) -> dict[str, Floats]:
     if tuple(map(int, torch.__version__.split(".")[:2])) < SAFE_TORCH:
         needed = ".".join(map(str, SAFE_TORCH))
         raise MissingPartError(f"torch {torch.__version__} cannot read weights safely: pip install 'torch>={needed}'")
-    _read_parts(content)
+    _check_pickles(_read_parts(content))
     tensors = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     weights: dict[str, Floats] = {}
     for name, tensor in tensors.items():

@@ -12,7 +12,7 @@ from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.observation import PolicyInput, observation_size
 from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyMemory
 from unjam.errors import InputError, invalid_value, naming, unknown_name
-from unjam.onnx_models import check_model, open_session, parse_model, remove_texts, run_session
+from unjam.onnx_models import check_model, open_session, parse_model, remove_texts, run_session, time_limit
 
 OPSETS, IR_VERSIONS = range(9, 26), range(4, 14)
 """allowed versions of the operators and of the format"""
@@ -98,7 +98,8 @@ class OnnxDriver(PolicyDriver):
             policy = _read_policy(self.graph.tobytes(), self.description, self.expert)
             object.__setattr__(self, "policy", policy)
             object.__setattr__(self, "graph", np.frombuffer(policy.graph, np.uint8))
-            _probe(self)
+            with time_limit():
+                _probe(self)
 
     def policy_memory(self, n: int) -> Memory:
         """Return the initial recurrent state of the graph for `n` CAVs."""
