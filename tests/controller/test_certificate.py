@@ -10,7 +10,7 @@ import pytest
 
 from unjam.controller import certificate as certificates
 from unjam.controller import string_stability
-from unjam.controller.certificate import OperatingDomain, certify_driver, make_certificate
+from unjam.controller.certificate import OperatingDomain, certify_driver, describe_worst_cases, make_certificate
 from unjam.controller.domain import outside_domain_share
 from unjam.controller.file import (
     CERTIFICATE_PART,
@@ -229,3 +229,25 @@ def test_a_damaged_certificate_is_one_line_and_costs_no_drive(tmp_path: Path) ->
     with pytest.raises(InputError, match="the controller is damaged: JSONDecodeError"):
         verify_controller_file(file)
     assert outside_domain_share(read_controller(file), visited_states()) == 0.0
+
+
+def test_the_line_of_a_certificate_names_what_it_assumes() -> None:
+    driver = filter_driver(PISaturation(), leader_braking=7.5)
+    text = describe_worst_cases(asdict(certify_driver(driver, visited_states(), PAPER_IDM)), driver)
+    assert "brake with at most 7.5 m/s2, from " in text
+    assert " states at 0 to 5 m/s with gaps of 8 to 23 m: 0 contacts" in text
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"leader_gap": np.full(60, 1e9)}, "gap of the sample is not allowed; allowed: 0 to 100 in each state"),
+        ({"leader_gap": np.full(60, -3.0)}, "gap of the sample is not allowed"),
+        ({"speed": np.full(60, np.nan)}, "speed of the sample is not allowed; allowed: 0 to 100"),
+    ],
+)
+def test_states_that_no_cav_observes_are_not_certified(change: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=f"certify: {words}"):
+        certify_driver(filter_driver(PISaturation()), visited_states()._replace(**change), PAPER_IDM)
+    with pytest.raises(InputError, match="certify: a sample of 5 states is not allowed; allowed: 21 or more"):
+        certify_driver(filter_driver(PISaturation()), visited_states(5), PAPER_IDM)

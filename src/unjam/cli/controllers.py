@@ -81,7 +81,7 @@ def certify_command(
 
     - unjam certify ring.unjam
     """
-    from unjam.controller.certificate import make_certificate
+    from unjam.controller.certificate import describe_worst_cases, make_certificate
 
     if out is not None:
         check_page_path(out)
@@ -98,9 +98,7 @@ def certify_command(
     if json:
         print_json({"file": str(file), "page": str(target), "certificate": certificate})
         return
-    worst = certificate["worst_cases"]
-    tests = f"{worst['steps']:,} steps behind braking and adversarial leaders: {worst['contacts']} contacts"
-    console.print(f"{tests}, min gap {worst['min_gap']:.2f} m", soft_wrap=True)
+    console.print(describe_worst_cases(certificate, controller.driver), soft_wrap=True)
     for each in certificate["string_stability"]:
         verdict = "not string stable" if each["amplified_band"] else "string stable"
         largest = f"largest gain {max(each['gains']):.2f} at {each['peak_frequency']:.3g} Hz"

@@ -8,7 +8,7 @@ import numpy as np
 
 from unjam.controller.file import SAMPLE_PART, Controller, Floats, read_sample
 from unjam.controller.string_stability import StringStability, measure_string_stability, operating_speeds
-from unjam.drivers.local_state import LocalState
+from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, FollowingState
 from unjam.drivers.wrappers import FilteredDriver
@@ -27,6 +27,8 @@ ATTACK_POPULATION, ATTACK_GENERATIONS, ATTACK_ELITES = 128, 16, 12
 """cross-entropy method: maneuvers in a generation, generations, and elites that determine the next generation"""
 MAX_LEADER_ACCELERATION = 3.0
 """largest acceleration of an adversarial leader [m/s2]"""
+STATE_NAMES, MAX_SPEED = ("speed", "leader speed", "gap"), 100.0
+"""quantities of a state that are checked, and the largest allowed speed [m/s]"""
 MIN_MOVING_SPEED = 1.0
 """speed above which time gaps are evaluated [m/s]"""
 
@@ -109,6 +111,18 @@ def make_certificate(controller: Controller) -> dict[str, Any]:
     return asdict(certify_driver(driver, states, humans))
 
 
+def describe_worst_cases(certificate: dict[str, Any], driver: FilteredDriver) -> str:
+    """Return in one line from which states and behind which leaders a controller was simulated, and what happened."""
+    worst, domain = certificate["worst_cases"], certificate["domain"]
+    speeds, gaps = ("{:.3g} to {:.3g}".format(*domain[name]) for name in ("speed", "leader_gap"))
+    braking = f"at most {driver.safety.leader_braking:g} m/s2"
+    return (
+        f"{worst['steps']:,} steps behind adversarial leaders that brake with {braking}, "
+        f"from {worst['leader_stops']:,} states at {speeds} m/s with gaps of {gaps} m: {worst['contacts']} contacts, "
+        f"minimum gap {worst['min_gap']:.2f} m"
+    )
+
+
 FollowingSimulator = Callable[[FollowingState, Floats], FollowingState]
 """simulates a controller behind leaders, from initial states and the leaders' accelerations, shape (steps, rows)"""
 
@@ -131,7 +145,12 @@ def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: I
         )
         return drive_world(world, driver)
 
-    states = FollowingState(*visited_states[:3])
+    states, fewest = FollowingState(*visited_states[:3]), 1 + max(1, round(ISO_MEAN_SECONDS / driver.time_step))
+    if len(states.speed) < fewest:
+        raise InputError(f"certify: a sample of {len(states.speed)} states is not allowed; allowed: {fewest} or more")
+    for name, values, largest in zip(STATE_NAMES, states, (MAX_SPEED, MAX_SPEED, MAX_OBSERVED_GAP), strict=True):
+        if not ((values >= 0.0) & (values <= largest)).all():  # refuses NaN, too
+            raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")
     ranges = [(float(values.min()), float(values.max())) for values in states]
     speeds = operating_speeds(float(states.speed.mean()), humans)
     return Certificate(

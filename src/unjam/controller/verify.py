@@ -9,12 +9,12 @@ import json
 import secrets
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
 from unjam.controller import file as archive
-from unjam.controller.certificate import make_certificate
+from unjam.controller.certificate import describe_worst_cases, make_certificate
 from unjam.controller.domain import road_description
 from unjam.controller.file import Controller, Floats, read_controller, read_sample, replay_states, sha256_of
 from unjam.controller.graph import check_graph, run_graph
@@ -22,6 +22,7 @@ from unjam.controller.manifest import PROVENANCE_ENTRIES, driver_interface, firs
 from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_recipe, user_code_recipes
+from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError, MissingPartError
 from unjam.files import parse_json, reject_damaged, to_json
 
@@ -212,10 +213,8 @@ def _check_certificate(controller: Controller) -> PartCheck:
     stated = parse_json(controller.parts[archive.CERTIFICATE_PART])  # before the simulations, in case it is damaged
     actual = _json_roundtrip(make_certificate(controller))
     _require_same("certificate", first_difference(stated, actual, CERTIFICATE_TOLERANCE))
-    worst = actual["worst_cases"]
-    detail = f"{worst['steps']:,} steps behind leaders that brake and attack, {worst['contacts']} contacts"
-    detail += f", minimum gap {worst['min_gap']:.2f} m: the same in repeated simulations"
-    return PartCheck("certificate", "checked", detail)
+    found = describe_worst_cases(actual, cast(FilteredDriver, controller.driver))
+    return PartCheck("certificate", "checked", f"{found}: the same in repeated simulations")
 
 
 def _action_limit(controller: Controller) -> float:
