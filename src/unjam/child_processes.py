@@ -6,7 +6,7 @@
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from pathlib import Path
 
 from unjam.processes import bind_to_parent
@@ -15,6 +15,8 @@ from unjam.user_code import is_package_folder
 
 PACKAGE_PARENT = str(Path(__file__).parents[1])
 """folder from which unjam itself is imported"""
+DATA_FOLDER = Path(__file__).with_name("controllers")
+"""folder of the package without Python modules and settings of libraries"""
 
 
 def python_command(*arguments: str) -> list[str]:
@@ -56,6 +58,13 @@ def isolated_start(import_path: Iterable[str]) -> Iterator[None]:
         for name, value in before.items():
             os.environ.pop(name)
             os.environ.update({} if value is None else {name: value})
+
+
+@contextmanager
+def outside_working_folder() -> Iterator[None]:
+    """Leave the working folder within the block: some libraries read it, or let their processes import from it."""
+    with chdir(DATA_FOLDER):
+        yield
 
 
 def _isolation_variables() -> dict[str, str]:
