@@ -7,6 +7,8 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import chdir, contextmanager
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 
 from unjam.processes import bind_to_parent
@@ -65,6 +67,21 @@ def outside_working_folder() -> Iterator[None]:
     """Leave the working folder within the block: some libraries read it, or let their processes import from it."""
     with chdir(DATA_FOLDER):
         yield
+
+
+class _MatplotlibFinder(MetaPathFinder):
+    """Finds matplotlib and loads it outside the working folder, whose `matplotlibrc` it would read first."""
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
+        spec = PathFinder.find_spec(fullname) if fullname == "matplotlib" else None
+        if spec is not None and spec.loader is not None:
+            spec.loader.exec_module = outside_working_folder()(spec.loader.exec_module)
+        return spec
+
+
+def isolate_matplotlib() -> None:
+    """Let matplotlib ignore settings in the working folder, if this process has not imported it yet."""
+    sys.meta_path.insert(0, _MatplotlibFinder())
 
 
 def _isolation_variables() -> dict[str, str]:
