@@ -11,7 +11,7 @@ from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 
-from unjam.processes import bind_to_parent
+from unjam.processes import bind_to_parent, follow_parent
 from unjam.trust import expected_code_environment
 from unjam.user_code import is_package_folder
 
@@ -82,6 +82,12 @@ class _MatplotlibFinder(MetaPathFinder):
 def isolate_matplotlib() -> None:
     """Let matplotlib ignore settings in the working folder, if this process has not imported it yet."""
     sys.meta_path.insert(0, _MatplotlibFinder())
+
+
+def initialize_pool_process(parent: int) -> None:
+    """Initialize a process of a pool, which ends with its parent."""
+    follow_parent(parent)
+    isolate_matplotlib()
 
 
 def _isolation_variables() -> dict[str, str]:

@@ -77,6 +77,13 @@ def exit_with_parent(signum: int) -> None:
         os.kill(os.getpid(), signum)
 
 
+def follow_parent(parent: int) -> None:
+    """Let this child end when its parent does; the parent alone handles interrupts of the terminal."""
+    os.environ[PARENT_VARIABLE] = str(parent)
+    exit_with_parent(signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 @contextmanager
 def capture_stderr(path: Path) -> Iterator[None]:
     """Write the standard error of this process, its libraries included, to a file within the block."""
@@ -105,12 +112,10 @@ def continue_in_limited_child(description: str, *writable: Path) -> None:
         return
     sys.stdout.flush()
     sys.stderr.flush()
-    parent = str(os.getpid())
+    parent = os.getpid()
     child = os.fork()
     if child == 0:
-        os.environ[PARENT_VARIABLE] = parent
-        exit_with_parent(signal.SIGKILL)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent receives it too, and ends the child
+        follow_parent(parent)
         limit_resources(MAX_CHILD_MEMORY, MAX_CHILD_TIME)
         confine_process(*writable)
         return
