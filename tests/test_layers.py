@@ -319,7 +319,7 @@ def test_python_children_start_in_one_way() -> None:
 
 
 PROCESS_WIDE = {
-    *("redirect_stdout", "redirect_stderr", "os.dup2", "os.chdir", "os.umask", "gc.freeze", "gc.disable"),
+    *("redirect_stdout", "redirect_stderr", "os.dup2", "chdir", "os.chdir", "os.umask", "gc.freeze", "gc.disable"),
     *("warnings.catch_warnings", "warnings.simplefilter", "warnings.filterwarnings", "logging.basicConfig"),
     *("signal.signal", "signal.alarm", "torch.set_num_threads", "torch.manual_seed", "np.random.seed"),
     *("os.environ.update", "os.environ.pop", "os.environ.setdefault", "sys.path.insert", "sys.path.append"),

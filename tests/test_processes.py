@@ -201,6 +201,19 @@ def test_an_owner_sends_heartbeats(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert (tmp_path / LOCK_FILE).stat().st_mtime > 1
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
+def test_a_fork_that_ends_leaves_private_folders(tmp_path: Path) -> None:
+    code = (
+        "import os, sys\nfrom unjam.processes import PrivateFolder\nkept = PrivateFolder()\n"
+        "with PrivateFolder() as folder:\n    child = os.fork()\n    if child == 0:\n        sys.exit()\n"
+        "    os.waitpid(child, 0)\n    print(os.path.exists(folder), os.path.exists(kept.name))"
+    )
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    assert done.stdout == "True True\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_private_folders_of_killed_processes_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     code = (

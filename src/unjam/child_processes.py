@@ -6,15 +6,19 @@
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 
-from unjam.processes import bind_to_parent
+from unjam.processes import bind_to_parent, follow_parent
 from unjam.trust import expected_code_environment
 from unjam.user_code import is_package_folder
 
 PACKAGE_PARENT = str(Path(__file__).parents[1])
 """folder from which unjam itself is imported"""
+DATA_FOLDER = Path(__file__).with_name("controllers")
+"""folder of the package without Python modules and settings of libraries"""
 
 
 def python_command(*arguments: str) -> list[str]:
@@ -56,6 +60,34 @@ def isolated_start(import_path: Iterable[str]) -> Iterator[None]:
         for name, value in before.items():
             os.environ.pop(name)
             os.environ.update({} if value is None else {name: value})
+
+
+@contextmanager
+def outside_working_folder() -> Iterator[None]:
+    """Leave the working folder within the block: some libraries read it, or let their processes import from it."""
+    with chdir(DATA_FOLDER):
+        yield
+
+
+class _MatplotlibFinder(MetaPathFinder):
+    """Finds matplotlib and loads it outside the working folder, whose `matplotlibrc` it would read first."""
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
+        spec = PathFinder.find_spec(fullname) if fullname == "matplotlib" else None
+        if spec is not None and spec.loader is not None:
+            spec.loader.exec_module = outside_working_folder()(spec.loader.exec_module)
+        return spec
+
+
+def isolate_matplotlib() -> None:
+    """Let matplotlib ignore settings in the working folder, if this process has not imported it yet."""
+    sys.meta_path.insert(0, _MatplotlibFinder())
+
+
+def initialize_pool_process(parent: int) -> None:
+    """Initialize a process of a pool, which ends with its parent."""
+    follow_parent(parent)
+    isolate_matplotlib()
 
 
 def _isolation_variables() -> dict[str, str]:

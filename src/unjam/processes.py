@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, redirect_stdout, suppress
 from functools import cache
 from pathlib import Path
+from weakref import finalize
 
 from unjam.errors import DiskError, InputError
 from unjam.files import open_in_place, remove
@@ -77,6 +78,13 @@ def exit_with_parent(signum: int) -> None:
         os.kill(os.getpid(), signum)
 
 
+def follow_parent(parent: int) -> None:
+    """Let this child end when its parent does; the parent alone handles interrupts of the terminal."""
+    os.environ[PARENT_VARIABLE] = str(parent)
+    exit_with_parent(signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 @contextmanager
 def capture_stderr(path: Path) -> Iterator[None]:
     """Write the standard error of this process, its libraries included, to a file within the block."""
@@ -105,12 +113,10 @@ def continue_in_limited_child(description: str, *writable: Path) -> None:
         return
     sys.stdout.flush()
     sys.stderr.flush()
-    parent = str(os.getpid())
+    parent = os.getpid()
     child = os.fork()
     if child == 0:
-        os.environ[PARENT_VARIABLE] = parent
-        exit_with_parent(signal.SIGKILL)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent receives it too, and ends the child
+        follow_parent(parent)
         limit_resources(MAX_CHILD_MEMORY, MAX_CHILD_TIME)
         confine_process(*writable)
         return
@@ -201,22 +207,34 @@ def _check_other_machine(path: Path, descriptor: int, target: str) -> None:
         raise InputError(f"{message}; allowed: one at a time, or {max_age:g} s after its end")
 
 
-class PrivateFolder(tempfile.TemporaryDirectory[str]):
-    """A temporary folder that a later process removes if this one is killed."""
+class PrivateFolder(AbstractContextManager[str]):
+    """A temporary folder, removed at the end of its process, or by a later one if that is killed."""
 
     def __init__(self) -> None:
         """Make and lock it."""
-        super().__init__(prefix=PRIVATE_FOLDER_PREFIX)
-        self._lock_descriptor = _open_locked(Path(self.name, PRIVATE_LOCK_FILE))
-        if self._lock_descriptor is not None:
-            os.write(self._lock_descriptor, _folder_identity(Path(self.name)))
+        self.name = tempfile.mkdtemp(prefix=PRIVATE_FOLDER_PREFIX)
+        lock = _open_locked(Path(self.name, PRIVATE_LOCK_FILE))
+        if lock is not None:
+            os.write(lock, _folder_identity(Path(self.name)))
+        self._finalizer = finalize(self, _remove_private_folder, Path(self.name), lock, os.getpid())
+
+    def __enter__(self) -> str:
+        return self.name
+
+    def __exit__(self, *error: object) -> None:
+        self.cleanup()
 
     def cleanup(self) -> None:
-        """Remove it."""
-        super().cleanup()
-        if self._lock_descriptor is not None:
-            os.close(self._lock_descriptor)
-            self._lock_descriptor = None
+        """Remove it; may be called twice, and has no effect in a fork of its process."""
+        self._finalizer()
+
+
+def _remove_private_folder(folder: Path, lock: int | None, process: int) -> None:
+    if os.getpid() != process:
+        return
+    remove(folder)
+    if lock is not None:
+        os.close(lock)
 
 
 @cache

@@ -22,7 +22,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 from matplotlib.figure import Figure
 
-from unjam.child_processes import isolated_start
+from unjam.child_processes import initialize_pool_process, isolated_start
 from unjam.controller import controller_hash
 from unjam.files import atomic_write, make_folder, to_json
 from unjam.reports.figures import png_bytes
@@ -161,10 +161,17 @@ def measure_parts(folder: Path, parts: Mapping[str, StudyPart], workers: int) ->
         # Spawned processes: a forked one would inherit the locks of torch's threads without the threads.
         context, share = multiprocessing.get_context("spawn"), max(1, workers // count)
         absolute = filter(os.path.isabs, sys.path)  # in a notebook it holds the working folder
-        with isolated_start(absolute), ProcessPoolExecutor(count, mp_context=context) as pool:
-            running = {pool.submit(function, *given, share): name for name, (function, given) in missing.items()}
-            for done in as_completed(running):
-                save_part(running[done], done.result())
+        others = set(multiprocessing.active_children())
+        new_pool = ProcessPoolExecutor(count, context, initialize_pool_process, (os.getpid(),))
+        with isolated_start(absolute), new_pool as pool:
+            try:
+                running = {pool.submit(function, *given, share): name for name, (function, given) in missing.items()}
+                for done in as_completed(running):
+                    save_part(running[done], done.result())
+            except BaseException:  # the pool would wait for its processes
+                for process in set(multiprocessing.active_children()) - others:
+                    process.terminate()
+                raise
     measured: dict[str, Any] = {}
     for name in parts:
         (part, _, entry), result = name.partition("/"), stored_part(name)["result"]

@@ -1,9 +1,14 @@
 import json
+import os
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from tests.test_processes import linux, soon
 from unjam.errors import EpisodeError
 from unjam.scenarios import Ring
 from unjam.training.evaluate import Evaluation
@@ -38,6 +43,11 @@ def numbers_below(limit: int, workers: int) -> list[int]:
     return list(range(limit))
 
 
+def wait_long(file: str, workers: int) -> None:
+    Path(file).write_text(f"{os.getpid()}\n")
+    time.sleep(300.0)
+
+
 def parts(count: int) -> dict[str, StudyPart]:
     return {f"of-{number}": (square, (number,)) for number in range(count)}
 
@@ -55,6 +65,30 @@ def test_entries_of_a_part_are_joined(tmp_path: Path) -> None:
     }
     found = measure_parts(tmp_path, entries, 1)
     assert found == {"squares": {"of 1": {"square": 1}, "of 2": {"square": 4}}, "rows": [0, 1, 0, 1, 2]}
+
+
+PROGRAM = """
+import signal, sys
+from pathlib import Path
+from tests.paper.test_study import measure_parts, wait_long
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+measure_parts(Path(sys.argv[1]), {name: (wait_long, (f"{sys.argv[1]}/{name}",)) for name in ("one", "two")}, 2)
+"""
+
+
+@linux
+@pytest.mark.long
+@pytest.mark.parametrize("signum", [signal.SIGKILL, signal.SIGTERM])
+def test_processes_that_measure_parts_end_with_the_program(signum: signal.Signals, tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])}
+    program = subprocess.Popen([sys.executable, "-c", PROGRAM, str(tmp_path)], env=environment)
+    files, patience = (tmp_path / "one", tmp_path / "two"), time.monotonic() + 60.0
+    while not all(file.exists() and file.read_text().endswith("\n") for file in files):
+        assert time.monotonic() < patience
+        time.sleep(0.05)
+    program.send_signal(signum)
+    assert program.wait(timeout=15.0) == (143 if signum == signal.SIGTERM else -signum)
+    assert all(soon(int(file.read_text())) for file in files)
 
 
 def test_a_part_is_measured_again_only_if_its_arguments_changed(tmp_path: Path) -> None:

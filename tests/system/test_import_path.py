@@ -1,4 +1,4 @@
-"""Modules in the working folder are never imported."""
+"""Modules in the working folder are never imported, and settings there not read."""
 
 import os
 import subprocess
@@ -163,3 +163,15 @@ def test_python_m_unjam_imports_nothing_from_the_working_folder(tmp_path: Path) 
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout[:6]) == (0, "unjam "), done.stderr
     assert not canary.exists()
+
+
+CHILD = "from unjam.worlds.messages import open_answer_pipe; open_answer_pipe(); import matplotlib"
+
+
+@pytest.mark.parametrize(
+    "command", [[UNJAM, "model", "missing"], [sys.executable, "-c", CHILD]], ids=["unjam", "child"]
+)
+def test_settings_of_matplotlib_in_the_working_folder_are_not_read(command: list[str], tmp_path: Path) -> None:
+    (tmp_path / "matplotlibrc").write_bytes(b"\xff")
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr, done.stderr

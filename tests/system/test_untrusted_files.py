@@ -38,19 +38,29 @@ def test_a_graph_that_needs_too_much_memory_is_refused_in_one_line(unjam: Run, t
     assert "graph: cannot be run" in ran.stderr
 
 
-def test_a_report_in_a_locked_folder_is_refused(unjam: Run, tmp_path: Path) -> None:
+def test_a_report_from_or_in_a_locked_folder_is_refused(unjam: Run, tmp_path: Path) -> None:
     drive = ["drive", "ring", "--driver", "pi", "--episodes", "1", "--set", "horizon=20", "--out", "run"]
     assert unjam(*drive, pictures=False).returncode == 0
     before = (tmp_path / "run" / "report.html").read_bytes()
-    process = holder(tmp_path / "run")
-    for arguments in (["report", "run"], ["report", "run", "--out", "run/other.html"]):
+    (tmp_path / "locked").mkdir()
+    processes = holder(tmp_path / "run"), holder(tmp_path / "locked")
+    (tmp_path / "free").mkdir()
+    for file in ("evaluation.json", "episodes.parquet", "plot_episodes.safetensors"):
+        (tmp_path / "free" / file).write_bytes((tmp_path / "run" / file).read_bytes())
+    for arguments in (
+        ["report", "run"],
+        ["report", "run", "--out", "x.html"],
+        ["report", "free", "--out", "locked/x.html"],
+    ):
         ran = unjam(*arguments, pictures=False)
         assert (ran.returncode, one_line(ran.stderr)) == (2, True), ran.stderr
         assert "is being written by another process" in ran.stderr
-    assert unjam("report", "run", "--out", "page.html", pictures=False).returncode == 0
-    process.communicate("")
+    assert unjam("report", "free", pictures=False).returncode == 0
+    for process in processes:
+        process.communicate("")
     assert (tmp_path / "run" / "report.html").read_bytes() == before
-    assert not (tmp_path / "run" / "other.html").exists()
+    assert not (tmp_path / "x.html").exists()
+    assert unjam("report", "run", "--out", "x.html", pictures=False).returncode == 0
 
 
 SHORT_RING = ("ring", "--set", "horizon=20")

@@ -83,6 +83,21 @@ def test_missing_ray_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         run_all({"any": CommandLine(["--version"], tmp_path / "log")}, 1, "ray", print)
 
 
+@pytest.mark.slow
+def test_ray_imports_nothing_from_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray")
+    monkeypatch.chdir(tmp_path)
+    for planted in (tmp_path / "numpy.py", tmp_path / "unjam" / "__init__.py"):
+        planted.parent.mkdir(exist_ok=True)
+        planted.write_text(f"open({str(tmp_path / 'canary')!r}, 'w').close()\n")
+    (tmp_path / "file").touch()
+    run_all({"relative": command_of(Path("relative"))}, 1, "ray", print)
+    assert (tmp_path / "relative" / "run" / "controller.unjam").is_file()
+    with pytest.raises(UnjamError, match=r"^[^\n]*/file[^\n]*$"):
+        run_all({"failing": CommandLine([], tmp_path / "file" / "log")}, 1, "ray", print)
+    assert not (tmp_path / "canary").exists()
+
+
 @pytest.fixture
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """A Ray cluster of two machines, which are processes here, with a core each."""

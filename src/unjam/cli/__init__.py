@@ -14,7 +14,7 @@ from typer import Option
 from typer.core import TyperGroup
 
 from unjam import __version__
-from unjam.child_processes import isolate_children
+from unjam.child_processes import isolate_children, isolate_matplotlib
 from unjam.cli.options import with_trust_option
 from unjam.errors import (
     DISK_ERRNOS,
@@ -130,6 +130,7 @@ def main() -> None:
             signal.signal(signum, _terminate)
     exit_with_parent(signal.SIGTERM)
     isolate_children()
+    isolate_matplotlib()
     sys.exit(_run_app())
 
 

@@ -147,8 +147,8 @@ def report_command(
     continue_in_limited_child(f"report: {', '.join(map(str, folders))}", target.absolute().parent, Path(get_cachedir()))
     from unjam.reports.html import write_report_page
 
-    if target.parent in folders:
-        check_not_locked(target.parent)
+    for folder in (*folders, target.parent):
+        check_not_locked(folder)
     page = write_report_page(folders, target)
     if json:
         print_json({"report": str(page), "folders": [str(folder) for folder in folders]})

@@ -34,7 +34,7 @@ MAX_PLOT_TIMES = 600
 PLOT_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
-    "text.usetex": False,  # a matplotlibrc of the working folder could enable LaTeX, which runs code
+    "text.usetex": False,  # in a program, a matplotlibrc could enable LaTeX, which runs code
     "axes.edgecolor": MUTED_COLOR,
     "axes.labelcolor": TEXT_COLOR,
     "axes.titlecolor": TEXT_COLOR,

@@ -19,8 +19,14 @@ from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Literal, NamedTuple
 
-from unjam.child_processes import child_environment, child_import_path, isolated_start, python_command
-from unjam.errors import UnjamError, error_from_name, import_optional
+from unjam.child_processes import (
+    child_environment,
+    child_import_path,
+    isolated_start,
+    outside_working_folder,
+    python_command,
+)
+from unjam.errors import UnjamError, as_unjam_error, error_from_name, import_optional
 from unjam.files import APPEND_FLAGS, atomic_write, make_folder, open_in_place
 from unjam.folders import PROTECTED_FOLDERS_VARIABLE
 from unjam.parameters import build_dataclass
@@ -63,6 +69,7 @@ def training_command(config: "RunConfig", folder: Path, config_file: Path, log: 
     """Return the command line that starts or resumes a training; its configuration is written to `config_file`."""
     from unjam.training.config import CONFIG_FILE, to_toml
 
+    folder, config_file, log = (path.absolute() for path in (folder, config_file, log))  # another machine runs it
     make_folder(config_file.parent)
     atomic_write(config_file, to_toml(config))
     options = ["--workers", str(config.workers), *([TRUST_CODE_OPTION] if is_all_code_trusted() else [])]
@@ -75,9 +82,10 @@ def training_command(config: "RunConfig", folder: Path, config_file: Path, log: 
 
 
 class LocalExecutor:
-    """Runs command lines on this machine, and can stop all of them."""
+    """Runs command lines on this machine, in a folder that exists or the working folder, and can stop all of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, folder: str | None = None) -> None:
+        self._folder = folder
         self._running: set[subprocess.Popen[bytes]] = set()
         self._lock = threading.Lock()
         self._is_stopped = False
@@ -95,7 +103,9 @@ class LocalExecutor:
         with open(open_in_place(command.log, APPEND_FLAGS), "ab") as log:
             log.write(f"$ {shlex.join(argv)}\n".encode())
             log.flush()
-            with subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment) as process:
+            with subprocess.Popen(
+                argv, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, cwd=self._folder
+            ) as process:
                 with self._lock:
                     self._running.add(process)
                 code = process.wait()
@@ -153,23 +163,38 @@ def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, 
 @contextmanager
 def _open_ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
     """Yield a function that runs a command line on the existing Ray cluster, or on one of this machine."""
-    ray = import_optional("ray")
-    with isolated_start(child_import_path()):
+    ray, folder = import_optional("ray"), os.getcwd()
+    # Ray's processes import modules from the folder in which it was started.
+    with _ray_errors(), isolated_start(child_import_path()), outside_working_folder():
         try:
             ray.init(address="auto", log_to_driver=False)
         except ConnectionError:
             ray.init(address="local", num_cpus=workers, include_dashboard=False, log_to_driver=False)
     remote = ray.remote(num_cpus=1, max_retries=MAX_ATTEMPTS - 1)(_run_on_node)
+
+    def run(command: CommandLine) -> int:
+        with _ray_errors():
+            return ray.get(remote.remote(command, folder, bind_to_parent({})[PROTECTED_FOLDERS_VARIABLE]))
+
     try:
-        yield lambda command: ray.get(remote.remote(command, bind_to_parent({})[PROTECTED_FOLDERS_VARIABLE]))
+        yield run
     finally:
         ray.shutdown()
 
 
-def _run_on_node(command: CommandLine, protected_folders: str) -> int:
-    """Run a command line in a process of the cluster, with the protected folders of the starting machine."""
+@contextmanager
+def _ray_errors() -> Iterator[None]:
+    """Raise errors of Ray as `UnjamError`, and errors of a process of the cluster with their own class."""
+    try:
+        yield
+    except Exception as error:
+        raise as_unjam_error(getattr(error, "cause", None) or error) from None
+
+
+def _run_on_node(command: CommandLine, folder: str, protected_folders: str) -> int:
+    """Run a command line in a process of the cluster, with the folders of the starting machine."""
     os.environ[PROTECTED_FOLDERS_VARIABLE] = protected_folders
-    return LocalExecutor().run(command)
+    return LocalExecutor(folder if os.path.isdir(folder) else None).run(command)
 
 
 @expecting_code()

@@ -12,7 +12,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from unjam.child_processes import child_environment, python_command
+from unjam.child_processes import child_environment, isolate_matplotlib, python_command
 from unjam.processes import exit_with_parent
 from unjam.tree import Arrays
 
@@ -36,6 +36,7 @@ def start_child(module: str, stderr: IO[bytes] | None = None, **environment: str
 def open_answer_pipe() -> IO[bytes]:
     """Return the pipe for the answers of this process, which from now on prints to its standard error."""
     exit_with_parent(signal.SIGKILL)
+    isolate_matplotlib()
     output = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # SUMO and user code may print: not into the answers
     return output

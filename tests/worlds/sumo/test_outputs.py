@@ -6,6 +6,7 @@ import pytest
 
 from tests.worlds.sumo.user_networks import STANDING, TELEPORTS, UNSORTED, straight
 from unjam.drivers import Human
+from unjam.errors import EpisodeError
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import SumoWarning
@@ -50,8 +51,9 @@ def test_the_size_of_a_log_that_is_read_is_limited(tmp_path: Path) -> None:
     assert 5_000 < many.count < 20_000
 
 
-def test_a_missing_log_has_no_warnings(tmp_path: Path) -> None:
-    assert read_warnings(tmp_path / "none.log") == ()
+def test_a_missing_log_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(EpisodeError, match="warnings cannot be read: No such file"):
+        read_warnings(tmp_path / "none.log")
 
 
 @pytest.mark.parametrize("backend", ["libsumo", pytest.param("traci", marks=pytest.mark.long)])

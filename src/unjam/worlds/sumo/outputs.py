@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from unjam.errors import EpisodeError
 from unjam.worlds.record import SumoWarning, Trips
 from unjam.worlds.sumo.networks import MESSAGE_TOTAL_MARKER
 
@@ -62,14 +63,15 @@ def _vehicle_class(kind: str, vehicle_classes: dict[str, str]) -> str:
 def read_warnings(log_path: Path) -> tuple[SumoWarning, ...]:
     """Return the warnings and errors in a complete log, except those that unjam counts itself.
 
-    SUMO must have written it with `aggregate-warnings` at `MAX_EXAMPLES_OPTION` and closed it.
+    SUMO must have written it with `aggregate-warnings` at `MAX_EXAMPLES_OPTION` and closed it. Raise `EpisodeError` if
+    it cannot be read.
     """
     try:
         with log_path.open(errors="replace") as file:
             text = file.read(MAX_LOG_BYTES)
             text = text.rpartition("\n")[0] if file.read(1) else text  # without an incomplete message
-    except OSError:
-        return ()
+    except OSError as error:
+        raise EpisodeError(f"SUMO's warnings cannot be read: {error.strerror}") from error
     messages = re.findall(r"^(?:Warning|Error): (.*(?:\n(?!Warning:|Error:).*)*)", text, re.MULTILINE)
     examples, counts = dict[str, str](), Counter[str]()
     totals = list[tuple[int, str]]()
