@@ -352,6 +352,56 @@ def test_rows_with_rounded_time_stamps_are_read_unchanged(rate: float, decimals:
         np.testing.assert_array_equal(getattr(found, name), rows[name])
 
 
+TIMES = np.arange(0, 40, 0.1)
+OTHER_UNITS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
+    "dates": (
+        lambda rows: rows.assign(time=pd.to_datetime(rows["time"], unit="s")),
+        "line 2: time: '1970-01-01 00:00:00' is not allowed; allowed: finite numbers of seconds",
+    ),
+    "durations": (
+        lambda rows: rows.assign(time=pd.to_timedelta(rows["time"].to_numpy(), "s")),
+        "line 2: time: '0 days 00:00:00' is",
+    ),
+    "milliseconds": (lambda rows: rows.assign(time=1000 * rows["time"]), "time: steps of 100 s are .* in seconds"),
+    "minutes": (lambda rows: waves(35 * TIMES, 35 * TIMES / 60), r"gap, speed, .*, time: gaps that change 63 times"),
+    "feet": (lambda rows: rows.assign(gap=rows["gap"] / METERS_PER_FOOT), r"gap, .*: gaps that change 3\.3 times as"),
+    "km/h": (
+        lambda rows: rows.assign(speed=3.6 * rows["speed"], leader_speed=3.6 * rows["leader_speed"]),
+        r"0\.28 times",
+    ),
+    "km/h of one vehicle": (
+        lambda rows: rows.assign(speed=3.6 * rows["speed"]),
+        r"speed, leader_speed: .* ratio of 0\.28",
+    ),
+    "swapped speeds": (
+        lambda rows: rows.rename(columns={"speed": "leader_speed", "leader_speed": "speed"}),
+        "change -1 tim",
+    ),
+    "columns of one name": (
+        lambda rows: rows.assign(v_lead=1.0).rename(columns={"v_lead": "gap"}),
+        "2 columns have the .* 'gap'",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_UNITS)
+def test_units_that_do_not_fit_each_other_are_refused(name: str, tmp_path: Path) -> None:
+    change, words = OTHER_UNITS[name]
+    changed, is_date = change(waves(TIMES, TIMES)), name in ("dates", "durations")
+    path = tmp_path / ("t.parquet" if is_date else "t.csv")
+    changed.to_parquet(path) if is_date else changed.to_csv(path, index=False)
+    with pytest.raises(InputError, match=words):
+        read_trajectories(path)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_at_constant_speed_is_no_wrong_unit(seed: int, tmp_path: Path) -> None:
+    noise = np.random.default_rng(seed).normal(0.0, 0.2, (3, len(TIMES)))
+    rows = {"pair": "a", "time": TIMES, "speed": 20 + noise[0], "leader_speed": 20 + noise[1], "gap": 30 + noise[2]}
+    pd.DataFrame(rows).to_csv(tmp_path / "t.csv", index=False)
+    assert len(read_trajectories(tmp_path / "t.csv").trajectories) == 1
+
+
 @pytest.mark.parametrize("rate", [10, 30])
 def test_samples_of_an_irregular_clock_are_interpolated(rate: float, tmp_path: Path) -> None:
     times = np.arange(0, 40, 1 / rate)

@@ -12,7 +12,7 @@ import pandas as pd
 
 from unjam.errors import InputError, shorten_list, unknown_name
 from unjam.physics.arrays import Floats
-from unjam.recordings.tables import read_table
+from unjam.recordings.tables import check_unique, read_table
 from unjam.recordings.trajectories import FollowingTrajectory, even_times
 
 TABLE_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
@@ -27,6 +27,15 @@ TIME_STEP_TOLERANCE = 0.01
 """largest relative difference between intervals of rows that are equal, and between time steps that are"""
 MISSING_ROW_INTERVAL = 1.5
 """shortest interval in which a row is missing, relative to the usual one"""
+MAX_TIME_STEP = 1.5
+"""longest time between two samples [s]: waves of a few seconds must be visible"""
+MIN_SAMPLES = 3
+"""fewest samples of a trajectory: the interval between two single rows is no time step"""
+UNIT_RATIO_LIMITS = (2 / 3, 1.5)
+"""smallest and largest ratio of quantities that are equal where the units of all columns fit each other"""
+CHANGE_SECONDS, MIN_GAP_CHANGE, MIN_CORRELATION = 5.0, 1.0, 0.7
+"""interval in which gaps change [s], smallest root mean square of these changes [m], and of their correlation with the
+speeds, from which on they show that a unit is wrong; in NGSIM and OpenACC the correlation is 1.00"""
 MAX_TIME_DECIMALS = 6
 """most decimals of time stamps that are taken for rounded"""
 METERS_PER_FOOT = 0.3048
@@ -257,6 +266,7 @@ def _check_columns(frame: pd.DataFrame, required: Iterable[str], path: Path) -> 
     if missing:
         columns = shorten_list(str(name) for name in frame.columns if name != "line")
         raise InputError(f"{path.name}: no column {missing[0]!r}; it has: {columns}; required: {', '.join(required)}")
+    check_unique(path, [str(name) for name in frame.columns if name in required])
 
 
 def _join_columns(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
@@ -277,7 +287,9 @@ def to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     """
     columns, not_numeric = dict[str, pd.Series](), pd.Series("", frame.index)
     for name in names:
-        columns[name] = pd.Series(pd.to_numeric(frame[name], errors="coerce"), frame.index)
+        is_date = frame[name].dtype.kind in "mM"  # pandas would return nanoseconds
+        numeric = np.nan if is_date else pd.to_numeric(frame[name], errors="coerce")
+        columns[name] = pd.Series(numeric, frame.index)
         is_text = columns[name].isna() & frame[name].notna()
         texts = frame.loc[is_text, name].map(lambda value: str(value).strip())
         if texts.empty:
@@ -320,8 +332,11 @@ def split_trajectories(
         for first, last in pairwise([0, *(np.flatnonzero(missing) + 1).tolist(), len(rows)]):
             seconds = (last - first - 1) * step
             longest = max(longest, seconds)
-            if seconds < options.min_seconds - step / 2 or last - first < 2:
+            if seconds < options.min_seconds - step / 2 or last - first < MIN_SAMPLES:
                 continue
+            if step > MAX_TIME_STEP:
+                allowed = f"<= {MAX_TIME_STEP:g} s; are its times in seconds?"
+                raise InputError(f"{path.name}: time: steps of {step:g} s are not allowed; allowed: {allowed}")
             part = rows.iloc[first:last]
             short_count -= len(part)
             pair = str(part["pair"].iloc[0])
@@ -335,8 +350,38 @@ def split_trajectories(
         raise InputError(
             f"{path.name}: no trajectory lasts {options.min_seconds:g} s; the longest lasts {longest:.3g} s"
         )
+    _check_units(trajectories, path)
     reasons = {**skipped_rows, f"trajectories shorter than {options.min_seconds:g} s": short_count}
     return ReadResult(trajectories, len(frame) + sum(skipped_rows.values()), bad_rows, reasons)
+
+
+def _check_units(trajectories: Sequence[FollowingTrajectory], path: Path) -> None:
+    """Raise `InputError` if the gaps do not change as the speeds and the times imply: then their units do not fit."""
+    low, high = UNIT_RATIO_LIMITS
+    own = sum(each.speed[1:].sum() * each.time_step for each in trajectories)
+    led = sum(each.leader_speed[1:].sum() * each.time_step - (each.gap[-1] - each.gap[0]) for each in trajectories)
+    if own > MIN_GAP_CHANGE and not low <= led / own <= high:
+        raise InputError(
+            f"{path.name}: speed, leader_speed: a ratio of {led / own:.2g} of the distances of leader and follower "
+            "is not allowed; allowed: {low:.2g} to {high:g}, as in m/s"
+        )
+    expected, recorded = list[Floats](), list[Floats]()
+    for each in trajectories:
+        closing = each.leader_speed - each.speed
+        implied = np.cumsum((closing[1:] + closing[:-1]) / 2.0) * each.time_step
+        lag = min(max(1, round(CHANGE_SECONDS / each.time_step)), len(implied) - 1)
+        expected.append(implied[lag:] - implied[:-lag])
+        recorded.append(each.gap[1:][lag:] - each.gap[1:][:-lag])
+    implied, change = np.concatenate(expected), np.concatenate(recorded)
+    squares, product = (float(implied @ implied), float(change @ change)), float(implied @ change)
+    is_clear = abs(product) >= MIN_CORRELATION * np.sqrt(squares[0] * squares[1])
+    if max(squares) < MIN_GAP_CHANGE**2 * len(change) or not min(squares) or not is_clear:
+        return
+    if not low <= product / squares[0] <= high:
+        raise InputError(
+            f"{path.name}: gap, speed, leader_speed, time: gaps that change {product / squares[0]:.2g} times as fast "
+            "as the speeds imply are not allowed; allowed: gaps in m, speeds in m/s and times in s"
+        )
 
 
 def _common_time_steps(steps: Sequence[float], seconds: Sequence[float]) -> list[float]:
@@ -377,7 +422,7 @@ def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:
         values = frame[name].to_numpy(np.float64)
         low, high = VALUE_LIMITS.get(name, (-np.inf, np.inf))
         is_wrong = ~np.isfinite(values) | (values < low) | (values > high)
-        allowed = f"{low:g} to {high:g}" if name in VALUE_LIMITS else "finite"
+        allowed = f"{low:g} to {high:g}" if name in VALUE_LIMITS else "finite numbers of seconds"
         is_bad |= is_wrong
         for line, value, text in zip(*frame.loc[is_wrong, ["line", name, "not_numeric"]].to_numpy().T, strict=True):
             reasons.setdefault(int(line), f"{text or f'{name}: {value:g}'} is not allowed; allowed: {allowed}")

@@ -4,7 +4,8 @@ import csv
 import gzip
 import re
 import zlib
-from collections.abc import Hashable
+from collections import Counter
+from collections.abc import Hashable, Iterable
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -85,6 +86,13 @@ def _refused_file(path: Path, reason: str) -> InputError:
     return InputError(f"{path.name}: cannot be read: {reason}; allowed: {ALLOWED_FILES}")
 
 
+def check_unique(path: Path, columns: Iterable[str]) -> None:
+    """Raise `InputError` if two of these columns have the same name: one of them would be ignored."""
+    counts = Counter(name.strip() for name in columns)
+    for name in [name for name, count in counts.items() if name and count > 1]:
+        raise InputError(f"{path.name}: {counts[name]} columns have the name {name!r}; allowed: one")
+
+
 def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     """Return SUMO's FCD output with the columns that it has as CSV."""
     if b"<fcd-export" not in head:
@@ -120,6 +128,8 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
         if len(cells) not in HEADERLESS_COLUMNS:
             raise _refused_file(path, "its first line is not the names of its columns")
         header, options = -1, {"names": HEADERLESS_COLUMNS[len(cells)], "header": None}
+    else:
+        check_unique(path, cells if separator == r"\s+" else next(csv.reader([lines[header]], delimiter=separator)))
     rows = "\n".join(lines[header + 1 :])
     if separator != "," and re.search(r"\d,\d", rows) and not re.search(r"\d\.\d", rows):
         options["decimal"] = ","
