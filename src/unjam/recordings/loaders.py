@@ -58,8 +58,8 @@ FCD_COLUMNS = ("timestep_time", "vehicle_speed", "vehicle_leaderSpeed", "vehicle
 --fcd-output.max-leader-distance"""
 GROUPED_NUMBER = re.compile(r"-?\d{1,3}(,\d{3})+(\.\d+)?")
 """a number with commas between thousands"""
-MAX_LISTED_ROWS, MAX_TEXT_LENGTH = 5, 40
-"""maximum number of bad rows, and of characters of a value, in a message"""
+MAX_LISTED_ROWS, MAX_TEXT_LENGTH, MAX_BAD_ROWS = 5, 40, 1 << 20
+"""maximum number of bad rows, and of characters of a value, in a message, and of bad rows with a reason"""
 
 
 @dataclass(frozen=True)
@@ -297,7 +297,7 @@ def to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
         is_grouped = texts.map(lambda text: bool(GROUPED_NUMBER.fullmatch(text)))
         numbers = texts[is_grouped].map(lambda text: float(text.replace(",", "")))
         columns[name] = columns[name].astype(np.float64).fillna(numbers)
-        others = f"{name}: " + texts[~is_grouped].map(lambda text: repr(text[:MAX_TEXT_LENGTH]))
+        others = f"{name}: " + texts[~is_grouped].head(MAX_BAD_ROWS).map(lambda text: repr(text[:MAX_TEXT_LENGTH]))
         not_numeric = not_numeric.where(not_numeric != "", others.reindex(frame.index).fillna(""))
     return frame.assign(**columns, not_numeric=not_numeric)
 
@@ -314,10 +314,12 @@ def split_trajectories(
         InputError: a row is bad, or no trajectory remains.
     """
     (is_bad, bad_rows), skipped_rows = _find_bad_rows(frame), skipped_rows or {}
-    if bad_rows and not options.drop_bad_rows:
-        more = f" ({len(bad_rows)} bad rows)" if len(bad_rows) > 1 else ""
+    bad_count = int(np.sum(is_bad))
+    if bad_count > (MAX_BAD_ROWS if options.drop_bad_rows else 0):
+        more = f" ({bad_count} bad rows)" if bad_count > 1 else ""
         line, reason = next(iter(bad_rows.items()))
-        raise InputError(f"{path.name}: line {line}: {reason}{more}{options.bad_row_hint}")
+        hint = f"; {MAX_BAD_ROWS:,} can be left out" if options.drop_bad_rows else options.bad_row_hint
+        raise InputError(f"{path.name}: line {line}: {reason}{more}{hint}")
     good = frame.loc[~is_bad].sort_values(by=["pair", "time"], kind="stable")
     groups = [rows for _, rows in good.groupby("pair", sort=False, dropna=False) if len(rows) > 1]
     if not groups:
@@ -424,9 +426,10 @@ def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:
         is_wrong = ~np.isfinite(values) | (values < low) | (values > high)
         allowed = f"{low:g} to {high:g}" if name in VALUE_LIMITS else "finite numbers of seconds"
         is_bad |= is_wrong
-        for line, value, text in zip(*frame.loc[is_wrong, ["line", name, "not_numeric"]].to_numpy().T, strict=True):
+        described = frame.loc[is_wrong, ["line", name, "not_numeric"]].head(MAX_BAD_ROWS)
+        for line, value, text in zip(*described.to_numpy().T, strict=True):
             reasons.setdefault(int(line), f"{text or f'{name}: {value:g}'} is not allowed; allowed: {allowed}")
     is_repeated = frame.assign(time=frame["time"].round(6)).duplicated(["pair", "time"])
-    for line, time in zip(frame["line"][is_repeated], frame["time"][is_repeated], strict=True):
+    for line, time in frame.loc[is_repeated, ["line", "time"]].head(MAX_BAD_ROWS).to_numpy().tolist():
         reasons.setdefault(int(line), f"time: {time:g} occurs twice in its pair")
     return is_bad | is_repeated.to_numpy(), dict(sorted(reasons.items()))
