@@ -1,13 +1,14 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from tests.recordings.synthetic_trajectories import idm_driver, write_table
 from unjam.errors import DiskError, InputError
 from unjam.following.calibration import CalibrationSettings, MultiStepSettings
-from unjam.following.fit_drivers import FitDriversSettings, fit_drivers, fit_drivers_from_files, unit_warnings
+from unjam.following.fit_drivers import FitDriversSettings, fit_drivers, fit_drivers_from_files
 from unjam.physics.idm import IDMParameters
 from unjam.recordings.trajectories import FollowingTrajectory
 
@@ -78,12 +79,11 @@ def data(tmp_path: Path) -> Path:
     return path
 
 
-def test_speeds_in_another_unit_than_gaps_give_a_warning() -> None:
-    trajectory = idm_driver(IDMParameters(time_headway=1.3))
-    assert unit_warnings([trajectory]) == []
-    in_kmh = replace(trajectory, speed=3.6 * trajectory.speed, leader_speed=3.6 * trajectory.leader_speed)
-    (line,) = unit_warnings([in_kmh])
-    assert line.startswith("warning: gaps change 0.28 times as fast as the speeds imply")
+def test_population_whose_error_is_not_a_number_is_refused(trajectories: list[FollowingTrajectory]) -> None:
+    broken = replace(trajectories[0], gap=np.full_like(trajectories[0].gap, np.nan))
+    settings = FitDriversSettings(calibration=CalibrationSettings(generations=1, candidates=1), rounds=1)
+    with pytest.raises(InputError, match="gap error of one IDM for all: nan is not allowed; allowed: a finite number"):
+        fit_drivers([broken], settings)
 
 
 @pytest.mark.long

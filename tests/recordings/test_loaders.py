@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from pyarrow.parquet import ParquetFile
 
 from tests.worlds.sumo.user_networks import built
 from unjam.errors import InputError
-from unjam.recordings import tables
+from unjam.recordings import loaders, tables
 from unjam.recordings.loaders import METERS_PER_FOOT, ReadOptions, read_trajectories
 from unjam.recordings.tables import NGSIM_COLUMN_ORDER
 from unjam.worlds.sumo.networks import sumo_program
@@ -245,6 +246,13 @@ def test_bad_row_can_be_dropped_and_is_reported(tmp_path: Path) -> None:
     assert "dropped: line 14: gap: nan is not allowed; allowed: 0 to 1000" in result.summary_lines()
 
 
+def test_more_bad_rows_than_can_be_listed_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loaders, "MAX_BAD_ROWS", 10)
+    path = write_table_file(tmp_path / "t.csv", gap=["near"] * 40 + [-1] * 20)
+    with pytest.raises(InputError, match=r"line 2: gap: 'near' is .* \(60 bad rows\); 10 can be left out"):
+        read_trajectories(path, options=replace(SHORT, drop_bad_rows=True))
+
+
 def test_short_trajectories_are_counted(tmp_path: Path) -> None:
     path = write_table_file(tmp_path / "t.csv")
     frame = pd.read_csv(path)
@@ -302,9 +310,39 @@ def test_a_table_that_unpacks_to_too_much_is_refused_before_it_takes_memory(
     frame = pd.DataFrame({"pair": np.zeros(99_999, int), "time": 0.0})
     (frame.to_parquet if name.endswith("parquet") else frame.to_csv)(tmp_path / name)
     monkeypatch.setattr(pd, "read_csv", pytest.fail)
-    monkeypatch.setattr(pd, "read_parquet", pytest.fail)
+    monkeypatch.setattr(ParquetFile, "read", pytest.fail)
     with pytest.raises(InputError, match=r"t\..*: cannot be read: it has more than 100,000 (cells|bytes of text)"):
         read_trajectories(tmp_path / name)
+
+
+def test_long_text_that_parquet_stores_once_is_refused_before_it_is_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "MAX_TEXT_BYTES", 100_000)
+    pd.DataFrame({"pair": ["x" * 1001] * 100, "time": 0.0}).to_parquet(tmp_path / "t.parquet")
+    monkeypatch.setattr(pd, "DataFrame", pytest.fail)
+    with pytest.raises(InputError, match=r"t\.parquet: cannot be read: it has more than 100,000 bytes of text"):
+        read_trajectories(tmp_path / "t.parquet")
+
+
+def test_nested_columns_of_parquet_are_not_read(tmp_path: Path) -> None:
+    rows = pd.read_parquet(write_table_file(tmp_path / "t.parquet"))
+    rows.assign(extra=[[1.0] * 99] * len(rows), gap=[{"m": 1.0}] * len(rows)).to_parquet(tmp_path / "t.parquet")
+    with pytest.raises(InputError, match="no column 'gap'; it has: pair, time, speed, leader_speed; required"):
+        read_trajectories(tmp_path / "t.parquet")
+
+
+@pytest.mark.parametrize("limit", ["MAX_FCD_VEHICLES", "MAX_CELLS"])
+def test_short_rows_that_take_much_memory_are_counted(
+    limit: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, limit, 1000)
+    content = {"MAX_FCD_VEHICLES": b"<fcd-export>" + b"<vehicle/>" * 1001, "MAX_CELLS": b"pair\n" + b"1\n" * 1001}[
+        limit
+    ]
+    (tmp_path / "t.gz").write_bytes(gzip.compress(content))
+    with pytest.raises(InputError, match=r"it has more than 1,000 (elements 'vehicle'|cells); allowed"):
+        read_trajectories(tmp_path / "t.gz")
 
 
 WRITERS: dict[str, Callable[[pd.DataFrame, Path], object]] = {
@@ -350,6 +388,56 @@ def test_rows_with_rounded_time_stamps_are_read_unchanged(rate: float, decimals:
     assert found.time_step == pytest.approx(1 / rate, rel=5e-4)
     for name in ("speed", "leader_speed", "gap"):
         np.testing.assert_array_equal(getattr(found, name), rows[name])
+
+
+TIMES = np.arange(0, 40, 0.1)
+OTHER_UNITS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
+    "dates": (
+        lambda rows: rows.assign(time=pd.to_datetime(rows["time"], unit="s")),
+        "line 2: time: '1970-01-01 00:00:00' is not allowed; allowed: finite numbers of seconds",
+    ),
+    "durations": (
+        lambda rows: rows.assign(time=pd.to_timedelta(rows["time"].to_numpy(), "s")),
+        "line 2: time: '0 days 00:00:00' is",
+    ),
+    "milliseconds": (lambda rows: rows.assign(time=1000 * rows["time"]), "time: steps of 100 s are .* in seconds"),
+    "minutes": (lambda rows: waves(35 * TIMES, 35 * TIMES / 60), r"gap, speed, .*, time: gaps that change 63 times"),
+    "feet": (lambda rows: rows.assign(gap=rows["gap"] / METERS_PER_FOOT), r"gap, .*: gaps that change 3\.3 times as"),
+    "km/h": (
+        lambda rows: rows.assign(speed=3.6 * rows["speed"], leader_speed=3.6 * rows["leader_speed"]),
+        r"0\.28 times",
+    ),
+    "km/h of one vehicle": (
+        lambda rows: rows.assign(speed=3.6 * rows["speed"]),
+        r"speed, leader_speed: .* ratio of 0\.28",
+    ),
+    "swapped speeds": (
+        lambda rows: rows.rename(columns={"speed": "leader_speed", "leader_speed": "speed"}),
+        "change -1 tim",
+    ),
+    "columns of one name": (
+        lambda rows: rows.assign(v_lead=1.0).rename(columns={"v_lead": "gap"}),
+        "2 columns have the .* 'gap'",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_UNITS)
+def test_units_that_do_not_fit_each_other_are_refused(name: str, tmp_path: Path) -> None:
+    change, words = OTHER_UNITS[name]
+    changed, is_date = change(waves(TIMES, TIMES)), name in ("dates", "durations")
+    path = tmp_path / ("t.parquet" if is_date else "t.csv")
+    changed.to_parquet(path) if is_date else changed.to_csv(path, index=False)
+    with pytest.raises(InputError, match=words):
+        read_trajectories(path)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_at_constant_speed_is_no_wrong_unit(seed: int, tmp_path: Path) -> None:
+    noise = np.random.default_rng(seed).normal(0.0, 0.2, (3, len(TIMES)))
+    rows = {"pair": "a", "time": TIMES, "speed": 20 + noise[0], "leader_speed": 20 + noise[1], "gap": 30 + noise[2]}
+    pd.DataFrame(rows).to_csv(tmp_path / "t.csv", index=False)
+    assert len(read_trajectories(tmp_path / "t.csv").trajectories) == 1
 
 
 @pytest.mark.parametrize("rate", [10, 30])

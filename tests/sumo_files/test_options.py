@@ -114,8 +114,29 @@ def test_options_at_their_defaults_change_nothing(inside: str, tmp_path: Path) -
 def test_files_of_a_configuration_may_name_variables_that_are_not_set(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delenv("NOWHERE", raising=False)
-    path = configuration(tmp_path, '<scale value="${NOWHERE}2"/>')
-    path.write_text(path.read_text().replace("road.rou", "${NOWHERE}road.rou"))
+    monkeypatch.delenv("SUMO_HOME", raising=False)
+    path = configuration(tmp_path, '<scale value="${SUMO_HOME}2"/>')
+    path.write_text(path.read_text().replace("road.rou", "${SUMO_HOME}road.rou"))
     found = read_sumo_files(path)
     assert (found.route_files, found.options) == ((tmp_path / "road.rou.xml",), {"scale": "2"})
+
+
+@pytest.mark.parametrize(
+    ("inside", "field"),
+    [
+        ("", "route-files"),
+        ('<scale value="${SECRET}"/>', "scale"),
+        ('<scale-suffix value="a${SECRET}"/>', "scale-suffix"),
+    ],
+)
+def test_other_variables_of_the_environment_stay_secret(
+    inside: str, field: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SECRET", "topsecret42")
+    path = configuration(tmp_path, inside + '<tripinfo-output value="${SECRET}.xml"/>')
+    if not inside:
+        path.write_text(path.read_text().replace("road.rou", "${SECRET}/road.rou"))
+    with pytest.raises(InputError, match=r"SECRET.* is not allowed; allowed: \$\{HOME\}") as caught:
+        read_sumo_files(path)
+    assert f": {field}: " in str(caught.value)
+    assert "topsecret42" not in str(caught.value)

@@ -141,6 +141,31 @@ def test_included_files_are_read_wherever_they_are_included(tmp_path: Path) -> N
     assert [each.tag for each in copied.iter()][1:] == ["routes", "vType", "x", "vehicle"]
 
 
+FOREIGN = {
+    "types": ('<additional><vType id="a"/></additional>', ""),
+    "settings": ('<settings><server password="hunter2"/></settings>', "element 'settings' is not allowed"),
+    "text": ("<additional><param>hunter2</param></additional>", "text is not allowed; allowed: elements of SUMO"),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+@pytest.mark.parametrize("is_included", [True, False])
+def test_files_outside_the_folder_have_only_elements_of_sumo(is_included: bool, name: str, tmp_path: Path) -> None:
+    content, words = FOREIGN[name]
+    (tmp_path / "foreign.xml").write_text(content)
+    (tmp_path / "project").mkdir()
+    include = '<include href="../foreign.xml"/>' if is_included else ""
+    path = configuration(tmp_path / "project", routes=ROUTES.replace("<routes>", f"<routes>{include}"))
+    if not is_included:
+        path.write_text(path.read_text().replace("road.rou.xml", "road.rou.xml,../foreign.xml"))
+    if not words:
+        assert "a" in read_sumo_files(path).types
+        return
+    message = refusal_message(path)
+    assert message.startswith(f"foreign.xml: {words}")
+    assert "hunter2" not in message
+
+
 def test_elements_for_vehicle_types_apply_to_their_cavs(tmp_path: Path) -> None:
     rerouter = '<rerouter id="r" edges="a" vTypes="car bus"/>'
     routes = f'<routes>{rerouter}<vTypeDistribution id="m" vTypes="car"/><vehicle id="v" type="m"/></routes>'

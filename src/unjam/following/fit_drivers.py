@@ -33,8 +33,6 @@ RESIDUAL_VALIDATION_SHARE = 0.2
 """share of the drivers whose trajectories validate a residual"""
 MIN_RESIDUAL_DRIVERS = 5
 """minimum number of drivers for a residual, so that at least one of them validates it"""
-UNIT_RATIO_LIMITS = (0.5, 2.0)
-"""smallest and largest plausible ratio of gap changes to integrated speed differences; without noise it is one"""
 MIN_SUSPICIOUS_PARAMETERS = 3
 """number of parameters at a bound from which on a warning suspects wrong units or data"""
 FILTER_FIELDS = ("kind", "split", "driver")
@@ -67,7 +65,7 @@ class FittedDrivers:
 
     population: Population
     notes: list[str]
-    """summary of each file, and warnings about its units"""
+    """summary of each file, and whether its trajectories are interpolated"""
 
     def facts(self) -> dict[str, Any]:
         """Return the main facts for JSON."""
@@ -148,7 +146,6 @@ def fit_drivers_from_files(
     if any(each.time_step != time_step for each in trajectories):
         notes.append(f"trajectories with a shorter time step are interpolated to {time_step:g} s")
         trajectories = [each if each.time_step == time_step else each.resample(time_step) for each in trajectories]
-    notes += unit_warnings(trajectories)
     population = fit_drivers(trajectories, settings, on_progress)
     origin = manifest()
     # Populations are published: they do not name folders of this machine.
@@ -168,19 +165,6 @@ def _name_prefixes(files: Sequence[Path]) -> list[str]:
     return [f"{stem}-" for stem in stems] if len(files) > 1 else [""]
 
 
-def unit_warnings(trajectories: Sequence[FollowingTrajectory]) -> list[str]:
-    """Return a warning if the changes of the gaps do not agree with the speeds: then their units are not m and m/s."""
-    differences = [each.leader_speed - each.speed for each in trajectories]
-    closing = np.concatenate([(each[1:] + each[:-1]) / 2.0 for each in differences])
-    change = np.concatenate([np.diff(each.gap) / each.time_step for each in trajectories])
-    ratio = float(closing @ change / max(closing @ closing, 1e-9))
-    low, high = UNIT_RATIO_LIMITS
-    if low <= ratio <= high or not closing.any():
-        return []
-    ratio_text = f"gaps change {ratio:.2f} times as fast as the speeds imply (0.28 for speeds in km/h)"
-    return [f"warning: {ratio_text}; allowed: speeds in m/s and gaps in m"]
-
-
 def fit_drivers(
     trajectories: Sequence[FollowingTrajectory],
     settings: FitDriversSettings | None = None,
@@ -192,7 +176,7 @@ def fit_drivers(
     if it reduces this error for validation drivers.
 
     Raises:
-        InputError: there are too few drivers for a residual, or the time steps differ.
+        InputError: there are too few drivers for a residual, the time steps differ, or a simulated gap is not finite.
     """
     settings = settings or FitDriversSettings()
     for name in settings.individual:
@@ -206,6 +190,11 @@ def fit_drivers(
     typical, calibrated = _calibrate_in_rounds(
         trajectories, names, replace(settings, calibration=calibration), on_progress
     )
+    for name, each in {"one IDM for all": common, **calibrated}.items():
+        if not np.isfinite(each.gap_error):
+            raise invalid_value(
+                f"gap error of {name}", each.gap_error, "a finite number; are the data in m, m/s and s?"
+            )
     residual, facts = _fit_residual(trajectories, calibrated, settings) if settings.residual else (None, {})
     return Population(
         typical=typical,

@@ -12,7 +12,7 @@ import pandas as pd
 
 from unjam.errors import InputError, shorten_list, unknown_name
 from unjam.physics.arrays import Floats
-from unjam.recordings.tables import read_table
+from unjam.recordings.tables import check_unique, read_table
 from unjam.recordings.trajectories import FollowingTrajectory, even_times
 
 TABLE_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
@@ -27,6 +27,15 @@ TIME_STEP_TOLERANCE = 0.01
 """largest relative difference between intervals of rows that are equal, and between time steps that are"""
 MISSING_ROW_INTERVAL = 1.5
 """shortest interval in which a row is missing, relative to the usual one"""
+MAX_TIME_STEP = 1.5
+"""longest time between two samples [s]: waves of a few seconds must be visible"""
+MIN_TRAJECTORY_SAMPLES = 3
+"""fewest samples of a trajectory: the interval between two single rows is no time step"""
+UNIT_RATIO_LIMITS = (2 / 3, 1.5)
+"""smallest and largest ratio of quantities that are equal where the units of all columns fit each other"""
+CHANGE_SECONDS, MIN_GAP_CHANGE, MIN_CORRELATION = 5.0, 1.0, 0.7
+"""interval in which gaps change [s], smallest root mean square of these changes [m], and of their correlation with the
+speeds, from which on they show that a unit is wrong; in NGSIM and OpenACC the correlation is 1.00"""
 MAX_TIME_DECIMALS = 6
 """most decimals of time stamps that are taken for rounded"""
 METERS_PER_FOOT = 0.3048
@@ -49,8 +58,8 @@ FCD_COLUMNS = ("timestep_time", "vehicle_speed", "vehicle_leaderSpeed", "vehicle
 --fcd-output.max-leader-distance"""
 GROUPED_NUMBER = re.compile(r"-?\d{1,3}(,\d{3})+(\.\d+)?")
 """a number with commas between thousands"""
-MAX_LISTED_ROWS, MAX_TEXT_LENGTH = 5, 40
-"""maximum number of bad rows, and of characters of a value, in a message"""
+MAX_LISTED_ROWS, MAX_TEXT_LENGTH, MAX_BAD_ROWS = 5, 40, 1 << 20
+"""maximum number of bad rows, and of characters of a value, in a message, and of bad rows with a reason"""
 
 
 @dataclass(frozen=True)
@@ -113,7 +122,7 @@ def _convert_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Rea
     _check_columns(frame, TABLE_COLUMNS, path)
     if options.driver_columns and "driver" not in frame:
         _check_columns(frame, options.driver_columns, path)
-        frame["driver"] = _join_columns(frame, options.driver_columns)
+        frame["driver"] = join_row_values(frame, options.driver_columns)
     return split_trajectories(to_numeric(frame, TABLE_COLUMNS[1:]), path, options)
 
 
@@ -129,7 +138,7 @@ def _convert_ngsim(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Rea
 
 def _convert_reconstructed(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of the reconstructed NGSIM I-80 data, which are in meters and tenths of a second."""
-    vehicles = _select_columns(frame.rename(columns=_alphanumeric), RECONSTRUCTED_COLUMNS, VEHICLE_COLUMNS, path)
+    vehicles = _select_columns(frame.rename(columns=alphanumeric), RECONSTRUCTED_COLUMNS, VEHICLE_COLUMNS, path)
     vehicles = vehicles.assign(site=path.stem, time=vehicles["time"] / 10.0)
     return _trajectories_from_vehicles(vehicles, path, options)
 
@@ -157,7 +166,7 @@ def _convert_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadR
     _check_columns(frame, key, path)
     is_free = vehicles["gap"] < 0
     driver = frame["vehicle_id"].astype(str)
-    vehicles = vehicles.assign(pair=_join_columns(frame, key), driver=driver, kind="simulated")
+    vehicles = vehicles.assign(pair=join_row_values(frame, key), driver=driver, kind="simulated")
     return split_trajectories(vehicles.loc[~is_free], path, options, {"no leader": int(np.sum(is_free))})
 
 
@@ -178,8 +187,8 @@ def _trajectories_from_vehicles(vehicles: pd.DataFrame, path: Path, options: Rea
     vehicles = vehicles.loc[~is_free]
     numbered = vehicles.assign(suffix=_reused_number_suffix(vehicles))
     frame = vehicles.assign(
-        pair=_join_columns(vehicles, ("site", "vehicle", "leader", "lane")),
-        driver=_join_columns(numbered, ("site", "vehicle", "suffix")).str.rstrip("-"),
+        pair=join_row_values(vehicles, ("site", "vehicle", "leader", "lane")),
+        driver=join_row_values(numbered, ("site", "vehicle", "suffix")).str.rstrip("-"),
         kind="human",
         leader_speed=vehicles["speed_ahead"],
         gap=vehicles["front_ahead"] - vehicles["length_ahead"] - vehicles["front"],
@@ -233,13 +242,14 @@ def detect_format(frame: pd.DataFrame) -> str:
     names = set(map(str, frame.columns))
     if {name.lower() for name in names}.issuperset(NGSIM_COLUMNS):
         return "ngsim"
-    if set(map(_alphanumeric, names)).issuperset(RECONSTRUCTED_COLUMNS):
+    if set(map(alphanumeric, names)).issuperset(RECONSTRUCTED_COLUMNS):
         return "ngsim-reconstructed"
     columns = {"highd": HIGHD_COLUMNS, "fcd": ("timestep_time", "vehicle_id"), "openacc": ("Speed1", "IVS1")}
     return next((format for format, required in columns.items() if names.issuperset(required)), "table")
 
 
-def _alphanumeric(name: str) -> str:
+def alphanumeric(name: str) -> str:
+    """Return the letters, in lower case, and digits of a column name."""
     return re.sub(r"[^a-z0-9]", "", str(name).lower())
 
 
@@ -257,9 +267,10 @@ def _check_columns(frame: pd.DataFrame, required: Iterable[str], path: Path) -> 
     if missing:
         columns = shorten_list(str(name) for name in frame.columns if name != "line")
         raise InputError(f"{path.name}: no column {missing[0]!r}; it has: {columns}; required: {', '.join(required)}")
+    check_unique(path, [str(name) for name in frame.columns if name in required])
 
 
-def _join_columns(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
+def join_row_values(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
     """Return for each row the values of these columns, joined by hyphens.
 
     Rows with equal values are joined only once, because a file may have millions of rows.
@@ -277,7 +288,9 @@ def to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
     """
     columns, not_numeric = dict[str, pd.Series](), pd.Series("", frame.index)
     for name in names:
-        columns[name] = pd.Series(pd.to_numeric(frame[name], errors="coerce"), frame.index)
+        is_date = frame[name].dtype.kind in "mM"  # pandas would return nanoseconds
+        numeric = np.nan if is_date else pd.to_numeric(frame[name], errors="coerce")
+        columns[name] = pd.Series(numeric, frame.index)
         is_text = columns[name].isna() & frame[name].notna()
         texts = frame.loc[is_text, name].map(lambda value: str(value).strip())
         if texts.empty:
@@ -285,7 +298,7 @@ def to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
         is_grouped = texts.map(lambda text: bool(GROUPED_NUMBER.fullmatch(text)))
         numbers = texts[is_grouped].map(lambda text: float(text.replace(",", "")))
         columns[name] = columns[name].astype(np.float64).fillna(numbers)
-        others = f"{name}: " + texts[~is_grouped].map(lambda text: repr(text[:MAX_TEXT_LENGTH]))
+        others = f"{name}: " + texts[~is_grouped].head(MAX_BAD_ROWS).map(lambda text: repr(text[:MAX_TEXT_LENGTH]))
         not_numeric = not_numeric.where(not_numeric != "", others.reindex(frame.index).fillna(""))
     return frame.assign(**columns, not_numeric=not_numeric)
 
@@ -302,10 +315,12 @@ def split_trajectories(
         InputError: a row is bad, or no trajectory remains.
     """
     (is_bad, bad_rows), skipped_rows = _find_bad_rows(frame), skipped_rows or {}
-    if bad_rows and not options.drop_bad_rows:
-        more = f" ({len(bad_rows)} bad rows)" if len(bad_rows) > 1 else ""
+    bad_count = int(np.sum(is_bad))
+    if bad_count > (MAX_BAD_ROWS if options.drop_bad_rows else 0):
+        more = f" ({bad_count} bad rows)" if bad_count > 1 else ""
         line, reason = next(iter(bad_rows.items()))
-        raise InputError(f"{path.name}: line {line}: {reason}{more}{options.bad_row_hint}")
+        hint = f"; {MAX_BAD_ROWS:,} can be left out" if options.drop_bad_rows else options.bad_row_hint
+        raise InputError(f"{path.name}: line {line}: {reason}{more}{hint}")
     good = frame.loc[~is_bad].sort_values(by=["pair", "time"], kind="stable")
     groups = [rows for _, rows in good.groupby("pair", sort=False, dropna=False) if len(rows) > 1]
     if not groups:
@@ -320,8 +335,11 @@ def split_trajectories(
         for first, last in pairwise([0, *(np.flatnonzero(missing) + 1).tolist(), len(rows)]):
             seconds = (last - first - 1) * step
             longest = max(longest, seconds)
-            if seconds < options.min_seconds - step / 2 or last - first < 2:
+            if seconds < options.min_seconds - step / 2 or last - first < MIN_TRAJECTORY_SAMPLES:
                 continue
+            if step > MAX_TIME_STEP:
+                allowed = f"<= {MAX_TIME_STEP:g} s; are its times in seconds?"
+                raise InputError(f"{path.name}: time: steps of {step:g} s are not allowed; allowed: {allowed}")
             part = rows.iloc[first:last]
             short_count -= len(part)
             pair = str(part["pair"].iloc[0])
@@ -335,8 +353,38 @@ def split_trajectories(
         raise InputError(
             f"{path.name}: no trajectory lasts {options.min_seconds:g} s; the longest lasts {longest:.3g} s"
         )
+    _check_units(trajectories, path)
     reasons = {**skipped_rows, f"trajectories shorter than {options.min_seconds:g} s": short_count}
     return ReadResult(trajectories, len(frame) + sum(skipped_rows.values()), bad_rows, reasons)
+
+
+def _check_units(trajectories: Sequence[FollowingTrajectory], path: Path) -> None:
+    """Raise `InputError` if the gaps do not change as the speeds and the times imply: then their units do not fit."""
+    low, high = UNIT_RATIO_LIMITS
+    own = sum(each.speed[1:].sum() * each.time_step for each in trajectories)
+    led = sum(each.leader_speed[1:].sum() * each.time_step - (each.gap[-1] - each.gap[0]) for each in trajectories)
+    if own > MIN_GAP_CHANGE and not low <= led / own <= high:
+        raise InputError(
+            f"{path.name}: speed, leader_speed: a ratio of {led / own:.2g} of the distances of leader and follower "
+            f"is not allowed; allowed: {low:.2g} to {high:g}, as in m/s"
+        )
+    expected, recorded = list[Floats](), list[Floats]()
+    for each in trajectories:
+        closing = each.leader_speed - each.speed
+        implied = np.cumsum((closing[1:] + closing[:-1]) / 2.0) * each.time_step
+        lag = min(max(1, round(CHANGE_SECONDS / each.time_step)), len(implied) - 1)
+        expected.append(implied[lag:] - implied[:-lag])
+        recorded.append(each.gap[1:][lag:] - each.gap[1:][:-lag])
+    implied, change = np.concatenate(expected), np.concatenate(recorded)
+    squares, product = (float(implied @ implied), float(change @ change)), float(implied @ change)
+    is_clear = abs(product) >= MIN_CORRELATION * np.sqrt(squares[0] * squares[1])
+    if max(squares) < MIN_GAP_CHANGE**2 * len(change) or not min(squares) or not is_clear:
+        return
+    if not low <= product / squares[0] <= high:
+        raise InputError(
+            f"{path.name}: gap, speed, leader_speed, time: gaps that change {product / squares[0]:.2g} times as fast "
+            "as the speeds imply are not allowed; allowed: gaps in m, speeds in m/s and times in s"
+        )
 
 
 def _common_time_steps(steps: Sequence[float], seconds: Sequence[float]) -> list[float]:
@@ -377,11 +425,12 @@ def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:
         values = frame[name].to_numpy(np.float64)
         low, high = VALUE_LIMITS.get(name, (-np.inf, np.inf))
         is_wrong = ~np.isfinite(values) | (values < low) | (values > high)
-        allowed = f"{low:g} to {high:g}" if name in VALUE_LIMITS else "finite"
+        allowed = f"{low:g} to {high:g}" if name in VALUE_LIMITS else "finite numbers of seconds"
         is_bad |= is_wrong
-        for line, value, text in zip(*frame.loc[is_wrong, ["line", name, "not_numeric"]].to_numpy().T, strict=True):
+        described = frame.loc[is_wrong, ["line", name, "not_numeric"]].head(MAX_BAD_ROWS)
+        for line, value, text in zip(*described.to_numpy().T, strict=True):
             reasons.setdefault(int(line), f"{text or f'{name}: {value:g}'} is not allowed; allowed: {allowed}")
     is_repeated = frame.assign(time=frame["time"].round(6)).duplicated(["pair", "time"])
-    for line, time in zip(frame["line"][is_repeated], frame["time"][is_repeated], strict=True):
+    for line, time in frame.loc[is_repeated, ["line", "time"]].head(MAX_BAD_ROWS).to_numpy().tolist():
         reasons.setdefault(int(line), f"time: {time:g} occurs twice in its pair")
     return is_bad | is_repeated.to_numpy(), dict(sorted(reasons.items()))

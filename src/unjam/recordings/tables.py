@@ -4,7 +4,8 @@ import csv
 import gzip
 import re
 import zlib
-from collections.abc import Hashable
+from collections import Counter
+from collections.abc import Hashable, Iterable
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -17,8 +18,11 @@ from unjam.sumo_files.reader import BrokenFileError, XmlAttributes, parse_xml
 
 HEAD_BYTES = 1 << 16
 """first bytes of a file, from which its form is detected before a table is parsed; no line of a table is longer"""
-MAX_TEXT_BYTES, MAX_CELLS = 1 << 30, 1 << 27
-"""maximum size of a table: as text, uncompressed, and in Parquet; both take about five times as much memory"""
+MAX_TEXT_BYTES, MAX_CELLS, MAX_FCD_VEHICLES = 1 << 30, 1 << 27, 1 << 23
+"""maximum size of a table: bytes of text (uncompressed, each cell of Parquet counted), cells, and `vehicle` elements of
+FCD output as XML; each takes about five times as much memory"""
+MAX_BINARY_LENGTH = 16
+"""longest value of a column of equally long binary values in Parquet that is read [bytes], as decimal numbers have"""
 HEAD_LINES = 20
 """first lines of a table, among which its header is"""
 RECONSTRUCTED_COLUMN_ORDER = (
@@ -52,31 +56,69 @@ def read_table(path: Path) -> pd.DataFrame:
             is_packed = raw.read(2) == b"\x1f\x8b"
         with gzip.open(path) if is_packed else path.open("rb") as file:
             head = file.read(HEAD_BYTES)
+            if head.startswith(b"PAR1"):
+                return _read_parquet(path)
             _check_size(path, file, head)
             file.seek(0)
-            if head.startswith(b"PAR1"):
-                return pd.read_parquet(path).assign(line=lambda frame: np.arange(len(frame)) + 2)
             if head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<"):
                 return _read_fcd_xml(path, file, head)
             return _read_csv(path, file, head)
-    except (ValueError, OSError, EOFError, zlib.error) as error:
+    except (ValueError, NotImplementedError, OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
     except BrokenFileError as error:
         raise InputError(str(error)) from None
 
 
 def _check_size(path: Path, file: Any, head: bytes) -> None:
-    """Raise `InputError` if a table is too large, before it takes memory: packed files can be tiny."""
-    if head.startswith(b"PAR1"):
-        from pyarrow.parquet import read_metadata
-
-        shape = read_metadata(path)
-        if shape.num_rows * shape.num_columns > MAX_CELLS:
-            raise _refused_file(path, f"it has more than {MAX_CELLS:,} cells")
-        return
-    size = len(head)
-    while size <= MAX_TEXT_BYTES and (chunk := file.read(HEAD_BYTES)):
+    """Raise `InputError` if a text is too large, before it takes memory: packed files can be tiny."""
+    size, cells, chunk = 0, 0, head
+    while chunk and size <= MAX_TEXT_BYTES and cells <= MAX_CELLS:
         size += len(chunk)
+        cells += max(len(chunk.split()), sum(map(chunk.count, (b"\n", b",", b";", b"\t"))))
+        chunk = file.read(HEAD_BYTES)
+    _check_text_bytes(path, size)
+    _check_cells(path, cells)
+
+
+def _read_parquet(path: Path) -> pd.DataFrame:
+    """Return the columns of numbers and text of a Parquet file; columns of lists and structures are left out.
+
+    Text is read as Parquet stores it, each value once, and becomes a column only if this takes little memory: a file
+    of some kilobytes can refer to one long text a million times.
+    """
+    import pyarrow as pa
+    from pyarrow.compute import call_function
+    from pyarrow.parquet import ParquetFile
+
+    with ParquetFile(path) as file:
+        metadata, schema = file.metadata, file.schema
+        check_unique(path, file.schema_arrow.names)
+    flat = [schema.column(number) for number in range(len(schema))]
+    flat = [each for each in flat if each.path == each.name and each.max_repetition_level == 0]
+    flat = [each for each in flat if each.length <= MAX_BINARY_LENGTH]
+    texts = {each.name for each in flat if each.physical_type == "BYTE_ARRAY"}
+    _check_cells(path, metadata.num_rows * metadata.num_columns)
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    chunks = [group.column(number) for group in groups for number in range(metadata.num_columns)]
+    _check_text_bytes(path, sum(each.total_uncompressed_size for each in chunks if each.path_in_schema in texts))
+    with ParquetFile(path, read_dictionary=sorted(texts)) as file:
+        table = file.read([each.name for each in flat])
+    dictionaries = [number for number, kind in enumerate(table.schema.types) if pa.types.is_dictionary(kind)]
+    texts = [chunk for number in dictionaries for chunk in table.column(number).chunks]
+    lengths = (call_function("binary_length", [each.dictionary]).take(each.indices) for each in texts)
+    _check_text_bytes(path, sum(each.sum().as_py() or 0 for each in lengths))
+    for number in dictionaries:
+        kind = table.schema.field(number).type.value_type
+        table = table.set_column(number, table.column_names[number], table.column(number).cast(kind))
+    return table.to_pandas(ignore_metadata=True).assign(line=lambda frame: np.arange(len(frame)) + 2)
+
+
+def _check_cells(path: Path, cells: int) -> None:
+    if cells > MAX_CELLS:
+        raise _refused_file(path, f"it has more than {MAX_CELLS:,} cells")
+
+
+def _check_text_bytes(path: Path, size: int) -> None:
     if size > MAX_TEXT_BYTES:
         raise _refused_file(path, f"it has more than {MAX_TEXT_BYTES:,} bytes of text")
 
@@ -85,23 +127,35 @@ def _refused_file(path: Path, reason: str) -> InputError:
     return InputError(f"{path.name}: cannot be read: {reason}; allowed: {ALLOWED_FILES}")
 
 
+def check_unique(path: Path, columns: Iterable[str]) -> None:
+    """Raise `InputError` if two of these columns have the same name: one of them would be ignored."""
+    counts = Counter(name.strip() for name in columns)
+    for name in [name for name, count in counts.items() if name and count > 1]:
+        raise InputError(f"{path.name}: {counts[name]} columns have the name {name!r}; allowed: one")
+
+
 def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     """Return SUMO's FCD output with the columns that it has as CSV."""
     if b"<fcd-export" not in head:
         raise _refused_file(path, "it is XML, but not SUMO's FCD output")
-    parser, time, rows = expat.ParserCreate(), "", list[dict[str, Any]]()
+    parser, time = expat.ParserCreate(), ""
+    columns = {"timestep_time": list[Any](), **{f"vehicle_{name}": list[Any]() for name in FCD_ATTRIBUTES}, "line": []}
 
     def on_start(tag: str, attributes: XmlAttributes) -> None:
         nonlocal time
         if tag == "timestep":
             time = attributes.get("time", "")
         elif tag == "vehicle":
-            values = {f"vehicle_{name}": attributes[name] for name in FCD_ATTRIBUTES if name in attributes}
-            rows.append({"timestep_time": time, **values, "line": parser.CurrentLineNumber})
+            if len(columns["line"]) == MAX_FCD_VEHICLES:
+                raise _refused_file(path, f"it has more than {MAX_FCD_VEHICLES:,} elements 'vehicle'")
+            row = (time, *map(attributes.get, FCD_ATTRIBUTES), parser.CurrentLineNumber)
+            for column, value in zip(columns.values(), row, strict=True):
+                column.append(value)
 
     parser.StartElementHandler = on_start
     parse_xml(path, parser, iter(lambda: file.read(HEAD_BYTES), b""))
-    return pd.DataFrame(rows)
+    known = {name: column for name, column in columns.items() if any(value is not None for value in column)}
+    return pd.DataFrame(known)
 
 
 def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
@@ -120,6 +174,8 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
         if len(cells) not in HEADERLESS_COLUMNS:
             raise _refused_file(path, "its first line is not the names of its columns")
         header, options = -1, {"names": HEADERLESS_COLUMNS[len(cells)], "header": None}
+    else:
+        check_unique(path, cells if separator == r"\s+" else next(csv.reader([lines[header]], delimiter=separator)))
     rows = "\n".join(lines[header + 1 :])
     if separator != "," and re.search(r"\d,\d", rows) and not re.search(r"\d\.\d", rows):
         options["decimal"] = ","

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 from unjam import sandbox
 from unjam.child_processes import child_environment, python_command
 from unjam.errors import InputError, invalid_value, spelling_hint
-from unjam.sumo_files.reader import file_stamp
+from unjam.sumo_files.reader import ALLOWED_VARIABLES, UNKNOWN_VARIABLE, file_stamp
 
 READER_PROGRAM = Path(__file__).with_name("reader_program.py")
 MAX_READER_MEMORY, MAX_READER_TIME = 4 * 2**30, 120
@@ -151,6 +151,9 @@ def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
     fields["used_types"], options = frozenset(fields["used_types"]), fields["options"]
     kinds = {name: classify_option(path.name, name, value) for name, value in options.items()}
     fields["options"] = {name: value for name, value in options.items() if kinds[name] == "passed"}
+    for name, value in fields["options"].items():
+        if variable := UNKNOWN_VARIABLE.search(value):
+            raise invalid_value(f"{path.name}: {name}", variable[0], ALLOWED_VARIABLES)
     dropped = [f"option {name}" for name in options if kinds[name] == "dropped"]
     fields["dropped_items"] = (*dropped, *fields["dropped_items"])
     fields["replaced_options"] = tuple(name for name in options if kinds[name] == "replaced")

@@ -24,12 +24,33 @@ DETECTOR_SUFFIXES = ("Detector", "inductionLoop", "routeProbe", "detector")
 """suffixes of elements that are detectors of traffic lights and calibrators: they are kept, but write no file"""
 EXTERNAL_ELEMENTS = ("calibrator", "variableSpeedSign")
 """elements with an attribute `file` that names the file of their content"""
+_ELEMENTS = """
+routes route-alternatives additional add data meandata detectors tlLogics taz tazs types stops connections edges
+include param vType vTypeDistribution type route routeDistribution vehicle trip flow stop interval edge lane
+edgeRelation tazRelation person personFlow personTrip walk ride access container containerFlow transport tranship
+tazSource tazSink source sink edgeData laneData timedEvent vTypeProbe inductionLoop e1Detector e2Detector e3Detector
+laneAreaDetector entryExitDetector instantInductionLoop detEntry detExit detector detectorDefinition routeProbe
+calibrator vaporizer variableSpeedSign step rerouter closingReroute closingLaneReroute destProbReroute
+routeProbReroute parkingAreaReroute stationReroute overtakingReroute viaProbReroute rerouterValue parkingArea space
+busStop trainStop containerStop chargingStation overheadWire overheadWireClamp overheadWireSegment tractionSubstation
+poly poi tlLogic phase condition assignment function WAUT wautJunction wautSwitch railSignalConstraints predecessor
+insertionPredecessor insertionOrder foeInsertion bidiPredecessor deadlock conflict ptLine ptLines preference
+restriction stopOffset neigh connection
+"""
+SUMO_ELEMENTS = set(_ELEMENTS.split())
+"""elements of SUMO's demand, additional files and weights of edges, and the outermost elements of such files"""
+FOLLOWING_MODEL_PREFIX = "carFollowing-"
 NULL_FILE = "NUL"
 """name of a file that SUMO never creates"""
 FILE_ATTRIBUTES = ("file", "output", "dest", "href")
 """attributes that name files, in addition to those that end in `File`"""
 FILE_PARAMETER_PARTS = ("file", "output", "log", "ssm", "tripinfo")
 """parts of the keys of harmful parameters: they name a file, write one, or remove trips from the records with delays"""
+SUBSTITUTED_VARIABLES = ("HOME", "SUMO_HOME", "PWD", "TMPDIR", "LOCALTIME", "UTC", "PID")
+"""variables that values of options may name; the last three are SUMO's own"""
+ALLOWED_VARIABLES = ", ".join(f"${{{name}}}" for name in SUBSTITUTED_VARIABLES)
+UNKNOWN_VARIABLE = re.compile(r"\$\{.*?\}")
+"""a variable that is left after the substitution"""
 LANE_NAME = re.compile(r"_\d+$")
 """end of the id of a lane; a parameter of a traffic light with such a key names the detector of a lane"""
 CAV_TYPE_TEMPLATE = "cav_of_{}"
@@ -76,8 +97,14 @@ class XmlReader:
     """
 
     def __init__(
-        self, handlers: XmlHandlers, out: IO[str] | None = None, type_changes: dict[str, XmlAttributes] | None = None
+        self,
+        handlers: XmlHandlers,
+        out: IO[str] | None = None,
+        type_changes: dict[str, XmlAttributes] | None = None,
+        folder: Path | None = None,
     ) -> None:
+        self._folder = folder
+        """files outside it may contain only elements of SUMO; None: no file is outside"""
         self._handlers, self._type_changes = handlers, type_changes or {}
         self._write = out.write if out else None
         self._dropped_depth = 0
@@ -114,6 +141,8 @@ class XmlReader:
         parser.StartElementHandler = self._on_start
         if self._write is not None:
             parser.EndElementHandler, parser.CharacterDataHandler = self._on_end, self._on_text
+        if self._folder is not None and not path.resolve().is_relative_to(self._folder):
+            parser.StartElementHandler, parser.CharacterDataHandler = self._on_foreign_start, self._on_foreign_text
         self.needs_copy |= any(character in str(path) for character in ",; \t$%")
         parse_xml(path, parser, self._chunks(path))
         self._open_files.pop()
@@ -153,6 +182,20 @@ class XmlReader:
             self._process_element(tag, attributes)
         elif self._write is not None:
             self._write_start(tag, attributes)
+
+    def _on_foreign_start(self, tag: str, attributes: XmlAttributes) -> None:
+        """Refuse elements that no file of SUMO has: copies of the files are passed on to others."""
+        if tag not in SUMO_ELEMENTS and not tag.startswith(FOLLOWING_MODEL_PREFIX):
+            self._refuse_foreign(f"element {tag!r}")
+        self._on_start(tag, attributes)
+
+    def _on_foreign_text(self, text: str) -> None:
+        if text.strip():
+            self._refuse_foreign("text")
+
+    def _refuse_foreign(self, content: str) -> None:
+        allowed = "elements of SUMO, as the file lies outside the folder of the configuration"
+        raise BrokenFileError(f"{self._open_files[-1].name}: {content} is not allowed; allowed: {allowed}")
 
     def _process_element(self, tag: str, attributes: XmlAttributes) -> None:
         """Write the harmless parts of an element that may name a file; read the file that it includes."""

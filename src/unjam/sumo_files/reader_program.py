@@ -23,6 +23,9 @@ if __name__ == "__main__":  # packages without their own code, which would impor
         sys.modules[name].__path__ = [str(folder)]
 
 from unjam.sumo_files.reader import (  # noqa: E402
+    ALLOWED_VARIABLES,
+    SUBSTITUTED_VARIABLES,
+    UNKNOWN_VARIABLE,
     BrokenFileError,
     XmlAttributes,
     XmlHandlers,
@@ -80,6 +83,9 @@ def _read_configuration(path: Path) -> dict[str, Any]:
     options = _read_options(path)
     if options.get("mesosim", "").lower() in TRUE_VALUES:
         raise BrokenFileError(f"{path.name}: mesosim: true is not allowed; allowed: false, as it obeys no commands")
+    for name in FILE_OPTIONS:
+        if variable := UNKNOWN_VARIABLE.search(options.get(name, "")):
+            raise BrokenFileError(f"{path.name}: {name}: {variable[0]!r} is not allowed; allowed: {ALLOWED_VARIABLES}")
     networks, additional, routes, weights = (
         [path.parent / unquote(name.strip()) for name in options.pop(files, "").split(",") if name.strip()]
         for files in FILE_OPTIONS
@@ -90,7 +96,9 @@ def _read_configuration(path: Path) -> dict[str, Any]:
     files = [network, *additional, *routes, *weights]
     for file in files:
         check_file_exists(file)
-    readers = {file: XmlReader(demand.handlers()) for file in files}
+    folder = path.parent.resolve()
+    # No copy of the network is passed on.
+    readers = {file: XmlReader(demand.handlers(), folder=None if file == network else folder) for file in files}
     for file, reader in readers.items():
         reader.read(file)
         stamps = {**reader.sources, **stamps}
@@ -153,9 +161,14 @@ def canonical_option(name: str) -> str:
 
 
 def _substitute_variables(text: str) -> str:
-    """Return an option's value with `~` and `${VARIABLE}` replaced as SUMO does; unset variables are empty."""
+    """Return an option's value with `~` and `SUBSTITUTED_VARIABLES` replaced as SUMO does; unset ones are empty.
+
+    Other variables stay as they are: configurations of others could ask for secrets.
+    """
     home = re.sub("(^|,)~", r"\1${HOME}", text)
-    return re.sub(r"\$\{(.+?)\}", lambda match: os.environ.get(match[1], ""), home)
+    for name in SUBSTITUTED_VARIABLES:
+        home = home.replace(f"${{{name}}}", os.environ.get(name, ""))
+    return home
 
 
 def _read_lanes(path: Path) -> list[tuple[str, float, float, list[tuple[float, float]]]]:
