@@ -91,7 +91,7 @@ FAULTS: dict[str, Fault] = {
         long_count=500,
     ),
     "killed commands": Fault(
-        "tune, search and reproduce killed (signal 9)", killed_commands, quick_count=3, long_count=30, is_slow=True
+        "tune, search and reproduce killed (signal 9)", killed_commands, quick_count=3, long_count=21, is_slow=True
     ),
     "clocks": Fault("clock that jumps by up to a day", jumping_clocks, quick_count=2, long_count=50),
     "packed tables": Fault(
