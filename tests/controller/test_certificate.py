@@ -75,6 +75,19 @@ def test_a_filter_that_does_not_act_is_found_out() -> None:
     assert certify_driver(bare, visited_states(), PAPER_IDM).worst_cases.contacts > 0
 
 
+@pytest.mark.parametrize(
+    ("step", "states", "message"),
+    [
+        (0.1, visited_states()._replace(leader_gap=np.zeros(60), leader_speed=np.zeros(60)), "cannot avoid contact"),
+        (60.0, visited_states(), "control step: 60.0 is not allowed; allowed: at most 20 s"),
+    ],
+)
+def test_a_sample_or_control_step_without_an_answer_is_refused(step: float, states: LocalState, message: str) -> None:
+    driver = FilteredDriver(Constant(1.0), 1.0, SafetyFilter(), step, INSTANT_ACTUATOR)
+    with pytest.raises(InputError, match=message):
+        certify_driver(driver, states, PAPER_IDM)
+
+
 @pytest.mark.parametrize("humans", [PAPER_IDM, IDMParameters(time_headway=1.6, max_acceleration=2.0)])
 def test_the_measured_gain_of_an_idm_is_that_of_the_linearised_one(humans: IDMParameters) -> None:
     idm = FilteredDriver(IDM(**asdict(humans)), 3.0, SafetyFilter(time_gap=0.0), 0.1)

@@ -12,7 +12,7 @@ from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, FollowingState
 from unjam.drivers.wrappers import FilteredDriver
-from unjam.errors import InputError
+from unjam.errors import InputError, invalid_value
 from unjam.files import reject_damaged
 from unjam.parameters import build_dataclass
 from unjam.physics.idm import IDMParameters
@@ -151,6 +151,8 @@ def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: I
     for name, values, largest in zip(STATE_NAMES, states, (MAX_SPEED, MAX_SPEED, MAX_OBSERVED_GAP), strict=True):
         if not ((values >= 0.0) & (values <= largest)).all():  # refuses NaN, too
             raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")
+    if driver.time_step > LEADER_STOP_SECONDS:
+        raise invalid_value("certify: control step", driver.time_step, f"at most {LEADER_STOP_SECONDS:g} s")
     ranges = [(float(values.min()), float(values.max())) for values in states]
     speeds = operating_speeds(float(states.speed.mean()), humans)
     return Certificate(
@@ -168,6 +170,8 @@ def _worst_cases(
     safety, step = driver.safety, driver.time_step
     actuation = driver.actuator, driver.actuator.initial_state(states.speed, step)
     is_safe = safety.max_acceleration(states, step, actuation) > -safety.braking  # it promises nothing elsewhere
+    if not is_safe.any():
+        raise InputError("certify: the filter cannot avoid contact in any state of the sample; allowed: in some")
     states = FollowingState(*(values[is_safe] for values in states))
     rows = len(states.speed)
     stop = np.full((round(LEADER_STOP_SECONDS / step), rows), -safety.leader_braking)
