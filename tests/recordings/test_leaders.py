@@ -53,6 +53,20 @@ def test_a_missing_second_ends_a_recording(tmp_path: Path) -> None:
     assert names == ["drive", "drive/2"]
 
 
+@pytest.mark.parametrize("name", ["vehicle", "Vehicle_ID", "id", "track_id"])
+@pytest.mark.parametrize("start", [0.05, 60.0])
+def test_each_vehicle_is_a_recording_of_its_own(start: float, name: str, tmp_path: Path) -> None:
+    columns = {"time": np.r_[TIMES, start + TIMES], "speed": np.r_[SPEEDS, SPEEDS + 5.0], name: np.repeat([1, 2], 600)}
+    found = read_leaders(write(tmp_path / "drive.csv", **columns))
+    assert [each.name for each in found] == ["drive-1", "drive-2"]
+    np.testing.assert_allclose(found[1].speed, SPEEDS + 5.0, atol=1e-9)
+
+
+def test_numbers_of_rows_are_no_vehicles(tmp_path: Path) -> None:
+    (found,) = read_leaders(write(tmp_path / "drive.csv", id=np.arange(600), time=TIMES, speed=SPEEDS))
+    assert found.name == "drive"
+
+
 def test_other_steps_are_interpolated(tmp_path: Path) -> None:
     (found,) = read_leaders(write(tmp_path / "drive.csv", time=TIMES, speed=SPEEDS))
     speeds = found.speeds_at(2.0, 10.0, 0.25)

@@ -8,12 +8,23 @@ import pandas as pd
 
 from unjam.errors import InputError, shorten_list
 from unjam.recordings.leaders import LeaderRecording
-from unjam.recordings.loaders import ReadOptions, detect_format, split_trajectories, to_numeric, trajectories_of_table
+from unjam.recordings.loaders import (
+    ReadOptions,
+    alphanumeric,
+    detect_format,
+    join_row_values,
+    split_trajectories,
+    to_numeric,
+    trajectories_of_table,
+)
 from unjam.recordings.tables import check_unique, read_table
 from unjam.sumo_files import file_stamp
 
 SPEED_UNITS = {"speed": 1.0, "speed_kmh": 1.0 / 3.6, "speed_mph": 0.44704}
 """columns of a table of speeds, one of them, and their unit in m/s"""
+VEHICLE_NAMES = {"pair", "id", "vehicle", "veh", "track", "car", "driver", "trip", "run"}
+VEHICLE_NAMES |= {f"{name}id" for name in VEHICLE_NAMES}
+"""columns of a table of speeds that tell its vehicles or drives apart, in lower case without underscores"""
 I24_COLUMNS = ("Time", "Velocity", "SpaceGap", "DrivingDir")
 """columns by which drives of the CIRCLES experiment on I-24 are recognized; their speeds are in km/h"""
 MIN_SECONDS = 20.0
@@ -64,8 +75,14 @@ def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, 
     return found
 
 
-def _follower_table(frame: pd.DataFrame, column: str, pair: str) -> pd.DataFrame:
-    """Return a table of speeds as one of trajectories with the recorded vehicle as the leader."""
+def _follower_table(frame: pd.DataFrame, column: str, stem: str) -> pd.DataFrame:
+    """Return a table of speeds as one of trajectories with each recorded vehicle as the leader.
+
+    A column of vehicles without equal values has the numbers of the rows.
+    """
+    names = [str(name) for name in frame.columns if alphanumeric(name) in VEHICLE_NAMES]
+    names = [name for name in names if 1 < len(frame[[name]].drop_duplicates()) < len(frame)]
+    vehicles = stem + "-" + join_row_values(frame, tuple(names)) if names else stem
     table = to_numeric(frame.loc[:, ["line", "time", column]], ["time", column])
     speed = table[column] * SPEED_UNITS[column]
-    return table.assign(pair=pair, speed=speed, leader_speed=speed, gap=0.0)
+    return table.assign(pair=vehicles, speed=speed, leader_speed=speed, gap=0.0)

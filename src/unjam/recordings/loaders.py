@@ -29,7 +29,7 @@ MISSING_ROW_INTERVAL = 1.5
 """shortest interval in which a row is missing, relative to the usual one"""
 MAX_TIME_STEP = 1.5
 """longest time between two samples [s]: waves of a few seconds must be visible"""
-MIN_SAMPLES = 3
+MIN_TRAJECTORY_SAMPLES = 3
 """fewest samples of a trajectory: the interval between two single rows is no time step"""
 UNIT_RATIO_LIMITS = (2 / 3, 1.5)
 """smallest and largest ratio of quantities that are equal where the units of all columns fit each other"""
@@ -122,7 +122,7 @@ def _convert_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Rea
     _check_columns(frame, TABLE_COLUMNS, path)
     if options.driver_columns and "driver" not in frame:
         _check_columns(frame, options.driver_columns, path)
-        frame["driver"] = _join_columns(frame, options.driver_columns)
+        frame["driver"] = join_row_values(frame, options.driver_columns)
     return split_trajectories(to_numeric(frame, TABLE_COLUMNS[1:]), path, options)
 
 
@@ -138,7 +138,7 @@ def _convert_ngsim(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Rea
 
 def _convert_reconstructed(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
     """Return the trajectories of the reconstructed NGSIM I-80 data, which are in meters and tenths of a second."""
-    vehicles = _select_columns(frame.rename(columns=_alphanumeric), RECONSTRUCTED_COLUMNS, VEHICLE_COLUMNS, path)
+    vehicles = _select_columns(frame.rename(columns=alphanumeric), RECONSTRUCTED_COLUMNS, VEHICLE_COLUMNS, path)
     vehicles = vehicles.assign(site=path.stem, time=vehicles["time"] / 10.0)
     return _trajectories_from_vehicles(vehicles, path, options)
 
@@ -166,7 +166,7 @@ def _convert_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadR
     _check_columns(frame, key, path)
     is_free = vehicles["gap"] < 0
     driver = frame["vehicle_id"].astype(str)
-    vehicles = vehicles.assign(pair=_join_columns(frame, key), driver=driver, kind="simulated")
+    vehicles = vehicles.assign(pair=join_row_values(frame, key), driver=driver, kind="simulated")
     return split_trajectories(vehicles.loc[~is_free], path, options, {"no leader": int(np.sum(is_free))})
 
 
@@ -187,8 +187,8 @@ def _trajectories_from_vehicles(vehicles: pd.DataFrame, path: Path, options: Rea
     vehicles = vehicles.loc[~is_free]
     numbered = vehicles.assign(suffix=_reused_number_suffix(vehicles))
     frame = vehicles.assign(
-        pair=_join_columns(vehicles, ("site", "vehicle", "leader", "lane")),
-        driver=_join_columns(numbered, ("site", "vehicle", "suffix")).str.rstrip("-"),
+        pair=join_row_values(vehicles, ("site", "vehicle", "leader", "lane")),
+        driver=join_row_values(numbered, ("site", "vehicle", "suffix")).str.rstrip("-"),
         kind="human",
         leader_speed=vehicles["speed_ahead"],
         gap=vehicles["front_ahead"] - vehicles["length_ahead"] - vehicles["front"],
@@ -242,13 +242,14 @@ def detect_format(frame: pd.DataFrame) -> str:
     names = set(map(str, frame.columns))
     if {name.lower() for name in names}.issuperset(NGSIM_COLUMNS):
         return "ngsim"
-    if set(map(_alphanumeric, names)).issuperset(RECONSTRUCTED_COLUMNS):
+    if set(map(alphanumeric, names)).issuperset(RECONSTRUCTED_COLUMNS):
         return "ngsim-reconstructed"
     columns = {"highd": HIGHD_COLUMNS, "fcd": ("timestep_time", "vehicle_id"), "openacc": ("Speed1", "IVS1")}
     return next((format for format, required in columns.items() if names.issuperset(required)), "table")
 
 
-def _alphanumeric(name: str) -> str:
+def alphanumeric(name: str) -> str:
+    """Return the letters, in lower case, and digits of a column name."""
     return re.sub(r"[^a-z0-9]", "", str(name).lower())
 
 
@@ -269,7 +270,7 @@ def _check_columns(frame: pd.DataFrame, required: Iterable[str], path: Path) -> 
     check_unique(path, [str(name) for name in frame.columns if name in required])
 
 
-def _join_columns(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
+def join_row_values(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
     """Return for each row the values of these columns, joined by hyphens.
 
     Rows with equal values are joined only once, because a file may have millions of rows.
@@ -334,7 +335,7 @@ def split_trajectories(
         for first, last in pairwise([0, *(np.flatnonzero(missing) + 1).tolist(), len(rows)]):
             seconds = (last - first - 1) * step
             longest = max(longest, seconds)
-            if seconds < options.min_seconds - step / 2 or last - first < MIN_SAMPLES:
+            if seconds < options.min_seconds - step / 2 or last - first < MIN_TRAJECTORY_SAMPLES:
                 continue
             if step > MAX_TIME_STEP:
                 allowed = f"<= {MAX_TIME_STEP:g} s; are its times in seconds?"
