@@ -215,13 +215,15 @@ def test_names_of_drivers_are_escaped(tmp_path: Path) -> None:
 
 
 def test_texts_of_a_folder_are_escaped(tmp_path: Path) -> None:
-    folder = results_in(tmp_path / "a <i>b", "pi", failing=1, scenario="<u>ring")
+    folder = results_in(tmp_path / "a <i>b", "pi", failing=1, scenario="<u>ring\u202egnir")
     (folder / "config.toml").write_text('expert = "<s>"\n')
     text, page = page_of(folder, results_in(tmp_path / "c", "pi"))
     assert not page.of("i")[1:]  # the first is the scale of the page itself
     for tag in ("u", "s", "cannot"):
         assert not page.of(tag)
     assert "SUMO &lt;cannot&gt; start" in text
+    assert "ring?gnir" in text, "bidirectional marks would turn the text around"
+    assert "\u202e" not in text
 
 
 def test_failed_episodes_are_listed_with_their_reason(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def _follower_table(frame: pd.DataFrame, column: str, stem: str) -> pd.DataFrame
     A column of vehicles without equal values has the numbers of the rows.
     """
     names = [str(name) for name in frame.columns if alphanumeric(name) in VEHICLE_NAMES]
-    names = [name for name in names if 1 < frame[name].nunique(dropna=False) < len(frame)]
+    names = [name for name in names if 1 < len(frame[[name]].drop_duplicates()) < len(frame)]
     vehicles = stem + "-" + join_row_values(frame, tuple(names)) if names else stem
     table = to_numeric(frame.loc[:, ["line", "time", column]], ["time", column])
     speed = table[column] * SPEED_UNITS[column]

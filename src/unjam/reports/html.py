@@ -15,6 +15,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from unjam import __version__
+from unjam.errors import printable
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, check_parent_folder
 from unjam.measures.metric_table import metric_table
 from unjam.measures.statistics import metric_estimate
@@ -63,10 +64,11 @@ def _damaged_folder(results: Sequence[Results]) -> Path:
 
 
 def render_template(template: str, **values: Any) -> str:
-    """Return a page of the folder `page/` as text, with the common style and script; `values` are escaped."""
+    """Return a page of the folder `page/` as text, with common style and script; values are escaped and `printable`."""
     environment = Environment(
         loader=PackageLoader("unjam.reports", "page"),
         autoescape=True,
+        finalize=lambda value: value if hasattr(value, "__html__") else printable(str(value)),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

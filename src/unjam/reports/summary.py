@@ -17,7 +17,7 @@ from unjam.reports.results import PlotEpisode, Results
 
 CLOSE_TIME_GAP = 1.0
 """time gap below which the report has a note [s]; the paper's h_max"""
-FORMULA_STARTS = {*"=+-@"}
+FORMULA_STARTS = {*"=+-@\t\r\n"}
 """first letters of a cell that a spreadsheet takes for a formula"""
 MAX_LIMIT_RATIO = 1.01
 """ratio of mean speed to the limit above which the report has a note"""
