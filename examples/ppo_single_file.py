@@ -58,29 +58,37 @@ def learn(*columns: Tensor) -> None:
         optimizer.step()
 
 
-# An action in each second
-settings = {"features": [PolicyInput(**each) for each in INPUTS], "steps_per_control_step": 10, "horizon": 300}
-rings = gymnasium.make_vec("unjam/ring-22-grown-v1", num_envs=RINGS, device="cpu", exact=False, **settings)
-(observation, _), ended = rings.reset(seed=1), torch.zeros(RINGS, dtype=torch.bool)
-for update in range(int(sys.argv[1]) if len(sys.argv) > 1 else 100):
-    steps = []
-    for _ in range(STEPS):
-        action = (chosen := policy(observation)).sample()
-        following, reward, terminated, truncated, info = rings.step(action)
-        # The step after an end ignores its action
-        old, is_valid, ended = chosen.log_prob(action).detach(), ~ended, terminated | truncated
-        steps.append((observation, action, old, reward, following, terminated, ended, is_valid))
-        observation = following
-        if "episode_metrics" in info:
-            speeds = info["episode_metrics"]["mean_speed"][info["_episode_metrics"]]
-            print(f"update {update}: mean speed {speeds.mean():.2f} m/s in {len(speeds)} episodes", flush=True)
-    learn(*map(torch.stack, zip(*steps, strict=True)))
+def main(updates: int) -> None:
+    """Train, and write policy.onnx and policy.toml."""
+    # An action in each second
+    settings = {"features": [PolicyInput(**each) for each in INPUTS], "steps_per_control_step": 10, "horizon": 300}
+    rings = gymnasium.make_vec("unjam/ring-22-grown-v1", num_envs=RINGS, device="cpu", exact=False, **settings)
+    (observation, _), ended = rings.reset(seed=1), torch.zeros(RINGS, dtype=torch.bool)
+    for update in range(updates):
+        steps = []
+        for _ in range(STEPS):
+            action = (chosen := policy(observation)).sample()
+            following, reward, terminated, truncated, info = rings.step(action)
+            # The step after an end ignores its action
+            old, is_valid, ended = chosen.log_prob(action).detach(), ~ended, terminated | truncated
+            steps.append((observation, action, old, reward, following, terminated, ended, is_valid))
+            observation = following
+            if "episode_metrics" in info:
+                speeds = info["episode_metrics"]["mean_speed"][info["_episode_metrics"]]
+                print(f"update {update}: mean speed {speeds.mean():.2f} m/s in {len(speeds)} episodes", flush=True)
+        learn(*map(torch.stack, zip(*steps, strict=True)))
 
-# torch warns of packages that are not needed here, and of its own deprecated code
-logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-warnings.filterwarnings("ignore", category=FutureWarning)
-program = torch.onnx.export(actor.eval(), (observation,), dynamic_shapes=({0: "n"},), verbose=False)
-for node in program.model.graph:
-    node.metadata_props.clear()  # stack traces, with paths of this machine
-program.save("policy.onnx")
-Path("policy.toml").write_text(tomli_w.dumps({"inputs": INPUTS, "output": {"limits": [-1.0, 1.0]}, "time_step": 1.0}))
+    # torch warns of packages that are not needed here, and of its own deprecated code
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    warnings.filterwarnings("ignore", category=FutureWarning)
+    program = torch.onnx.export(actor.eval(), (observation,), dynamic_shapes=({0: "n"},), verbose=False)
+    for node in program.model.graph:
+        node.metadata_props.clear()  # stack traces, with paths of this machine
+    program.save("policy.onnx")
+    Path("policy.toml").write_text(
+        tomli_w.dumps({"inputs": INPUTS, "output": {"limits": [-1.0, 1.0]}, "time_step": 1.0})
+    )
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 100)

@@ -1,6 +1,6 @@
 """PPO with one policy for all CAVs of the merge, which come and go, in eight slots that stay.
 
-Run: python examples/shared_policy.py [updates] [horizon]. Its agent is that of ppo_single_file.py.
+Run: python examples/shared_policy.py [updates] [horizon]. Policy and updates are those of ppo_single_file.py.
 """
 
 import sys
@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from ppo_single_file import Agent
+from ppo_single_file import INPUTS, learn, policy
 
 import unjam
+from unjam.adapters import PolicyInput
 
 UPDATES, HORIZON = (int(text) for text in (*sys.argv[1:], "50", "600")[:2])
 SLOTS = 8
@@ -21,19 +22,15 @@ def column(values: dict[str, Any]) -> torch.Tensor:
     return torch.as_tensor(np.array([*values.values()]))
 
 
-torch.manual_seed(0)
-torch.set_num_threads(1)
-merge = unjam.parallel_env("merge", slots=SLOTS, horizon=HORIZON)
-agent = Agent(inputs=5)
+features = [PolicyInput(**each) for each in INPUTS]
+merge = unjam.parallel_env("merge", slots=SLOTS, horizon=HORIZON, features=features)
 for update in range(UPDATES):
     observations, infos = merge.reset(seed=update)
     steps, total = [], 0.0
     while merge.agents:
         observation = column(observations)
         is_occupied = column({slot: info["is_occupied"] for slot, info in infos.items()})
-        with torch.no_grad():
-            policy = agent.policy(observation)
-            action = policy.sample()
+        action = (chosen := policy(observation)).sample()
         actions = dict(zip(merge.agents, action.numpy(), strict=True))  # those of empty slots are ignored
         observations, rewards, terminations, truncations, infos = merge.step(actions)
         # The trip of a CAV that leaves ends; its slot has its last observation, and is empty in the next step.
@@ -41,9 +38,9 @@ for update in range(UPDATES):
         ended = column(terminations) | column(truncations) | has_left
         reward = column(rewards).float()
         end = column(observations), column(terminations), ended
-        steps.append((observation, action, policy.log_prob(action), reward, *end, is_occupied))
+        steps.append((observation, action, chosen.log_prob(action).detach(), reward, *end, is_occupied))
         total += reward.max().item()  # the reward is common to all CAVs
-    rows = agent.rollout_rows(steps)
-    agent.learn(*rows)
-    print(f"unjam {unjam.__version__}, update {update}: {len(rows[0])} rows, return {total:.1f}", flush=True)
+    learn(*map(torch.stack, zip(*steps, strict=True)))
+    rows = int(sum(step[-1].sum() for step in steps))
+    print(f"unjam {unjam.__version__}, update {update}: {rows} rows, return {total:.1f}", flush=True)
 merge.close()

@@ -47,7 +47,7 @@ PROGRAMS = {"reproduce": ("-c", SMALL_STUDIES.format(root=str(Path(__file__).par
 RESULTS: dict[str, Callable[[Path], Any]] = {
     "tune": lambda out: (out / "pi.unjam").read_bytes(),
     "search": lambda out: (out / "best.toml").read_text(),
-    "reproduce": lambda out: str(read_part(out / "small.json", "table")),
+    "reproduce": lambda out: str([{**row, "seconds": 0.0} for row in read_part(out / "small.json", "table")]),
 }
 """commands that write a folder, and what a repetition must write there again"""
 DAY = 86_400.0
