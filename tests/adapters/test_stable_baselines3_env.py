@@ -109,3 +109,9 @@ def test_without_stable_baselines3_the_extra_is_named(monkeypatch: pytest.Monkey
     monkeypatch.delitem(sys.modules, "unjam.adapters.stable_baselines3_env", raising=False)
     with pytest.raises(MissingPartError, match=r"stable_baselines3 is not installed.*unjam\[train\]"):
         made()
+
+
+def test_slots_are_refused() -> None:
+    ramps = gymnasium.make_vec("unjam/OnRamp-v0", num_envs=2, slots=3)
+    with pytest.raises(InputError, match=r"actions of shape \(3, 1\), as with slots, are not allowed; allowed: \(1,\)"):
+        to_sb3_vec_env(ramps)

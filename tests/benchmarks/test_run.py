@@ -175,9 +175,9 @@ def test_a_file_of_another_driver_or_suite_is_not_overwritten(suite: str, tmp_pa
     unjam.benchmark("pi", "ring", file, workers=1)
     before = file.read_bytes()
     for driver, name, message in (
-        ("pi", suite, "suite: 'ring'"),
-        ("idm", "ring", "driver: 'pi'"),
-        ("pi:window=10", "ring", "driver: 'pi'"),
+        ("pi", suite, "has suite 'ring'"),
+        ("idm", "ring", "has driver 'pi'"),
+        ("pi:window=10", "ring", "has driver 'pi'"),
     ):
         with pytest.raises(InputError, match=message):
             unjam.benchmark(driver, name, file, workers=1)

@@ -25,6 +25,9 @@ class SB3VecEnv(VecEnv):
             raise invalid_value("environment: autoreset_mode", mode, "NEXT_STEP or DISABLED")
         if device := getattr(environment.unwrapped, "device", ""):
             raise invalid_value("environment: device", device, "'', NumPy arrays")
+        if (shape := environment.single_action_space.shape) != (1,):
+            reason = f"actions of shape {shape}, as with slots, are not allowed"
+            raise InputError(f"environment: {reason}; allowed: (1,); slots need a policy with shared parameters")
         self._environment = DictInfoToList(environment)
         self._actions = np.zeros(0)
         super().__init__(environment.num_envs, environment.single_observation_space, environment.single_action_space)

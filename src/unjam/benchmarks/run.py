@@ -226,5 +226,5 @@ def _stored_result(path: Path, new: BenchmarkResult) -> BenchmarkResult:
         raise invalid_value("out", str(path), "a new file: it is unknown whether a Python object has changed")
     for (key, expected), found in zip(identity(new).items(), identity(stored).values(), strict=True):
         if found != expected:
-            raise invalid_value(f"out: {path}: {key}", found, f"{expected!r}, to continue it, or a new file")
+            raise InputError(f"out: {path} has {key} {found!r}, not {expected!r}; allowed: the same, or a new file")
     return replace(stored, manifest=stored.manifest | {"command": new.manifest["command"]})

@@ -55,7 +55,7 @@ def benchmark_command(
     Examples:
 
     - unjam benchmark pi --suite closed-roads-v1
-    - unjam benchmark my_driver.py:gentle --roads ring-22-grown,figure-eight-14
+    - unjam benchmark my_driver.py:gentle --suite closed-roads-v1 --roads ring-22-dense,figure-eight-14
     - unjam benchmark my_driver.py:gentle --suite closed-roads-v1 --out gentle.json
     - unjam benchmark policy.onnx --training-steps 1000000
     - unjam benchmark --compare gentle.json results/benchmark/*.json
