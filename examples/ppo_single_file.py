@@ -82,6 +82,7 @@ def main(updates: int) -> None:
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", category=FutureWarning)
     program = torch.onnx.export(actor.eval(), (observation,), dynamic_shapes=({0: "n"},), verbose=False)
+    assert program is not None
     for node in program.model.graph:
         node.metadata_props.clear()  # stack traces, with paths of this machine
     program.save("policy.onnx")
