@@ -96,8 +96,7 @@ def check_model(model: Any, size: int, opsets: range, ir_versions: range) -> Non
     graph = model.graph
     if fixed := {each.name for each in graph.initializer} & {each.name for each in graph.input}:
         raise invalid_value("graph: initializer", min(fixed), "constants, not inputs")
-    measured = {each.name for each in graph.input}
-    """what depends on the values of inputs, and not on their shapes alone"""
+    measured = {each.name for each in graph.input}  # what depends on values of inputs, not on their shapes alone
     for node in graph.node:
         _check_node(node, imported[0][1])
         if node.op_type != "Shape" and measured.intersection(node.input):

@@ -120,11 +120,11 @@ def drivers_command(
     - unjam drivers
     - unjam drivers pi
     """
-    descriptions = {key: inspect.getdoc(kind) or "" for key, kind in DRIVERS.items()}
-    descriptions |= {f"{PACKAGED_PREFIX}{key}": _packaged_summary(key, name is None) for key in packaged_names()}
-    if name is not None and name not in descriptions:
-        raise unknown_name("driver", name, descriptions)
-    names = descriptions if name is None else [name]
+    names = [*DRIVERS, *(f"{PACKAGED_PREFIX}{key}" for key in packaged_names())]
+    if name is not None and name not in names:
+        raise unknown_name("driver", name, names)
+    names = names if name is None else [name]
+    descriptions = {key: _describe_driver(key, name is None) for key in names}
     parameters = {key: parameter_entries(DRIVERS[key]()) if key in DRIVERS else [] for key in names}
     if json:
         entries = {
@@ -142,6 +142,13 @@ def drivers_command(
         console.print(descriptions[name])
         if rows := [row for row in parameters[name] if row["name"] != "time_step"]:
             console.print(_parameter_table(rows, f"parameter (--driver {name}:parameter=value)"))
+
+
+def _describe_driver(name: str, is_brief: bool) -> str:
+    kind = DRIVERS.get(name)
+    if kind is None:
+        return _packaged_summary(name.removeprefix(PACKAGED_PREFIX), is_brief)
+    return inspect.getdoc(kind) or ""
 
 
 def _packaged_summary(name: str, is_brief: bool) -> str:

@@ -145,14 +145,8 @@ def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: I
         )
         return drive_world(world, driver)
 
-    states, fewest = FollowingState(*visited_states[:3]), 1 + max(1, round(ISO_MEAN_SECONDS / driver.time_step))
-    if len(states.speed) < fewest:
-        raise InputError(f"certify: a sample of {len(states.speed)} states is not allowed; allowed: {fewest} or more")
-    for name, values, largest in zip(STATE_NAMES, states, (MAX_SPEED, MAX_SPEED, MAX_OBSERVED_GAP), strict=True):
-        if not ((values >= 0.0) & (values <= largest)).all():  # refuses NaN, too
-            raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")
-    if driver.time_step > LEADER_STOP_SECONDS:
-        raise invalid_value("certify: control step", driver.time_step, f"at most {LEADER_STOP_SECONDS:g} s")
+    states = FollowingState(*visited_states[:3])
+    _check_sample(states, driver.time_step)
     ranges = [(float(values.min()), float(values.max())) for values in states]
     speeds = operating_speeds(float(states.speed.mean()), humans)
     return Certificate(
@@ -161,6 +155,23 @@ def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: I
         measure_string_stability(driver, speeds, humans, loop),
         OperatingDomain(*ranges),
     )
+
+
+def _check_sample(states: FollowingState, time_step: float) -> None:
+    """Raise `InputError` unless simulations can start in the states of a sample, and a CAV can observe them."""
+    if time_step > LEADER_STOP_SECONDS:
+        raise invalid_value("certify: control step", time_step, f"at most {LEADER_STOP_SECONDS:g} s")
+    fewest = 1 + _steps_of_mean(time_step)
+    if len(states.speed) < fewest:
+        raise InputError(f"certify: a sample of {len(states.speed)} states is not allowed; allowed: {fewest} or more")
+    for name, values, largest in zip(STATE_NAMES, states, (MAX_SPEED, MAX_SPEED, MAX_OBSERVED_GAP), strict=True):
+        if not ((values >= 0.0) & (values <= largest)).all():  # refuses NaN, too
+            raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")
+
+
+def _steps_of_mean(time_step: float) -> int:
+    """Return the number of control steps over which accelerations are averaged."""
+    return max(1, round(ISO_MEAN_SECONDS / time_step))
 
 
 def _worst_cases(
@@ -191,7 +202,7 @@ def _worst_cases(
 
 
 def _comfort(speeds: Floats, step: float) -> Comfort:
-    steps = max(1, round(ISO_MEAN_SECONDS / step))
+    steps = _steps_of_mean(step)
     means = (speeds[steps:] - speeds[:-steps]) / (steps * step)
     before = speeds[: len(means)]
     max_braking, max_acceleration = (np.interp(before, [5.0, 20.0], ends) for ends in ([5.0, 3.5], [4.0, 2.0]))

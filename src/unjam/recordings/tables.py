@@ -104,8 +104,8 @@ def _read_parquet(path: Path) -> pd.DataFrame:
     with ParquetFile(path, read_dictionary=sorted(texts)) as file:
         table = file.read([each.name for each in flat])
     dictionaries = [number for number, kind in enumerate(table.schema.types) if pa.types.is_dictionary(kind)]
-    texts = [chunk for number in dictionaries for chunk in table.column(number).chunks]
-    lengths = (call_function("binary_length", [each.dictionary]).take(each.indices) for each in texts)
+    arrays = [array for number in dictionaries for array in table.column(number).chunks]
+    lengths = (call_function("binary_length", [each.dictionary]).take(each.indices) for each in arrays)
     _check_text_bytes(path, sum(each.sum().as_py() or 0 for each in lengths))
     for number in dictionaries:
         kind = table.schema.field(number).type.value_type

@@ -195,9 +195,7 @@ class VectorBenchmark:
         yield Part(f"{self.name}, compared with SUMO", ENVIRONMENT_PART), rate
 
     def _rate(self, step: Callable[[], object]) -> float:
-        return steps_per_second(
-            lambda: deque((step() for _ in range(STEPS_PER_ROUND)), 0), self.rings * STEPS_PER_ROUND
-        )
+        return _repetition_rate(step, STEPS_PER_ROUND, self.rings)
 
 
 def motorway_rates(roads: int) -> Iterator[tuple[Part, float]]:
@@ -206,12 +204,10 @@ def motorway_rates(roads: int) -> Iterator[tuple[Part, float]]:
     environment.reset(seed=0)
     actions = np.zeros((roads, BUSY_ON_RAMP["slots"]), np.float32)
 
-    def advance(steps: int) -> None:
-        deque((environment.step(actions) for _ in range(steps)), 0)
-
-    advance(FILLING_STEPS)
+    step = partial(environment.step, actions)
+    _repetition_rate(step, FILLING_STEPS)
     while True:
-        rate = steps_per_second(partial(advance, MOTORWAY_STEPS), roads * MOTORWAY_STEPS)
+        rate = _repetition_rate(step, MOTORWAY_STEPS, roads)
         yield Part(f"vector environment of {roads:,} on-ramps", SLOTS_PART), rate
 
 
@@ -222,8 +218,7 @@ def _slots_rate(seed: int, simulation: Simulation) -> float:
     actions, world = dict.fromkeys(environment.agents, 0.0), environment._road.world
     while world.control_steps < FILLING_STEPS:
         environment.step(actions)
-    steps = range(world.control_steps, FILLING_STEPS + STEPS_PER_ROUND)
-    return steps_per_second(lambda: deque((environment.step(actions) for _ in steps), 0), len(steps))
+    return _repetition_rate(partial(environment.step, actions), FILLING_STEPS + STEPS_PER_ROUND - world.control_steps)
 
 
 def _run_episode(scenario: Scenario, seed: int, simulation: Simulation, action_duration: float = 1.0) -> Episode:
@@ -256,10 +251,7 @@ def _async_rate(seed: int) -> float:
     try:
         environment.reset(seed=seed)
         actions = np.zeros((ASYNC_ENVIRONMENTS, 1), np.float32)
-        steps = range(STEPS_PER_ROUND)
-        return steps_per_second(
-            lambda: deque((environment.step(actions) for _ in steps), 0), ASYNC_ENVIRONMENTS * len(steps)
-        )
+        return _repetition_rate(partial(environment.step, actions), STEPS_PER_ROUND, ASYNC_ENVIRONMENTS)
     finally:
         environment.close()
 
@@ -332,6 +324,11 @@ def ring_steps_per_second(batch: Iterator[object], rings: int) -> float:
     """Return steps of whole rings per second."""
     steps = itertools.islice(batch, STEPS_PER_ROUND)
     return steps_per_second(lambda: deque(steps, maxlen=0), rings * STEPS_PER_ROUND)
+
+
+def _repetition_rate(step: Callable[[], object], count: int, roads: int = 1) -> float:
+    """Return the steps per second of all roads together while `step` is called so many times."""
+    return steps_per_second(lambda: deque((step() for _ in range(count)), 0), roads * count)
 
 
 def steps_per_second(run: Callable[[], object], steps: int) -> float:
