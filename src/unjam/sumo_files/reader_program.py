@@ -83,12 +83,9 @@ def _read_configuration(path: Path) -> dict[str, Any]:
     options = _read_options(path)
     if options.get("mesosim", "").lower() in TRUE_VALUES:
         raise BrokenFileError(f"{path.name}: mesosim: true is not allowed; allowed: false, as it obeys no commands")
-    for name in FILE_OPTIONS:
-        if variable := UNKNOWN_VARIABLE.search(options.get(name, "")):
-            raise BrokenFileError(f"{path.name}: {name}: {variable[0]!r} is not allowed; allowed: {ALLOWED_VARIABLES}")
     networks, additional, routes, weights = (
-        [path.parent / unquote(name.strip()) for name in options.pop(files, "").split(",") if name.strip()]
-        for files in FILE_OPTIONS
+        [_named_file(path, option, name.strip()) for name in options.pop(option, "").split(",") if name.strip()]
+        for option in FILE_OPTIONS
     )
     if len(networks) != 1:
         raise BrokenFileError(f"{path.name}: names {'more than one' if networks else 'no'} net-file")
@@ -158,6 +155,18 @@ def canonical_option(name: str) -> str:
     for old, new in (("device.routing.", "device.rerouting."), (".knownveh", ".explicit")):
         name = name.replace(old, new)
     return SYNONYMS.get(name, name)
+
+
+def _named_file(path: Path, option: str, name: str) -> Path:
+    """Return a file that an option of a configuration names.
+
+    Variables besides `SUBSTITUTED_VARIABLES` are replaced only in names of existing files: no message shows their value.
+    """
+    file = path.parent / unquote(UNKNOWN_VARIABLE.sub(lambda match: os.environ.get(match[0][2:-1], ""), name))
+    if (variable := UNKNOWN_VARIABLE.search(name)) and not os.path.isfile(file):
+        allowed = f"{ALLOWED_VARIABLES}, and others in names of existing files"
+        raise BrokenFileError(f"{path.name}: {option}: {variable[0]!r} is not allowed; allowed: {allowed}")
+    return file
 
 
 def _substitute_variables(text: str) -> str:
