@@ -160,7 +160,7 @@ def canonical_option(name: str) -> str:
 def _named_file(path: Path, option: str, name: str) -> Path:
     """Return a file that an option of a configuration names.
 
-    Variables besides `SUBSTITUTED_VARIABLES` are replaced only in names of existing files: no message shows their value.
+    Variables besides `SUBSTITUTED_VARIABLES` are replaced only in names of existing files: no message then shows them.
     """
     file = path.parent / unquote(UNKNOWN_VARIABLE.sub(lambda match: os.environ.get(match[0][2:-1], ""), name))
     if (variable := UNKNOWN_VARIABLE.search(name)) and not os.path.isfile(file):
