@@ -24,7 +24,7 @@ from unjam.physics.arrays import Array, Floats
 from unjam.scenarios import Recorded
 from unjam.scenarios.road import RecordedRoad
 from unjam_paper.parameter_search import RowScores, SearchBudget, measure_candidates, search_parameters
-from unjam_paper.recorded_roads import SEARCH_SEED, SEARCH_SPACES, TIME_STEP, training_drives
+from unjam_paper.recorded_roads import SEARCH_SEED, SEARCH_SPACES, TIME_STEP, recorded_drives
 from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
 
@@ -82,7 +82,7 @@ def received_speeds(scenarios: list[Recorded], latency: float) -> Floats:
 
 def roads_with_vehicles_between(folder: Path, count: int) -> list[Recorded]:
     """Return the training drives with `count` human drivers between the recorded vehicle and the CAV."""
-    return [replace(each, platoon=f"human*{count} cav human*{FOLLOWERS}") for each in training_drives(folder)]
+    return [replace(each, platoon=f"human*{count} cav human*{FOLLOWERS}") for each in recorded_drives(folder)]
 
 
 def measure_value(folder: str, count: int, latency: float | None, workers: int) -> Table:

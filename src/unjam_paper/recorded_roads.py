@@ -1,19 +1,21 @@
 """Controllers behind recorded vehicles: fuel that they save in a platoon, and the gaps that they need for it.
 
-The recordings are drives on I-24 (10.5281/zenodo.6366761). Those of March 2021 are for tuning; those of April are test
-drives, which no part of this study reads yet.
+The recordings are drives on I-24 (10.5281/zenodo.6366761). Those of March 2021 are for tuning and training; those of
+April are test drives, which choose nothing.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
 from optuna.distributions import FloatDistribution
 
 from unjam.controller import make_driver
+from unjam.controller.file import SUFFIX
 from unjam.drivers.car_following import ACC, FollowerStopper
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
@@ -23,30 +25,35 @@ from unjam.errors import InputError
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import estimate
+from unjam.measures.statistics import estimate_on_shared_seeds
 from unjam.physics.arrays import Array, Floats
-from unjam.recordings.leaders import recording_files
 from unjam.scenarios import Recorded
 from unjam.scenarios.road import RecordedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.training.evaluate import raise_failure
 from unjam.worlds.batch.run import run_batches
+from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.fuel_optimal_plan import PlanLimits, PlannedDriver, plan_speeds
 from unjam_paper.parameter_search import SearchBudget, measure_candidates, search_parameters
+from unjam_paper.recorded_residuals import MODEL_RATIOS, planned_residuals, train_residual
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, trainings_text
 
 RECORDED_STUDY = "recorded-roads"
 RECORDINGS_FOLDER, PUBLISHED_FILE = "recordings/i24", "recordings/model.onnx"
 """in the folder of all studies: the drives, and controllers/cra/model.onnx of CIRCLES-consortium/algos-stack"""
-TRAINING_MONTH = "2021-03"
+TRAINING_MONTH, TEST_MONTH = "2021-03", "2021-04"
 TIME_STEP = 0.1
 TUNED_SET_SPEED = 45.0
 """above all recorded speeds [m/s]"""
 MOTORWAY_TIME_GAPS = (0.4, 0.6, 0.8)
 SPEED_CONTROL_TIME = 0.6
 """time in which the speed controller of a car reaches a commanded speed; of the published controller, too [s]"""
+STOPPER = (
+    f"follower-stopper:window={TIME_STEP:g},boundary_time_gaps=[{','.join(map(str, MOTORWAY_TIME_GAPS))}],"
+    f"time_constant={SPEED_CONTROL_TIME:g}"
+)
 SEARCH_SPACES: dict[str, dict[str, FloatDistribution]] = {
     "smooth-acc": {
         "time_gap": FloatDistribution(1.0, 4.0),
@@ -68,11 +75,29 @@ SEARCH_SPACES: dict[str, dict[str, FloatDistribution]] = {
 DRIVE_METRICS = (
     *("fuel_by_power", "cav_fuel_by_power", "human_fuel_by_power", "cav_mean_gap", "cav_gap_95", "cav_max_gap"),
     *("min_time_gap", "share_short_time_gap", "time_behind_leader", "outflow_veh_per_h", "cav_max_braking"),
-    *("mean_abs_jerk", "filter_override_share", "feasibility"),
+    *("amplification_long", "amplification_medium", "amplification_short", "mean_abs_jerk", "filter_override_share"),
+    "feasibility",
 )
+TUNED_METHOD = "smooth-acc"
+"""the law that residuals are added to"""
 SEARCH_SEED, SEARCH_BUDGET = 0, SearchBudget()
 PUBLISHED_LABEL, PLAN_LABEL = "published", "plan that knows the recording"
-SEARCH_PART, DRIVES_PART = "search", "training drives"
+SEARCH_PART, RESIDUALS_PART, TRAINING_PART, TEST_PART = "search", "residuals", "training drives", "test drives"
+SUMO_PART = "in SUMO"
+DRIVES_PARTS = {TRAINING_PART: TRAINING_MONTH, TEST_PART: TEST_MONTH}
+STANDARD_SETTING = "as tuned"
+SETTINGS: dict[str, dict[str, Any]] = {
+    STANDARD_SETTING: {},
+    "20 human drivers behind the CAV": {"platoon": "cav human*20"},
+    "human drivers calibrated with NGSIM": {"population": "unjam:ngsim"},
+    "human drivers calibrated with AstaZero": {"population": "unjam:astazero"},
+    "human drivers without noise": {"noise": 0.0},
+    "CAV without delay and lag": {"actuator": Actuator()},
+    "CAV with a delay of 0.4 s and a lag of 0.6 s": {"actuator": Actuator(delay=0.4, lag=0.6)},
+}
+"""assumptions of which the saving may depend, each changed alone"""
+WAVE_PERIODS = {"long": "periods above 60 s", "medium": "20 to 60 s", "short": "4 to 20 s"}
+SUMO_METRICS = ("fuel_ml_per_km", "fuel_by_power")
 
 
 @dataclass(frozen=True)
@@ -102,15 +127,19 @@ class PublishedController(Driver):
         return self.stopper.acceleration(state, state.speed + SPEED_CONTROL_TIME * acceleration), memory
 
 
-def training_drives(folder: Path) -> list[Recorded]:
-    """Return a road for each drive of March; raise `InputError` if the drives are missing."""
-    path = folder / RECORDINGS_FOLDER
-    found = [file for file in recording_files(path) if file.name.startswith(TRAINING_MONTH)] if path.is_dir() else []
+def recorded_drives(folder: Path, month: str = TRAINING_MONTH) -> list[Recorded]:
+    """Return a road for each drive of a month; raise `InputError` if the drives are missing."""
+    found = _drive_files(folder, month)
     if not found:
+        path = folder / RECORDINGS_FOLDER
         raise InputError(
             f"{RECORDED_STUDY}: {path} has no drives; download them: https://doi.org/10.5281/zenodo.6366761"
         )
     return [Recorded(recordings=str(file)) for file in found]
+
+
+def _drive_files(folder: Path, month: str) -> list[Path]:
+    return sorted((folder / RECORDINGS_FOLDER).glob(f"{month}*"))
 
 
 def untuned_driver(method: str) -> Driver:
@@ -120,7 +149,7 @@ def untuned_driver(method: str) -> Driver:
 
 def tune_driver(folder: str, method: str, workers: int) -> Table:
     """Return the best candidates of a method after each generation, on the training drives."""
-    scenarios = training_drives(Path(folder))
+    scenarios = recorded_drives(Path(folder))
     human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
     return search_parameters(
         scenarios, untuned_driver(method), SEARCH_SPACES[method], human, SEARCH_SEED, SEARCH_BUDGET
@@ -134,21 +163,42 @@ def tuned_name(rows: Table, method: str) -> str:
     return f"{method}:{values}"
 
 
-def measure_driver(folder: str, name: str, workers: int) -> Table:
-    """Return the metrics of a driver behind each training drive, one row for each."""
-    scenarios, driver = training_drives(Path(folder)), None
+def measure_driver(folder: str, month: str, setting: str, name: str, workers: int) -> Table:
+    """Return the metrics of a driver behind each drive of a month with changed assumptions, one row for each drive."""
+    scenarios = [replace(each, **SETTINGS[setting]) for each in recorded_drives(Path(folder), month)]
     if name == PLAN_LABEL:
         ideal = {"actuator": Actuator(), "safety": SafetyFilter(active=False), "actuation": "raw"}
         scenarios = [replace(each, **ideal) for each in scenarios]
         driver = plan_driver(scenarios)
-    elif name == PUBLISHED_LABEL:
-        driver = PublishedController(str(Path(folder) / PUBLISHED_FILE))
-    made = driver or make_driver(name, TIME_STEP)
-    rows = [measure(episode) for episode in run_batches([EpisodeTask(each, made, (0,)) for each in scenarios])]
+    else:
+        driver = compared_driver(Path(folder), name)
+    rows = [measure(episode) for episode in run_batches([EpisodeTask(each, driver, (0,)) for each in scenarios])]
     raise_failure(rows)
+    return _drive_rows(name, scenarios, rows, DRIVE_METRICS)
+
+
+def measure_fuel_in_sumo(folder: str, month: str, name: str, workers: int) -> Table:
+    """Return the fuel of the platoon by SUMO's emission model behind each drive of a month."""
+    scenarios, driver = recorded_drives(Path(folder), month), compared_driver(Path(folder), name)
+    rows = [measure(run_episode(each, driver, (0,))) for each in scenarios]
+    raise_failure(rows)
+    return _drive_rows(name, scenarios, rows, SUMO_METRICS)
+
+
+def compared_driver(folder: Path, name: str) -> Driver:
+    """Return a driver by its name in tables."""
+    if name == PUBLISHED_LABEL:
+        return PublishedController(str(folder / PUBLISHED_FILE))
+    return make_driver(name, TIME_STEP)
+
+
+def _drive_rows(name: str, scenarios: Sequence[Recorded], rows: Table, metrics: Sequence[str]) -> Table:
     drives = (Path(each.recordings).stem for each in scenarios)
-    metrics = ({name: row[name] for name in DRIVE_METRICS} for row in rows)
-    return [{"driver": name, "drive": drive, **row} for drive, row in zip(drives, metrics, strict=True)]
+    label = _entry(name) if name.endswith(SUFFIX) else name
+    return [
+        {"driver": label, "drive": drive, **{metric: row[metric] for metric in metrics}}
+        for drive, row in zip(drives, rows, strict=True)
+    ]
 
 
 def plan_driver(scenarios: list[Recorded]) -> PlannedDriver:
@@ -160,45 +210,143 @@ def plan_driver(scenarios: list[Recorded]) -> PlannedDriver:
 
 
 def make_recorded_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
-    """Return the searches of parameters, and then the drivers behind the training drives."""
+    """Return the searches of parameters, then the trainings, and then the drivers behind the drives of both months."""
     root, folder = str(study_folder.folder), study_folder.folder / RECORDED_STUDY
     parts: dict[str, StudyPart] = {f"{SEARCH_PART} {method}": (tune_driver, (root, method)) for method in SEARCH_SPACES}
     if not all((folder / f"{part}.json").is_file() for part in parts):
         return parts
     tuned = [tuned_name(read_part(folder, f"{SEARCH_PART} {method}"), method) for method in SEARCH_SPACES]
-    gaps = ",".join(map(str, MOTORWAY_TIME_GAPS))
-    stopper = f"follower-stopper:window={TIME_STEP:g},boundary_time_gaps=[{gaps}],time_constant={SPEED_CONTROL_TIME:g}"
-    names = (HUMAN_LABEL, stopper, PUBLISHED_LABEL, *tuned, PLAN_LABEL)
-    return parts | {f"{DRIVES_PART}/{name.partition(':')[0]}": (measure_driver, (root, name)) for name in names}
+    drives = str(study_folder.folder / RECORDINGS_FOLDER / f"{TRAINING_MONTH}*")
+    runs = planned_residuals(folder / RESIDUALS_PART, drives, tuned[0], seeds)
+    parts |= {f"{RESIDUALS_PART}/{run.name}": (train_residual, (run,)) for run in runs}
+    if not all(run.controller.is_file() for run in runs):
+        return parts
+    names = (HUMAN_LABEL, STOPPER, PUBLISHED_LABEL, *tuned)
+    residuals = tuple(str(run.controller) for run in runs)
+    for part, month in DRIVES_PARTS.items():
+        for name in (*names, PLAN_LABEL, *residuals):
+            parts[f"{part}/{_entry(name)}"] = measure_driver, (root, month, STANDARD_SETTING, name)
+    for name in names:
+        parts[f"{SUMO_PART}/{_entry(name)}"] = measure_fuel_in_sumo, (root, TEST_MONTH, name)
+        for setting in SETTINGS:
+            parts[f"{setting}/{_entry(name)}"] = measure_driver, (root, TEST_MONTH, setting, name)
+    return parts
 
 
-def drivers_table(folder: Path) -> pd.DataFrame:
-    """Return fuel, gaps, lost time and flow of the drivers behind the training drives, compared with human drivers."""
-    rows = read_part(folder, DRIVES_PART)
-    names = dict.fromkeys(row["driver"] for row in rows)
-    by_driver = {name: pd.DataFrame([row for row in rows if row["driver"] == name]) for name in names}
-    human = by_driver[HUMAN_LABEL]
-    return pd.DataFrame([_table_row(name, own, human) for name, own in by_driver.items()])
+def _entry(name: str) -> str:
+    """Return a short label: the name of a law, or that of a trained controller's file."""
+    return Path(name).stem if name.endswith(SUFFIX) else name.partition(":")[0]
 
 
-def _table_row(name: str, own: pd.DataFrame, human: pd.DataFrame) -> dict[str, str]:
-    def change(metric: str, relative: bool) -> str:
-        values, base = own[metric].to_numpy(np.float64), human[metric].to_numpy(np.float64)
-        difference: Floats = 100.0 * (values / base - 1.0) if relative else values - base
-        is_same = name == HUMAN_LABEL
-        return NO_VALUE_TEXT if is_same else str(estimate_cell(estimate(difference.tolist()), 2, sign="+"))
+@dataclass(frozen=True)
+class DriveResults:
+    """The metrics of drivers behind the same drives; several trainings are one driver."""
 
-    reasons = [text for text in own["feasibility"] if text and text != FEASIBLE]
-    gaps = own["cav_mean_gap"].mean(), own["cav_gap_95"].mean(), own["cav_max_gap"].max()
+    rows: Table
+
+    def groups(self) -> dict[str, Table]:
+        """Return the rows of each driver, with those of all trainings together."""
+        groups: dict[str, Table] = {}
+        for row in self.rows:
+            label, _, seed = row["driver"].rpartition(" ")
+            trained = f"{TUNED_METHOD} and residual {label}"
+            groups.setdefault(trained if seed.isdigit() else row["driver"], []).append(row)
+        return groups
+
+    def values(self, label: str, metric: str) -> Floats:
+        """Return a metric of a driver, shape (trainings, drives)."""
+        own, count = self.groups()[label], len({row["drive"] for row in self.rows})
+        return np.array([row[metric] for row in own], np.float64).reshape(-1, count)
+
+    def change(self, label: str, metric: str, is_relative: bool = True, baseline: str = HUMAN_LABEL) -> Floats:
+        """Return the change from human drivers, minus that of another baseline, shape (trainings, drives)."""
+        human = self.values(HUMAN_LABEL, metric)
+        scale = human / 100.0 if is_relative else 1.0
+        return (self.values(label, metric) - self.values(baseline, metric)) / scale
+
+    def change_text(self, label: str, metric: str, is_relative: bool = True, baseline: str = HUMAN_LABEL) -> str:
+        """Return the mean change with its 95 % CI over drives and trainings; a dash for the baseline itself."""
+        if label in (HUMAN_LABEL, baseline):
+            return NO_VALUE_TEXT
+        values = self.change(label, metric, is_relative, baseline)
+        return str(estimate_cell(estimate_on_shared_seeds(values), 2, sign="+"))
+
+    def label_of(self, method: str) -> str:
+        """Return the label of the driver with the parameters that were tuned."""
+        return next(label for label in self.groups() if label.partition(":")[0] == method)
+
+
+def drivers_table(part: str, folder: Path) -> pd.DataFrame:
+    """Return fuel, gaps, lost time and flow of the drivers behind drives, compared with human drivers."""
+    results = DriveResults(read_part(folder, part))
+    tuned = results.label_of(TUNED_METHOD)
+    return pd.DataFrame(_driver_row(results, label, own, tuned) for label, own in results.groups().items())
+
+
+def _driver_row(results: DriveResults, label: str, own: Table, tuned: str) -> dict[str, Any]:
+    reasons = [row["feasibility"] for row in own if row["feasibility"] and row["feasibility"] != FEASIBLE]
+    gap, gap_95, largest = (results.values(label, f"cav_{name}") for name in ("mean_gap", "gap_95", "max_gap"))
     return {
-        "driver": name,
-        "fuel of the platoon [%]": change("fuel_by_power", relative=True),
-        "fuel of the CAV [%]": change("cav_fuel_by_power", relative=True),
-        "gap: mean / 95 % / largest [m]": " / ".join(f"{each:.0f}" for each in gaps),
-        "smallest time gap [s]": f"{own['min_time_gap'].min():.2f}",
-        "lost time [s]": change("time_behind_leader", relative=False),
-        "flow [%]": change("outflow_veh_per_h", relative=True),
+        "driver": label,
+        "fuel of the platoon [%]": results.change_text(label, "fuel_by_power"),
+        f"difference to {TUNED_METHOD} [points]": results.change_text(label, "fuel_by_power", baseline=tuned),
+        "fuel of the CAV [%]": results.change_text(label, "cav_fuel_by_power"),
+        "gap: mean / 95 % / largest [m]": f"{gap.mean():.0f} / {gap_95.mean():.0f} / {largest.max():.0f}",
+        "smallest time gap [s]": f"{results.values(label, 'min_time_gap').min():.2f}",
+        "lost time [s]": results.change_text(label, "time_behind_leader", is_relative=False),
+        "flow [%]": results.change_text(label, "outflow_veh_per_h"),
         "feasible": reasons[0] if reasons else "yes",
+    }
+
+
+def waves_table(folder: Path) -> pd.DataFrame:
+    """Return by how much each driver's platoon amplifies waves, by their period, behind the test drives."""
+    results = DriveResults(read_part(folder, TEST_PART))
+    return pd.DataFrame(
+        {
+            "driver": label.partition(":")[0],
+            **{
+                f"amplification, {period}": f"{results.values(label, f'amplification_{name}').mean():.2f}"
+                for name, period in WAVE_PERIODS.items()
+            },
+            "hardest braking [m/s²]": f"{results.values(label, 'cav_max_braking').max():.1f}",
+            "mean jerk [m/s³]": f"{results.values(label, 'mean_abs_jerk').mean():.2f}",
+        }
+        for label in results.groups()
+    )
+
+
+def settings_table(folder: Path) -> pd.DataFrame:
+    """Return the change of fuel by each driver under other assumptions, and by SUMO's emission model."""
+    tables = {setting: DriveResults(read_part(folder, setting)) for setting in SETTINGS}
+    rows = [_setting_row(setting, results, "fuel_by_power") for setting, results in tables.items()]
+    in_sumo = DriveResults(read_part(folder, SUMO_PART))
+    return pd.DataFrame([*rows, _setting_row("fuel by SUMO's emission model", in_sumo, "fuel_ml_per_km")])
+
+
+def _setting_row(setting: str, results: DriveResults, metric: str) -> dict[str, str]:
+    labels = [label for label in results.groups() if label != HUMAN_LABEL]
+    cells = {label.partition(":")[0]: results.change_text(label, metric) for label in labels}
+    return {"assumption": setting, **cells}
+
+
+def residuals_table(folder: Path) -> pd.DataFrame:
+    """Return the gains of the trainings over their law on validation windows of the training drives."""
+    rows = read_part(folder, RESIDUALS_PART)
+    groups = {label: [row for row in rows if row["residual"] == label] for label in MODEL_RATIOS}
+    return pd.DataFrame(_residual_row(label, own) for label, own in groups.items())
+
+
+def _residual_row(label: str, own: Table) -> dict[str, Any]:
+    gains: dict[int, list[float]] = {}
+    for row in own:
+        gains.setdefault(row["seed"], []).append(row["return_validation"] - row["return_expert"])
+    return {
+        "residual": label,
+        "trainings": len(gains),
+        "environment steps": f"{max(row['environment_steps'] for row in own):,}",
+        "best gain in validation": trainings_text([max(each) for each in gains.values()], 1, sign="+"),
+        "last gain in validation": trainings_text([each[-1] for each in gains.values()], 1, sign="+"),
     }
 
 
@@ -220,6 +368,9 @@ def search_table(folder: Path) -> pd.DataFrame:
 RECORDED_ROADS = Study(
     title="controllers behind recorded vehicles: fuel of a platoon, and the gaps that it needs",
     make_parts=make_recorded_parts,
-    minutes=25.0,
-    tables={"drivers": drivers_table, "search": search_table},
+    minutes=180.0,
+    tables={
+        **{name: partial(drivers_table, part) for name, part in (("drivers", TRAINING_PART), ("test", TEST_PART))},
+        **{"waves": waves_table, "settings": settings_table, "search": search_table, "residuals": residuals_table},
+    },
 )

@@ -267,16 +267,26 @@ def test_an_unknown_reward_lists_the_known_ones(name: str) -> None:
         make_reward(name)
 
 
-def test_fuel_is_saved_by_coasting_and_wasted_by_braking() -> None:
-    def reward(acceleration: float, time_gap: float = 2.0) -> float:
-        numbers = np.zeros((1, 2)), np.array([[acceleration]]), np.array([[time_gap]]), np.zeros(1, bool), np.zeros(1)
-        return float(total(REWARDS["fuel"](Outcome(*numbers, np.array([[20.0]]))))[0])
+def fuel_return(acceleration: float = 0.0, time_gap: float = 2.0, speed: float = 20.0) -> float:
+    """Return the fuel reward of one step of one CAV."""
+    numbers = np.zeros((1, 2)), np.array([[acceleration]]), np.array([[time_gap]]), np.zeros(1, bool), np.zeros(1)
+    return float(total(REWARDS["fuel"](Outcome(*numbers, np.array([[speed]]))))[0])
 
-    assert reward(0.0) == pytest.approx(0.0, abs=0.15)
-    assert reward(-0.2) - reward(0.0) == pytest.approx(reward(0.0) - reward(0.2))  # coasting gives back speed's fuel
-    assert reward(-3.0) == reward(-0.5)  # braking harder saves nothing more
-    assert reward(0.0, 0.5) == pytest.approx(reward(0.0) - 0.05)
-    assert reward(0.0, 7.0) == pytest.approx(reward(0.0) - 0.2)
+
+def test_fuel_is_lost_by_braking_and_not_by_accelerating() -> None:
+    assert fuel_return() == pytest.approx(0.0, abs=0.15)
+    assert fuel_return(0.5) == pytest.approx(fuel_return())  # it becomes speed
+    assert fuel_return(-0.2) == pytest.approx(fuel_return())  # coasting gives it back
+    assert fuel_return(-1.0) < fuel_return() - 0.5
+    assert fuel_return(-2.0) - fuel_return(-1.0) == pytest.approx(fuel_return(-3.0) - fuel_return(-2.0))
+
+
+@pytest.mark.parametrize("speed", [0.0, 2.0, 10.0, 30.0])
+def test_gaps_cost_beyond_90_m_and_5_s(speed: float) -> None:
+    limit = max(90.0, 5.0 * speed)
+    near, calm, late = (fuel_return(time_gap=gap / max(speed, 1e-3), speed=speed) for gap in (2.0, limit, limit + 20.0))
+    assert late == pytest.approx(calm - 0.2)
+    assert near == pytest.approx(calm - 0.1 * max(0.0, 1.0 - 2.0 / max(speed, 1e-3)))
 
 
 @given(outcome=outcomes())

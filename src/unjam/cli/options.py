@@ -121,7 +121,9 @@ def scenario_changes(
     warmup: Annotated[int | None, Option(help="Human-only simulation steps before the CAVs take over.")] = None,
     penetration_rate: Annotated[float | None, Option(help="Share of CAVs, on open roads.")] = None,
     cav_types: Annotated[str | None, Option(help="Vehicle types of CAVs on your own network: car,truck.")] = None,
-    recordings: Annotated[str | None, Option(help="Recorded speeds: a file or a folder, on the road recorded.")] = None,
+    recordings: Annotated[
+        str | None, Option(help="Recorded speeds: file, folder or pattern, on the road recorded.")
+    ] = None,
     platoon: Annotated[str | None, Option(help="Vehicles behind the recorded one: `human*2 cav human*20`.")] = None,
     network: dict[str, Any],
 ) -> dict[str, Any]:

@@ -35,3 +35,8 @@ def fuel_rate(speed: Array, acceleration: Array, car: Car = MID_SIZE_CAR) -> Arr
     drag = 0.5 * AIR_DENSITY * car.drag_area * speed * speed
     force = car.mass * (acceleration + car.rolling_resistance * GRAVITY) + drag
     return clamp_min(car.base_power + speed * force, 0.0) * (car.consumption / JOULES_PER_KWH)
+
+
+def kinetic_fuel_rate(speed: Array, acceleration: Array, car: Car = MID_SIZE_CAR) -> Array:
+    """Return the part of the fuel rate that becomes kinetic energy [ml/s]; negative while the car brakes."""
+    return car.mass * acceleration * speed * (car.consumption / JOULES_PER_KWH)

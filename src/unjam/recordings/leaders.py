@@ -1,6 +1,7 @@
 """Recorded speeds of vehicles that others follow, and the files that have them."""
 
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from unjam.physics.arrays import Floats
 from unjam.recordings.trajectories import even_times
 
 FILE_SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".xml", ".gz")
+WILDCARDS = {*"*?["}
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +38,20 @@ class LeaderRecording:
 def recording_files(path: Path) -> list[Path]:
     """Return the files of a folder that can be recordings, ordered by name; or the file itself.
 
-    Raise `InputError` if there is none.
+    The last part of `path` may be a pattern like `2021-03*`. Raise `InputError` if there is none.
     """
-    if not path.is_dir():
-        if not path.is_file():
-            raise invalid_value("recordings", str(path), "a file with speeds, or a folder of them")
+    if path.is_file():
         return [path]
-    found = sorted(each for each in path.iterdir() if each.suffix.lower() in FILE_SUFFIXES and each.is_file())
+    folder, pattern = (path, "*") if path.is_dir() else (path.parent, path.name)
+    if not folder.is_dir() or not WILDCARDS & {*pattern}:
+        allowed = "a file with speeds, a folder of them, or a pattern like 'drives/2021-03*'"
+        raise invalid_value("recordings", str(path), allowed)
+    found = sorted(
+        each
+        for each in folder.iterdir()
+        if fnmatchcase(each.name, pattern) and each.suffix.lower() in FILE_SUFFIXES and each.is_file()
+    )
     if not found:
-        raise invalid_value("recordings", str(path), f"a folder with files that end in {', '.join(FILE_SUFFIXES)}")
+        endings = ", ".join(FILE_SUFFIXES)
+        raise invalid_value("recordings", str(path), f"a folder or a pattern with files that end in {endings}")
     return found

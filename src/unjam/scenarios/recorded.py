@@ -54,7 +54,8 @@ class Recorded(Scenario):
     """the parameter in which the roads of a batch may differ"""
 
     recordings: str = ""
-    """a file with speeds, or a folder of them, see `unjam.recordings.leader_files`; empty: artificial waves"""
+    """a file with speeds, a folder of them, or a pattern like `drives/2021-03*`, see `unjam.recordings.leader_files`;
+    empty: artificial waves"""
     platoon: str = "cav human*5"
     """vehicles behind the recorded one, from front to back, like `human*2 cav human*20`"""
     begin: NonNegative = 0.0
@@ -152,7 +153,7 @@ class Recorded(Scenario):
         from unjam.recordings.leader_files import read_leaders
 
         path = Path(self.recordings)
-        if path.is_dir():
+        if not path.is_file():
             return f"recordings: {len(recording_files(path))} files of {path.name}, drawn at random"
         found = read_leaders(path)
         seconds, speeds = [each.seconds for each in found], np.concatenate([each.speed for each in found])

@@ -13,7 +13,7 @@ from unjam.drivers.user_driver import FileReference, UserFunction, is_file_refer
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import split_parameters
 from unjam.physics.arrays import Array, Floats, clamp_min, namespace, square_root
-from unjam.physics.fuel import fuel_rate
+from unjam.physics.fuel import fuel_rate, kinetic_fuel_rate
 from unjam.worlds.record import Trajectory
 
 DESIRED_SPEED = 30.0
@@ -30,8 +30,10 @@ CRASH_CLOSURE_STEPS = 2_400
 """control steps for which a crash closes a road in the travel-time reward: a whole on-ramp episode"""
 MIN_CRASH_BACKLOG = 200
 """minimum number of vehicles that a crash stops, as more would enter: about 160 (3,700 veh/h for 154 s) drive there"""
-MAX_CALM_TIME_GAP, STANDING_TIME_GAP = 5.0, 60.0
-"""time gap beyond which a CAV lags behind, and that of a vehicle that practically stands [s]"""
+MAX_CALM_TIME_GAP, MAX_CALM_GAP = 5.0, 90.0
+"""a CAV lags behind if its time gap [s] and its gap [m] are larger than these"""
+LATE_WEIGHT = 0.01
+"""cost of each meter beyond them [ml/s]"""
 STEADY_FUEL = 0.05
 """fuel of a mid-size car at a constant speed of 10 to 25 m/s [ml/m]"""
 STANDSTILL_SPEED = 1e-3
@@ -129,15 +131,17 @@ def released_merge_reward(outcome: Outcome) -> dict[str, Array]:
 def fuel_reward(outcome: Outcome) -> dict[str, Array]:
     """Reward little fuel of the CAVs for their distance [ml/s]: about 0 in steady driving, less with braking.
 
-    Fuel is that of the power at the wheels, see `unjam.physics.fuel`. Time gaps below 1 s, and the part of those beyond
-    5 s, cost 0.1 for each second: a CAV must not save fuel by being late. A crash costs 10.
+    Fuel is that of the power at the wheels, see `unjam.physics.fuel`, without the part that becomes kinetic energy: it
+    is lost only when the CAV brakes. Time gaps below 1 s cost 0.1 for each second, and gaps beyond 90 m and 5 s 0.01
+    for each meter: a CAV must not save fuel by being late. A crash costs 10.
     """
-    saved = STEADY_FUEL * outcome.cav_speeds - fuel_rate(outcome.cav_speeds, outcome.accelerations)
-    late = clamp_min(outcome.time_gaps - MAX_CALM_TIME_GAP, 0.0) * (outcome.time_gaps < STANDING_TIME_GAP)
+    speeds, accelerations = outcome.cav_speeds, outcome.accelerations
+    lost = fuel_rate(speeds, accelerations) - kinetic_fuel_rate(speeds, accelerations)
+    late = clamp_min(_cav_gaps(outcome) - clamp_min(MAX_CALM_TIME_GAP * speeds, MAX_CALM_GAP), 0.0)
     return {
-        "fuel": _nan_mean(saved),
+        "fuel": _nan_mean(STEADY_FUEL * speeds - lost),
         "time_gap": TIME_GAP_WEIGHT * time_gap_penalty(outcome),
-        "late": -TIME_GAP_WEIGHT * _nan_sum(late),
+        "late": -LATE_WEIGHT * _nan_sum(late),
         "crash": -10.0 * outcome.has_crashed,
     }
 
@@ -169,6 +173,11 @@ def time_gap_penalty(outcome: Outcome) -> Array:
     return -_nan_sum(clamp_min(MAX_PENALIZED_TIME_GAP - outcome.time_gaps, 0.0))
 
 
+def gap_penalty(outcome: Outcome) -> Array:
+    """Term: minus the mean gap of the CAVs [100 m]: the longer it is, the smaller the flow."""
+    return -_nan_mean(_cav_gaps(outcome)) / 100.0
+
+
 def acceleration_penalty(outcome: Outcome) -> Array:
     """Term: minus the CAVs' mean squared acceleration [m2/s4]."""
     return -_nan_mean(outcome.accelerations * outcome.accelerations)
@@ -182,6 +191,7 @@ def speed_variation_penalty(outcome: Outcome) -> Array:
 
 REWARD_TERMS: dict[str, Callable[[Outcome], Array]] = {
     "time_gap": time_gap_penalty,
+    "gap": gap_penalty,
     "comfort": acceleration_penalty,
     "smoothness": speed_variation_penalty,
 }
@@ -206,6 +216,11 @@ def reward_label(reward: RewardLike) -> str:
 def time_gap(gap: Array, speed: Array) -> Array:
     """Return gap over speed [s]; a very large number for a standing vehicle."""
     return gap / clamp_min(speed, STANDSTILL_SPEED)
+
+
+def _cav_gaps(outcome: Outcome) -> Array:
+    """Return the gaps of the CAVs [m]: the inverse of `time_gap`."""
+    return outcome.time_gaps * clamp_min(outcome.cav_speeds, STANDSTILL_SPEED)
 
 
 def make_reward(text: RewardLike) -> Reward:
