@@ -133,7 +133,7 @@ def recorded_drives(folder: Path, month: str = TRAINING_MONTH) -> list[Recorded]
     if not found:
         path = folder / RECORDINGS_FOLDER
         raise InputError(
-            f"{RECORDED_STUDY}: {path} has no drives; download them: https://doi.org/10.5281/zenodo.6366761"
+            f"{RECORDED_STUDY}: {path} has no drives of {month}; download them: https://doi.org/10.5281/zenodo.6366761"
         )
     return [Recorded(recordings=str(file)) for file in found]
 
@@ -216,6 +216,7 @@ def make_recorded_parts(study_folder: StudyFolder, seeds: int) -> dict[str, Stud
     if not all((folder / f"{part}.json").is_file() for part in parts):
         return parts
     tuned = [tuned_name(read_part(folder, f"{SEARCH_PART} {method}"), method) for method in SEARCH_SPACES]
+    recorded_drives(study_folder.folder, TEST_MONTH)  # refused before the trainings
     drives = str(study_folder.folder / RECORDINGS_FOLDER / f"{TRAINING_MONTH}*")
     runs = planned_residuals(folder / RESIDUALS_PART, drives, tuned[0], seeds)
     parts |= {f"{RESIDUALS_PART}/{run.name}": (train_residual, (run,)) for run in runs}

@@ -11,7 +11,7 @@ from tests.adapters.onnx_policies import linear, write
 from unjam.controller import make_driver
 from unjam.errors import InputError
 from unjam.physics.fuel import fuel_rate
-from unjam_paper import fuel_optimal_plan, information_ahead, recorded_roads
+from unjam_paper import fuel_optimal_plan, information_ahead, recorded_residuals, recorded_roads
 from unjam_paper.fuel_optimal_plan import PlanLimits, plan_speeds
 from unjam_paper.information_ahead import (
     FIXED_PARAMETERS,
@@ -22,15 +22,22 @@ from unjam_paper.information_ahead import (
     value_table,
 )
 from unjam_paper.parameter_search import SearchBudget, measure_candidates
+from unjam_paper.recorded_residuals import MODEL_RATIOS
 from unjam_paper.recorded_roads import (
+    DRIVES_PARTS,
     PLAN_LABEL,
     PUBLISHED_FILE,
     RECORDED_ROADS,
     RECORDINGS_FOLDER,
-    training_drives,
+    SETTINGS,
+    TEST_PART,
+    TRAINING_PART,
+    DriveResults,
+    recorded_drives,
     tuned_name,
     untuned_driver,
 )
+from unjam_paper.results_file import read_part
 from unjam_paper.study import StudyFolder
 
 STEP = 0.1
@@ -52,18 +59,19 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_test_drives_are_not_read(folder: Path) -> None:
-    assert [Path(each.recordings).stem for each in training_drives(folder)] == ["2021-03-01_a", "2021-03-02_b"]
+def test_drives_are_split_by_month(folder: Path) -> None:
+    names = [[Path(each.recordings).stem for each in recorded_drives(folder, month)] for month in DRIVES_PARTS.values()]
+    assert names == [["2021-03-01_a", "2021-03-02_b"], ["2021-04-01_c"]]
 
 
 def test_missing_drives_are_named_with_their_source(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"recorded-roads: .* has no drives; .*doi\.org"):
-        training_drives(tmp_path)
+    with pytest.raises(InputError, match=r"recorded-roads: .* has no drives of 2021-03; .*doi\.org"):
+        recorded_drives(tmp_path)
 
 
 @pytest.mark.parametrize("method", ["smooth-acc", "acc"])
 def test_candidates_that_drive_at_once_equal_those_that_drive_alone(folder: Path, method: str) -> None:
-    scenarios = training_drives(folder)
+    scenarios = recorded_drives(folder)
     parameters = {"time_gap": np.array([1.5, 2.5, 3.5]), "gap_gain": np.array([0.02, 0.05, 0.2])}
     together = measure_candidates(scenarios, untuned_driver(method), parameters)
     for number in range(3):
@@ -89,17 +97,51 @@ def test_a_plan_saves_fuel_within_its_limits() -> None:
     assert fuel(speed) < 0.85 * fuel(leader)
 
 
-def test_the_study_tunes_first_and_compares_all_drivers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_study_tunes_trains_and_then_compares_all_drivers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorded_roads, "SEARCH_BUDGET", SearchBudget(5, 6))
+    monkeypatch.setattr(recorded_roads, "SETTINGS", {name: SETTINGS[name] for name in (*SETTINGS,)[:2]})
     monkeypatch.setitem(fuel_optimal_plan.OPTIMIZER_OPTIONS, "maxiter", 20)
+    monkeypatch.setattr(recorded_residuals, "STEPS_PER_ITERATION", 2000)
+    monkeypatch.setattr(recorded_residuals, "TRAINING_STEPS", 4000)
+    small = {"evaluation.validation_episodes": 2, "evaluation.validation_interval": 1, "scenario_options.window": 30.0}
+    for name, value in small.items():
+        monkeypatch.setitem(recorded_residuals.TRAINING_CHANGES, name, value)
     study = folder / "recorded-roads"
     RECORDED_ROADS.run(StudyFolder(folder), 1, study, 1)
-    table = pd.read_csv(study / "drivers.csv")
-    names = [name.partition(":")[0] for name in table["driver"]]
-    assert names == ["human", "follower-stopper", "published", "smooth-acc", "acc", PLAN_LABEL]
-    assert table["fuel of the platoon [%]"].tolist()[0] == "–"
-    search = pd.read_csv(study / "search.csv")
-    assert list(search["method"]) == ["smooth-acc", "acc"]
+    laws = ["human", "follower-stopper", "published", "smooth-acc", "acc"]
+    trained = [f"smooth-acc and residual {name}" for name in MODEL_RATIOS]
+    for table, part, drives in (("drivers", TRAINING_PART, 2), ("test", TEST_PART, 1)):
+        frame = pd.read_csv(study / f"{table}.csv")
+        assert [name.partition(":")[0] for name in frame["driver"]] == [*laws, PLAN_LABEL, *trained]
+        assert frame["fuel of the platoon [%]"].tolist()[0] == "–"
+        assert len(read_part(study, part)) == 8 * drives
+    assert list(pd.read_csv(study / "search.csv")["method"]) == ["smooth-acc", "acc"]
+    settings = pd.read_csv(study / "settings.csv")
+    assert list(settings.columns[1:]) == laws[1:]
+    assert len(settings) == 3  # two settings, and fuel in SUMO
+    assert list(pd.read_csv(study / "residuals.csv")["trainings"]) == [1, 1]
+    assert len(pd.read_csv(study / "waves.csv")) == 8
+
+
+def test_several_trainings_are_one_driver_with_paired_drives() -> None:
+    fuel = {
+        "human": [100.0, 50.0],
+        "smooth-acc:gap=2": [98.0, 50.0],
+        "with model 0": [97.0, 49.0],
+        "with model 1": [99.0, 50.0],
+    }
+    rows = [
+        {"driver": name, "drive": drive, "fuel_by_power": value}
+        for name, values in fuel.items()
+        for drive, value in zip("ab", values, strict=True)
+    ]
+    results = DriveResults(rows)
+    trained = "smooth-acc and residual with model"
+    assert [*results.groups()] == ["human", "smooth-acc:gap=2", trained]
+    np.testing.assert_allclose(results.change(trained, "fuel_by_power"), [[-3.0, -2.0], [-1.0, 0.0]])
+    against_law = results.change(trained, "fuel_by_power", baseline="smooth-acc:gap=2")
+    np.testing.assert_allclose(against_law, [[-1.0, -2.0], [1.0, 0.0]])
+    assert results.change_text("human", "fuel_by_power") == "–"
 
 
 def test_received_speeds_are_those_of_the_first_vehicle_after_the_latency(folder: Path) -> None:
