@@ -4,6 +4,7 @@ The recorded vehicle is connected. Human drivers follow it, then the CAV, then o
 speed of the first vehicle before its waves arrive. Fuel counts from the CAV on.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -23,8 +24,22 @@ from unjam.measures.statistics import estimate
 from unjam.physics.arrays import Array, Floats
 from unjam.scenarios import Recorded
 from unjam.scenarios.road import RecordedRoad
+from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.worlds.batch.run import run_batches
+from unjam.worlds.worker_pool import EpisodeTask
+from unjam_paper.fuel_optimal_plan import PlanLimits, PlannedDriver, plan_speeds
 from unjam_paper.parameter_search import RowScores, SearchBudget, measure_candidates, search_parameters
-from unjam_paper.recorded_roads import SEARCH_SEED, SEARCH_SPACES, TIME_STEP, recorded_drives
+from unjam_paper.recorded_roads import (
+    IDEAL_CAR,
+    PLAN_LABEL,
+    SEARCH_SEED,
+    SEARCH_SPACES,
+    TEST_MONTH,
+    TEST_PART,
+    TIME_STEP,
+    TRAINING_MONTH,
+    recorded_drives,
+)
 from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
 
@@ -44,7 +59,7 @@ FIXED_PARAMETERS = {
     **{"acceleration_limit": 0.53, "braking_limit": 0.36, "largest_gap": 91.0},
 }
 """of the search without information, see `unjam_paper.recorded_roads`"""
-PART = "value"
+INFORMATION_STUDY, PART = "information-ahead", "value"
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,62 +95,100 @@ def received_speeds(scenarios: list[Recorded], latency: float) -> Floats:
     return np.stack([np.pad(each, (delay, longest - len(each)), "edge") for each in speeds], 1)
 
 
-def roads_with_vehicles_between(folder: Path, count: int) -> list[Recorded]:
-    """Return the training drives with `count` human drivers between the recorded vehicle and the CAV."""
-    return [replace(each, platoon=f"human*{count} cav human*{FOLLOWERS}") for each in recorded_drives(folder)]
+def roads_with_vehicles_between(folder: Path, count: int, month: str = TRAINING_MONTH) -> list[Recorded]:
+    """Return the drives of a month with `count` human drivers between the recorded vehicle and the CAV."""
+    return [replace(each, platoon=f"human*{count} cav human*{FOLLOWERS}") for each in recorded_drives(folder, month)]
+
+
+def informed_driver(scenarios: list[Recorded], latency: float | None, parameters: Mapping[str, float]) -> InformedACC:
+    """Return the law with these parameters, which receives the speeds of the first vehicles with a latency."""
+    received = np.zeros((1, len(scenarios))) if latency is None else received_speeds(scenarios, latency)
+    return InformedACC(**{**FIXED_PARAMETERS, **parameters}, time_step=TIME_STEP, received_speeds=received)
 
 
 def measure_value(folder: str, count: int, latency: float | None, workers: int) -> Table:
-    """Return the best parameters with a latency, and what they save on each drive, as a list of one row."""
+    """Return the best parameters with a latency on the training drives, as a list of one row."""
     scenarios = roads_with_vehicles_between(Path(folder), count)
     human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
-    received = np.zeros((1, len(scenarios))) if latency is None else received_speeds(scenarios, latency)
-    driver = InformedACC(**FIXED_PARAMETERS, time_step=TIME_STEP, received_speeds=received)
     space = SHARED_SPACE if latency is None else SHARED_SPACE | SPACE_AHEAD
+    driver = informed_driver(scenarios, latency, {})
     best = search_parameters(scenarios, driver, space, human, SEARCH_SEED, VALUE_BUDGET)[-1]
-    scores = measure_candidates(scenarios, replace(driver, **best["parameters"]))
-    return [{"between": count, "latency": latency, **best, "by_drive": _fuel_changes(scores, human)}]
+    return [{"between": count, "latency": latency, **best}]
 
 
-def _fuel_changes(scores: RowScores, human: RowScores) -> list[float]:
-    """Return the fuel relative to human drivers on each drive [%]."""
-    return (100.0 * (scores.fuel / human.fuel - 1.0))[0].tolist()
+def measure_test_value(
+    folder: str, count: int, found: Mapping[float | None, Mapping[str, float]], workers: int
+) -> Table:
+    """Return the fuel on each test drive by latency with the parameters that were found, and that of the plan."""
+    scenarios = roads_with_vehicles_between(Path(folder), count, TEST_MONTH)
+    human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
+    scores: dict[float | str | None, RowScores] = {
+        latency: measure_candidates(scenarios, informed_driver(scenarios, latency, parameters))
+        for latency, parameters in found.items()
+    }
+    planned = [replace(each, **IDEAL_CAR) for each in scenarios]
+    scores[PLAN_LABEL] = measure_candidates(planned, plan_behind_humans(planned))
+    return [
+        {
+            **{"between": count, "latency": latency, "by_drive": (100.0 * (each.fuel / human.fuel - 1.0))[0].tolist()},
+            **{"mean_gap": float(each.mean_gap.mean()), "max_gap": float(each.max_gap.max())},
+        }
+        for latency, each in scores.items()
+    ]
+
+
+def plan_behind_humans(scenarios: list[Recorded]) -> PlannedDriver:
+    """Return the plan of a CAV that knows the future of the human driver ahead, who does not react to it."""
+    human = make_driver(HUMAN_LABEL, TIME_STEP)
+    speeds, gaps = list[Floats](), list[float]()
+    for episode in run_batches([EpisodeTask(each, human, (0,)) for each in scenarios]):
+        speeds.append(episode.speeds[:, FOLLOWERS + 1])
+        start = episode.positions[0]
+        gaps.append(float(start[FOLLOWERS + 1] - start[FOLLOWERS]) - VEHICLE_LENGTH)
+    return PlannedDriver(tuple(plan_speeds(speeds, gaps, TIME_STEP, PlanLimits())), TIME_STEP)
 
 
 def make_value_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
-    """Return a part for each distance and latency."""
-    root = str(study_folder.folder)
-    return {
+    """Return a search for each distance and latency, and then the test drives for each distance."""
+    root, folder = str(study_folder.folder), study_folder.folder / INFORMATION_STUDY
+    parts: dict[str, StudyPart] = {
         f"{PART}/{count} {latency}": (measure_value, (root, count, latency))
         for count, latency in product(VEHICLES_BETWEEN, LATENCIES)
     }
+    if not (folder / f"{PART}.json").is_file():
+        return parts
+    for count in VEHICLES_BETWEEN:
+        found = {row["latency"]: row["parameters"] for row in read_part(folder, PART) if row["between"] == count}
+        parts[f"{TEST_PART}/{count}"] = measure_test_value, (root, count, found)
+    return parts
 
 
 def value_table(folder: Path) -> pd.DataFrame:
-    """Return what the CAV saves by distance and latency, and the difference to no information, paired by drive."""
-    rows = read_part(folder, PART)
-    without = {row["between"]: np.array(row["by_drive"]) for row in rows if row["latency"] is None}
-    return pd.DataFrame(_value_row(row, without[row["between"]]) for row in rows)
+    """Return what the CAV saves on the test drives by distance and latency, and the difference to no information."""
+    rows = read_part(folder, TEST_PART)
+    by_case = {(row["between"], row["latency"]): np.array(row["by_drive"]) for row in rows}
+    return pd.DataFrame(
+        _value_row(row, by_case[row["between"], None], by_case[row["between"], PLAN_LABEL]) for row in rows
+    )
 
 
-def _value_row(row: dict[str, Any], without: Floats) -> dict[str, str]:
+def _value_row(row: dict[str, Any], without: Floats, plan: Floats) -> dict[str, str]:
     changes, cell = np.array(row["by_drive"]), partial(estimate_cell, digits=2, sign="+")
-    is_informed = row["latency"] is not None
+    latency, names = row["latency"], {None: "nothing received", PLAN_LABEL: PLAN_LABEL}
+    difference = NO_VALUE_TEXT if latency is None else str(cell(estimate((changes - without).tolist())))
     return {
         "vehicles between": str(row["between"]),
-        "latency [s]": f"{row['latency']:g}" if is_informed else "nothing received",
+        "latency [s]": names.get(latency) or f"{latency:g}",
         "fuel [%]": str(cell(estimate(changes.tolist()))),
-        "difference to nothing received": str(cell(estimate((changes - without).tolist())))
-        if is_informed
-        else NO_VALUE_TEXT,
+        "difference to nothing received": difference,
+        "share of the plan's saving": f"{changes.mean() / plan.mean():.2f}",
         "gap: mean / largest [m]": f"{row['mean_gap']:.0f} / {row['max_gap']:.0f}",
-        "share of the received speed": f"{row['parameters'].get('ahead_weight', 0.0):.2f}",
     }
 
 
 INFORMATION_AHEAD = Study(
     title="value of speeds from ahead behind recorded vehicles, by distance and latency",
     make_parts=make_value_parts,
-    minutes=60.0,
+    minutes=75.0,
     tables={"value": value_table},
 )

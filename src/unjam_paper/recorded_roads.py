@@ -78,6 +78,8 @@ DRIVE_METRICS = (
     *("amplification_long", "amplification_medium", "amplification_short", "mean_abs_jerk", "filter_override_share"),
     "feasibility",
 )
+IDEAL_CAR: dict[str, Any] = {"actuator": Actuator(), "safety": SafetyFilter(active=False), "actuation": "raw"}
+"""the car of a plan"""
 TUNED_METHOD = "smooth-acc"
 """the law that residuals are added to"""
 SEARCH_SEED, SEARCH_BUDGET = 0, SearchBudget()
@@ -167,8 +169,7 @@ def measure_driver(folder: str, month: str, setting: str, name: str, workers: in
     """Return the metrics of a driver behind each drive of a month with changed assumptions, one row for each drive."""
     scenarios = [replace(each, **SETTINGS[setting]) for each in recorded_drives(Path(folder), month)]
     if name == PLAN_LABEL:
-        ideal = {"actuator": Actuator(), "safety": SafetyFilter(active=False), "actuation": "raw"}
-        scenarios = [replace(each, **ideal) for each in scenarios]
+        scenarios = [replace(each, **IDEAL_CAR) for each in scenarios]
         driver = plan_driver(scenarios)
     else:
         driver = compared_driver(Path(folder), name)

@@ -17,10 +17,10 @@ TRAINED = {"scenario": scenario_recipe(Ring())}
     [
         (Ring(), ""),
         (make_scenario("ring", {"length": 230, "horizon": 100}), ""),
-        (Ring(length=(260, 280)), "was trained on another ring: length 260-280 (there 220-270)"),
+        (Ring(length=(260, 280)), "was trained on the ring road with other parameters: length 260-280 (there 220-270)"),
         (Ring(warmup=6000, vehicles=20), "warmup 6000 (there 0), vehicles 20 (there 22)"),
         (make_scenario("ring", {"safety.active": False}), ": safety.active False (there True)"),
-        (make_scenario("merge"), "was trained on the ring, not on the merge"),
+        (make_scenario("merge"), "was trained on the ring road, not on the merge road"),
     ],
 )
 def test_another_road_than_that_of_the_training_is_told(road: Scenario, words: str) -> None:
@@ -30,7 +30,7 @@ def test_another_road_than_that_of_the_training_is_told(road: Scenario, words: s
 
 def test_a_tuned_controller_was_not_trained_and_an_unknown_road_is_no_other() -> None:
     mismatch = road_mismatch({**TRAINED, "tuning": {}}, scenario_recipe(make_scenario("merge")))
-    assert mismatch == "was tuned on the ring, not on the merge"
+    assert mismatch == "was tuned on the ring road, not on the merge road"
     assert road_mismatch({}, scenario_recipe(Ring())) == ""
     assert road_description(TRAINED) == "ring, length 220-270, vehicles 22, cavs 1, warmup 0"
 
@@ -48,6 +48,6 @@ def test_controllers_on_another_road_and_models_without_their_control_step_get_a
     road = scenario_recipe(make_scenario("figure-eight"))
     names = ["pi", "human", "unjam:figure-eight-tuned", "unjam:ring-tuned", "ppo.zip"]
     assert controller_notes(road, names, {}) == [
-        "unjam:ring-tuned was tuned on the ring, not on the figure-eight",
+        "unjam:ring-tuned was tuned on the ring road, not on the figure-eight road",
         "ppo.zip does not contain its control step: here it acts every 0.1 s, unless policy_driver sets another",
     ]

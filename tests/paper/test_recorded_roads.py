@@ -1,6 +1,6 @@
 """Controllers behind recorded vehicles: search of parameters, plans, and the study."""
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,20 +11,23 @@ from tests.adapters.onnx_policies import linear, write
 from unjam.controller import make_driver
 from unjam.errors import InputError
 from unjam.physics.fuel import fuel_rate
+from unjam.worlds.batch.run import run_batches
+from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper import fuel_optimal_plan, information_ahead, recorded_residuals, recorded_roads
 from unjam_paper.fuel_optimal_plan import PlanLimits, plan_speeds
 from unjam_paper.information_ahead import (
     FIXED_PARAMETERS,
     INFORMATION_AHEAD,
     InformedACC,
+    plan_behind_humans,
     received_speeds,
     roads_with_vehicles_between,
-    value_table,
 )
 from unjam_paper.parameter_search import SearchBudget, measure_candidates
 from unjam_paper.recorded_residuals import MODEL_RATIOS
 from unjam_paper.recorded_roads import (
     DRIVES_PARTS,
+    IDEAL_CAR,
     PLAN_LABEL,
     PUBLISHED_FILE,
     RECORDED_ROADS,
@@ -168,17 +171,33 @@ def test_each_candidate_receives_the_speeds_of_its_own_road(folder: Path) -> Non
     assert abs(together.fuel[1] / together.fuel[0] - 1.0).max() > 1e-4
 
 
-def test_the_value_of_information_is_relative_to_none_at_the_same_distance(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_value_of_information_is_that_on_test_drives(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(information_ahead, "VEHICLES_BETWEEN", (2,))
     monkeypatch.setattr(information_ahead, "LATENCIES", (None, 1.0))
     monkeypatch.setattr(information_ahead, "VALUE_BUDGET", SearchBudget(1, 6))
-    parts = INFORMATION_AHEAD.make_parts(StudyFolder(folder), 3)
-    assert [*parts] == ["value/2 None", "value/2 1.0"]
-    rows = [row for measure, arguments in parts.values() for row in measure(*arguments, 1)]
-    (folder / "value.json").write_text(json.dumps(rows))
-    table = value_table(folder)
-    assert table["latency [s]"].tolist() == ["nothing received", "1"]
+    monkeypatch.setitem(fuel_optimal_plan.OPTIMIZER_OPTIONS, "maxiter", 20)
+    study = folder / "information-ahead"
+    INFORMATION_AHEAD.run(StudyFolder(folder), 1, study, 1)
+    rows = read_part(study, TEST_PART)
+    assert [(row["between"], row["latency"]) for row in rows] == [(2, None), (2, 1.0), (2, PLAN_LABEL)]
+    assert {len(row["by_drive"]) for row in rows} == {1}
+    table = pd.read_csv(study / "value.csv")
+    assert table["latency [s]"].tolist() == ["nothing received", "1", PLAN_LABEL]
     difference = np.mean(np.subtract(rows[1]["by_drive"], rows[0]["by_drive"]))
     assert float(str(table["difference to nothing received"][1]).split()[0]) == pytest.approx(difference, abs=0.01)
+    assert table["share of the plan's saving"].tolist()[-1] == 1.0
+
+
+def test_a_plan_behind_human_drivers_starts_with_their_speeds_and_gaps(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(fuel_optimal_plan.OPTIMIZER_OPTIONS, "maxiter", 60)
+    scenarios = [replace(each, **IDEAL_CAR) for each in roads_with_vehicles_between(folder, 3)]
+    plan = plan_behind_humans(scenarios)
+    planned = run_batches([EpisodeTask(each, plan, (0,)) for each in scenarios])
+    human = run_batches([EpisodeTask(each, make_driver("human", STEP), (0,)) for each in scenarios])
+    for mine, other in zip(planned, human, strict=True):
+        ahead = mine.cav_columns[0] + 1
+        np.testing.assert_array_equal(mine.speeds[:, ahead:], other.speeds[:, ahead:])
+        assert np.diff(mine.positions[:, ahead - 1 : ahead + 1]).min() > 5.0  # vehicles have a length of 5 m
+        assert np.std(mine.speeds[:, ahead - 1]) < np.std(other.speeds[:, ahead - 1])

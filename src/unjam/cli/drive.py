@@ -9,7 +9,7 @@ from typer import Argument, Option
 from unjam.cli import options as opt
 from unjam.cli import output
 from unjam.cli.output import console, err_console, print_json
-from unjam.controller import DEFAULT_DRIVER, make_driver
+from unjam.controller import make_driver
 from unjam.controller.domain import controller_notes
 from unjam.drivers.driver import Driver
 from unjam.errors import InputError, MissingPartError, invalid_value
@@ -43,7 +43,8 @@ def drive_command(
             help="Driver of the CAVs: a name, name:parameter=value, your own path.py:name, a run folder, a .unjam "
             "file, or an .onnx file with a description; drivers joined by + share the CAVs. Several are compared on "
             "the same traffic.",
-            show_default="human and unjam:best; on your own network CAVs then have ACCs, as in assess",
+            show_default="human and unjam:best, on recorded roads unjam:recorded-tuned; on your own network "
+            "CAVs then have ACCs, as in assess",
         ),
     ] = None,
     episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Number of episodes.")] = 5,
@@ -75,10 +76,11 @@ def drive_command(
     changes = opt.merge_settings(changes, opt.parse_settings(settings))
     if out is not None and not report:
         raise InputError("out: it is not allowed with --no-report, which writes nothing")
-    if not driver:
-        driver = ["human", DEFAULT_DRIVER]
-        changes = (ACC_SETTINGS if scenario.endswith(".sumocfg") else {}) | changes
-    total = make_scenario(scenario, changes).max_episode_steps * episodes * len(driver)
+    if not driver and scenario.endswith(".sumocfg"):
+        changes = ACC_SETTINGS | changes
+    road = make_scenario(scenario, changes)
+    driver = driver or ["human", road.controller]
+    total = road.max_episode_steps * episodes * len(driver)
     folder = opt.new_folder(out, f"drive-{Path(scenario).stem}") if report else None
     with output.ProgressReporter(f"driving {Path(scenario).name}", "steps", total) as progress:
         options = workers, folder, progress.update, test_seeds, backend

@@ -15,7 +15,7 @@ from unjam.files import UNREADABLE_ERRORS, parse_json
 from unjam.parameters import build_dataclass, flatten_keys
 from unjam.worlds.record import Episode
 
-IRRELEVANT_PARAMETERS = {"horizon", "emission_class", "remember_warmup", "population"}
+IRRELEVANT_PARAMETERS = {"horizon", "emission_class", "remember_warmup", "population", "recordings", "begin", "window"}
 """scenario parameters that do not make it another scenario"""
 KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")
 """parameters that distinguish scenarios of a kind in a short description"""
@@ -75,7 +75,7 @@ def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
         return ""
     made = "tuned" if "tuning" in manifest else "trained"
     if trained.get("kind") != road["kind"]:
-        return f"was {made} on the {_value_text(trained.get('kind'))}, not on the {road['kind']}"
+        return f"was {made} on the {_value_text(trained.get('kind'))} road, not on the {road['kind']} road"
     before, now = _flatten_recipe(trained), _flatten_recipe(road)
     known = [name for name in now if name in before and name not in IRRELEVANT_PARAMETERS]
     differ = [name for name in known if not _is_within(before[name], now[name])]
@@ -84,7 +84,7 @@ def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
     listed = differ[:MAX_LISTED_PARAMETERS]
     words = [f"{name} {_value_text(now[name])} (there {_value_text(before[name])})" for name in listed]
     more = [f"{len(differ) - len(listed)} more"] if len(differ) > len(listed) else []
-    return f"was {made} on another {road['kind']}: {', '.join(words + more)}"
+    return f"was {made} on the {road['kind']} road with other parameters: {', '.join(words + more)}"
 
 
 def _flatten_recipe(recipe: dict[str, Any]) -> dict[str, Any]:

@@ -102,15 +102,15 @@ def _reduce_colors(png: bytes) -> bytes:
 def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     """Draw three quantities over time, a line per driver.
 
-    On closed roads: the CAV's speed and gap, and the std of speed across all vehicles; on open roads: the mean
-    speed, the std, and the insertion backlog.
+    On closed and recorded roads: the CAV's speed and gap, and the std of speed across all vehicles; on other open
+    roads: the mean speed, the std, and the insertion backlog.
     """
     figure = new_figure(6.2)
     panels = figure.subplots(3, 1, sharex=True)
-    is_closed = all(episode.is_closed for episode in episodes)
+    has_same_vehicles = all(episode.is_closed or episode.has_recorded_leader for episode in episodes)
     for episode, color in zip(episodes, LINE_COLORS, strict=False):
         stride = max(1, len(episode.times) // MAX_PLOT_TIMES)
-        for axes, (label, values) in zip(panels, _time_series(episode, is_closed).items(), strict=True):
+        for axes, (label, values) in zip(panels, _time_series(episode, has_same_vehicles).items(), strict=True):
             axes.plot(episode.times[::stride], values[::stride], color=color, lw=1.2)
             axes.set_ylabel(label)
         panels[0].plot([], [], color=color, lw=1.2, label=short_label(episode.driver))
@@ -125,11 +125,11 @@ def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     return figure
 
 
-def _time_series(episode: PlotEpisode, is_closed: bool) -> dict[str, np.ndarray]:
+def _time_series(episode: PlotEpisode, has_same_vehicles: bool) -> dict[str, np.ndarray]:
     """Return the quantities of `time_series_figure` by label; each of shape (T + 1,)."""
     speeds = np.where(np.isnan(episode.speeds).all(axis=1, keepdims=True), 0.0, episode.speeds)
     waves = {"speed std across\nvehicles [m/s]": np.nanstd(speeds, axis=1)}
-    if is_closed:
+    if has_same_vehicles:
         cav = episode.cav_columns[0]
         return {"CAV's speed [m/s]": episode.speeds[:, cav], "CAV's gap [m]": episode.gaps[:, cav], **waves}
     backlog = episode.backlog if len(episode.backlog) else np.zeros(len(speeds))

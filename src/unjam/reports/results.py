@@ -17,7 +17,7 @@ from unjam.errors import InputError, resume_hint
 from unjam.files import INVALID_DATA_ERRORS, read_json_lines
 from unjam.folders import reject_special_files
 from unjam.measures.metrics import METRICS
-from unjam.worlds.record import Episode
+from unjam.worlds.record import Episode, Floats
 
 Float32s = NDArray[np.float32]
 
@@ -72,7 +72,16 @@ def to_plot_episode(driver: str, episode: Episode) -> PlotEpisode:
     """Return the data of an episode for figures; its `control_step` is the time between two snapshots."""
     values = {name: getattr(episode, name) for name in (*EPISODE_ENTRIES, *PLOT_ARRAYS)}
     values |= {name: values[name][:: episode.snapshot_stride] for name in FULL_RATE_ARRAYS}
+    if episode.has_recorded_leader:
+        values |= _moving_scene(episode)
     return PlotEpisode(**{**values, "control_step": episode.control_step * episode.snapshot_stride}, driver=driver)
+
+
+def _moving_scene(episode: Episode) -> dict[str, Floats]:
+    """Return poses and the line of the road in a plane that moves with the recorded vehicle, which is at its origin."""
+    behind = episode.positions - episode.replayed_motion[:, :1, 0]
+    poses = np.stack([behind, 0.0 * behind, 0.0 * behind], -1)
+    return {"poses": poses, "lane_lines": np.array([[behind.min(), 0.0], [0.0, 0.0]])}
 
 
 def pack_episode(episode: PlotEpisode) -> dict[str, Float32s]:

@@ -7,7 +7,7 @@ ICRA; the drives on I-24 of that experiment are the usual recordings.
 import re
 from dataclasses import field, replace
 from functools import cached_property
-from math import ceil, floor
+from math import ceil, floor, nan
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
@@ -49,6 +49,7 @@ class Recorded(Scenario):
 
     title: ClassVar[str] = "recorded"
     reward: ClassVar[str] = "fuel"
+    controller: ClassVar[str] = "unjam:recorded-tuned"
     is_closed: ClassVar[bool] = False
     size_parameter: ClassVar[str] = "recordings"
     """the parameter in which the roads of a batch may differ"""
@@ -206,7 +207,7 @@ class Recorded(Scenario):
             cav_ids=tuple(name for name in ids if name.startswith("cav")),
             start_positions=positions,
             replayed_speeds=speeds,
-            limit_speed=float(speeds[1:].mean()),
+            limit_speed=nan,
             drawn_values=drawn_values,
             human_parameters=people,
         )

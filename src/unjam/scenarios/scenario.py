@@ -135,6 +135,8 @@ class Scenario(Subclassable):
     title: ClassVar[str]
     reward: ClassVar[str]
     """the default reward"""
+    controller: ClassVar[str] = "unjam:best"
+    """the packaged controller that was made for this kind of road"""
     is_closed: ClassVar[bool] = True
     """whether the road is a loop"""
     road_model: ClassVar[str] = ""
