@@ -136,3 +136,26 @@ def test_own_code_runs_without_a_state_folder(
     monkeypatch.setenv(TRUSTED_VARIABLE, "")
     trained = train(small_config(expert=f"{my_drivers}:gentle", scenario_options__horizon=20), tmp_path / "run")
     assert trained.controller.is_file()
+
+
+@pytest.mark.parametrize("command", ["compare", "progress", "remove"])
+def test_runs_on_foreign_roads_are_listed_and_removed_if_they_are_trusted(
+    command: str, unjam: Run, tmp_path: Path
+) -> None:
+    for name in ("first", "second"):
+        create_run_folder(tmp_path / name, small_config())
+        (tmp_path / name / "road.py").write_text(
+            "from unjam.scenarios import Ring\n\nclass Own(Ring):\n    title = 'own'\n"
+        )
+        config = tmp_path / name / "config.toml"
+        config.write_text(
+            config.read_text().replace('scenario = "ring"', f'scenario = "{tmp_path / name}/road.py:Own"')
+        )
+    names = ("first",) if command == "progress" else ("first", "second")
+    options = ("--yes",) if command == "remove" else ()
+    refused = unjam("runs", command, *names, *options)
+    assert (refused.returncode, one_line(refused.stderr)) == (2, True), refused.stderr
+    assert "--trust-code" in refused.stderr
+    done = unjam("runs", command, *names, *options, "--trust-code")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "first").exists() == (command != "remove")

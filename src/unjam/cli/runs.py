@@ -10,7 +10,15 @@ import typer
 from typer import Argument, Option
 
 from unjam.cli import output
-from unjam.cli.options import DEFAULT_WORKERS, HumansOption, JsonOption, WorkersOption, check_page_path, network_changes
+from unjam.cli.options import (
+    DEFAULT_WORKERS,
+    HumansOption,
+    JsonOption,
+    WorkersOption,
+    check_page_path,
+    network_changes,
+    with_trust_option,
+)
 from unjam.cli.output import console, err_console, print_json
 from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, resume_hint
@@ -164,6 +172,7 @@ runs_command = typer.Typer(name="runs", rich_markup_mode="markdown", add_complet
 
 
 @runs_command.callback(invoke_without_command=True)
+@with_trust_option
 def list_runs_command(
     context: typer.Context,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
@@ -209,6 +218,7 @@ def _gain_text(gain: Any) -> str:
 
 
 @runs_command.command("compare")
+@with_trust_option
 def compare_command(
     names: RunNamesArgument, folder: RunsFolderOption = DEFAULT_RUNS_FOLDER, json: JsonOption = False
 ) -> None:
@@ -242,6 +252,7 @@ def compare_command(
 
 
 @runs_command.command("progress")
+@with_trust_option
 def progress_command(
     name: Annotated[str, Argument(help="Name of a run, as listed, or its folder.")],
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
@@ -265,6 +276,7 @@ def progress_command(
 
 
 @runs_command.command("remove")
+@with_trust_option
 def remove_command(
     names: RunNamesArgument,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
