@@ -34,8 +34,8 @@ from unjam_paper.recorded_roads import (
     PLAN_LABEL,
     SEARCH_SEED,
     SEARCH_SPACES,
+    TEST_DRIVES_PART,
     TEST_MONTH,
-    TEST_PART,
     TIME_STEP,
     TRAINING_MONTH,
     recorded_drives,
@@ -159,13 +159,13 @@ def make_value_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPa
         return parts
     for count in VEHICLES_BETWEEN:
         found = {row["latency"]: row["parameters"] for row in read_part(folder, PART) if row["between"] == count}
-        parts[f"{TEST_PART}/{count}"] = measure_test_value, (root, count, found)
+        parts[f"{TEST_DRIVES_PART}/{count}"] = measure_test_value, (root, count, found)
     return parts
 
 
 def value_table(folder: Path) -> pd.DataFrame:
     """Return what the CAV saves on the test drives by distance and latency, and the difference to no information."""
-    rows = read_part(folder, TEST_PART)
+    rows = read_part(folder, TEST_DRIVES_PART)
     by_case = {(row["between"], row["latency"]): np.array(row["by_drive"]) for row in rows}
     return pd.DataFrame(
         _value_row(row, by_case[row["between"], None], by_case[row["between"], PLAN_LABEL]) for row in rows

@@ -84,11 +84,16 @@ TUNED_METHOD = "smooth-acc"
 """the law that residuals are added to"""
 SEARCH_SEED, SEARCH_BUDGET = 0, SearchBudget()
 PUBLISHED_LABEL, PLAN_LABEL = "published", "plan that knows the recording"
-SEARCH_PART, RESIDUALS_PART, TRAINING_PART, TEST_PART = "search", "residuals", "training drives", "test drives"
-SUMO_PART = "in SUMO"
-DRIVES_PARTS = {TRAINING_PART: TRAINING_MONTH, TEST_PART: TEST_MONTH}
+SEARCH_PART, RESIDUALS_PART, TRAINING_DRIVES_PART, TEST_DRIVES_PART = (
+    "search",
+    "residuals",
+    "training drives",
+    "test drives",
+)
+SUMO_FUEL_PART = "in SUMO"
+DRIVES_PARTS = {TRAINING_DRIVES_PART: TRAINING_MONTH, TEST_DRIVES_PART: TEST_MONTH}
 STANDARD_SETTING = "as tuned"
-SETTINGS: dict[str, dict[str, Any]] = {
+DRIVE_SETTINGS: dict[str, dict[str, Any]] = {
     STANDARD_SETTING: {},
     "20 human drivers behind the CAV": {"platoon": "cav human*20"},
     "human drivers calibrated with NGSIM": {"population": "unjam:ngsim"},
@@ -167,7 +172,7 @@ def tuned_name(rows: Table, method: str) -> str:
 
 def measure_driver(folder: str, month: str, setting: str, name: str, workers: int) -> Table:
     """Return the metrics of a driver behind each drive of a month with changed assumptions, one row for each drive."""
-    scenarios = [replace(each, **SETTINGS[setting]) for each in recorded_drives(Path(folder), month)]
+    scenarios = [replace(each, **DRIVE_SETTINGS[setting]) for each in recorded_drives(Path(folder), month)]
     if name == PLAN_LABEL:
         scenarios = [replace(each, **IDEAL_CAR) for each in scenarios]
         driver = plan_driver(scenarios)
@@ -229,8 +234,8 @@ def make_recorded_parts(study_folder: StudyFolder, seeds: int) -> dict[str, Stud
         for name in (*names, PLAN_LABEL, *residuals):
             parts[f"{part}/{_entry(name)}"] = measure_driver, (root, month, STANDARD_SETTING, name)
     for name in names:
-        parts[f"{SUMO_PART}/{_entry(name)}"] = measure_fuel_in_sumo, (root, TEST_MONTH, name)
-        for setting in SETTINGS:
+        parts[f"{SUMO_FUEL_PART}/{_entry(name)}"] = measure_fuel_in_sumo, (root, TEST_MONTH, name)
+        for setting in DRIVE_SETTINGS:
             parts[f"{setting}/{_entry(name)}"] = measure_driver, (root, TEST_MONTH, setting, name)
     return parts
 
@@ -303,7 +308,7 @@ def _driver_row(results: DriveResults, label: str, own: Table, tuned: str) -> di
 
 def waves_table(folder: Path) -> pd.DataFrame:
     """Return by how much each driver's platoon amplifies waves, by their period, behind the test drives."""
-    results = DriveResults(read_part(folder, TEST_PART))
+    results = DriveResults(read_part(folder, TEST_DRIVES_PART))
     return pd.DataFrame(
         {
             "driver": label.partition(":")[0],
@@ -318,11 +323,11 @@ def waves_table(folder: Path) -> pd.DataFrame:
     )
 
 
-def settings_table(folder: Path) -> pd.DataFrame:
+def assumptions_table(folder: Path) -> pd.DataFrame:
     """Return the change of fuel by each driver under other assumptions, and by SUMO's emission model."""
-    tables = {setting: DriveResults(read_part(folder, setting)) for setting in SETTINGS}
+    tables = {setting: DriveResults(read_part(folder, setting)) for setting in DRIVE_SETTINGS}
     rows = [_setting_row(setting, results, "fuel_by_power") for setting, results in tables.items()]
-    in_sumo = DriveResults(read_part(folder, SUMO_PART))
+    in_sumo = DriveResults(read_part(folder, SUMO_FUEL_PART))
     return pd.DataFrame([*rows, _setting_row("fuel by SUMO's emission model", in_sumo, "fuel_ml_per_km")])
 
 
@@ -372,7 +377,15 @@ RECORDED_ROADS = Study(
     make_parts=make_recorded_parts,
     minutes=180.0,
     tables={
-        **{name: partial(drivers_table, part) for name, part in (("drivers", TRAINING_PART), ("test", TEST_PART))},
-        **{"waves": waves_table, "settings": settings_table, "search": search_table, "residuals": residuals_table},
+        **{
+            name: partial(drivers_table, part)
+            for name, part in (("drivers", TRAINING_DRIVES_PART), ("test", TEST_DRIVES_PART))
+        },
+        **{
+            "waves": waves_table,
+            "assumptions": assumptions_table,
+            "search": search_table,
+            "residuals": residuals_table,
+        },
     },
 )

@@ -16,6 +16,7 @@ from rich.text import Text
 
 from unjam.cli import output
 from unjam.cli.train import _TrainingProgress
+from unjam.measures.metric_table import choose_baseline
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate
 from unjam.parameters import parse_assignments
@@ -33,7 +34,8 @@ def rows_of(first: float) -> list[dict[str, Any]]:
 def print_example(monkeypatch: pytest.MonkeyPatch, width: int, labels: tuple[str, ...] = LABELS) -> list[str]:
     text = StringIO()
     monkeypatch.setattr(output, "console", Console(file=text, width=width, highlight=False))
-    output.print_metrics({label: rows_of(1000.0 * number) for number, label in enumerate(labels)})
+    rows = {label: rows_of(1000.0 * number) for number, label in enumerate(labels)}
+    output.print_metrics(rows, choose_baseline(rows))
     return [line.rstrip() for line in text.getvalue().splitlines()]
 
 

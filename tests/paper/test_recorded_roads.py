@@ -26,15 +26,15 @@ from unjam_paper.information_ahead import (
 from unjam_paper.parameter_search import SearchBudget, measure_candidates
 from unjam_paper.recorded_residuals import MODEL_RATIOS
 from unjam_paper.recorded_roads import (
+    DRIVE_SETTINGS,
     DRIVES_PARTS,
     IDEAL_CAR,
     PLAN_LABEL,
     PUBLISHED_FILE,
     RECORDED_ROADS,
     RECORDINGS_FOLDER,
-    SETTINGS,
-    TEST_PART,
-    TRAINING_PART,
+    TEST_DRIVES_PART,
+    TRAINING_DRIVES_PART,
     DriveResults,
     recorded_drives,
     tuned_name,
@@ -102,7 +102,9 @@ def test_a_plan_saves_fuel_within_its_limits() -> None:
 
 def test_the_study_tunes_trains_and_then_compares_all_drivers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorded_roads, "SEARCH_BUDGET", SearchBudget(5, 6))
-    monkeypatch.setattr(recorded_roads, "SETTINGS", {name: SETTINGS[name] for name in (*SETTINGS,)[:2]})
+    monkeypatch.setattr(
+        recorded_roads, "DRIVE_SETTINGS", {name: DRIVE_SETTINGS[name] for name in (*DRIVE_SETTINGS,)[:2]}
+    )
     monkeypatch.setitem(fuel_optimal_plan.OPTIMIZER_OPTIONS, "maxiter", 20)
     monkeypatch.setattr(recorded_residuals, "STEPS_PER_ITERATION", 2000)
     monkeypatch.setattr(recorded_residuals, "TRAINING_STEPS", 4000)
@@ -113,13 +115,13 @@ def test_the_study_tunes_trains_and_then_compares_all_drivers(folder: Path, monk
     RECORDED_ROADS.run(StudyFolder(folder), 1, study, 1)
     laws = ["human", "follower-stopper", "published", "smooth-acc", "acc"]
     trained = [f"smooth-acc and residual {name}" for name in MODEL_RATIOS]
-    for table, part, drives in (("drivers", TRAINING_PART, 2), ("test", TEST_PART, 1)):
+    for table, part, drives in (("drivers", TRAINING_DRIVES_PART, 2), ("test", TEST_DRIVES_PART, 1)):
         frame = pd.read_csv(study / f"{table}.csv")
         assert [name.partition(":")[0] for name in frame["driver"]] == [*laws, PLAN_LABEL, *trained]
         assert frame["fuel of the platoon [%]"].tolist()[0] == "–"
         assert len(read_part(study, part)) == 8 * drives
     assert list(pd.read_csv(study / "search.csv")["method"]) == ["smooth-acc", "acc"]
-    settings = pd.read_csv(study / "settings.csv")
+    settings = pd.read_csv(study / "assumptions.csv")
     assert list(settings.columns[1:]) == laws[1:]
     assert len(settings) == 3  # two settings, and fuel in SUMO
     assert list(pd.read_csv(study / "residuals.csv")["trainings"]) == [1, 1]
@@ -178,7 +180,7 @@ def test_the_value_of_information_is_that_on_test_drives(folder: Path, monkeypat
     monkeypatch.setitem(fuel_optimal_plan.OPTIMIZER_OPTIONS, "maxiter", 20)
     study = folder / "information-ahead"
     INFORMATION_AHEAD.run(StudyFolder(folder), 1, study, 1)
-    rows = read_part(study, TEST_PART)
+    rows = read_part(study, TEST_DRIVES_PART)
     assert [(row["between"], row["latency"]) for row in rows] == [(2, None), (2, 1.0), (2, PLAN_LABEL)]
     assert {len(row["by_drive"]) for row in rows} == {1}
     table = pd.read_csv(study / "value.csv")

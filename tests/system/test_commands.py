@@ -114,11 +114,23 @@ def test_drive_prints_one_json_document(unjam: Run) -> None:
 def test_drive_prints_a_table_and_the_path_of_a_report(unjam: Run, tmp_path: Path) -> None:
     ran = unjam("drive", "ring", "-d", "human", "-d", "pi:window=10", *SMALL, "--out", "mine")
     assert ran.returncode == 0, ran.stderr
-    header, *lines = ran.stdout.splitlines()
-    assert header.split() == ["metric", "unit", "human", "pi:window=10", "pi:window=10", "−", "human"]
-    assert len(lines) >= len(REQUIRED_METRICS)
+    verdict, differences, header, *lines = ran.stdout.splitlines()
+    assert verdict.startswith("pi:window=10: ")
+    assert differences.startswith("  mean speed ")
+    assert header.split() == ["metric", "unit", "human", "pi:window=10"]
+    assert len(lines) < 12
+    assert "all metrics, with differences: --all" in ran.stderr
     assert "report: mine/report.html" in ran.stderr
     assert (tmp_path / "mine" / "report.html").is_file()
+
+
+@pytest.mark.slow
+def test_drive_prints_all_metrics_on_demand(unjam: Run) -> None:
+    ran = unjam("drive", "ring", "-d", "human", "-d", "pi:window=10", *SMALL, "--no-report", "--all")
+    assert ran.returncode == 0, ran.stderr
+    header, *lines = ran.stdout.splitlines()[2:]
+    assert header.split() == ["metric", "unit", "human", "pi:window=10", "pi:window=10", "−", "human"]
+    assert len(lines) >= len(REQUIRED_METRICS)
 
 
 @pytest.mark.slow
@@ -162,7 +174,7 @@ def test_drive_without_a_driver_compares_human_drivers_and_the_default_controlle
     common += ["--set", "horizon=60"]
     ran = unjam("drive", *common, pictures=False)
     assert ran.returncode == 0, ran.stderr
-    assert "unjam:best compared with human drivers" in ran.stdout
+    assert "travel time undecided compared with human drivers, 1 paired seed, which are too few" in ran.stdout
     assert "limits the ACC" not in ran.stderr, "each CAV has an ACC"
     without = unjam("drive", *common, "-d", "unjam:best", pictures=False)
     assert "note: unjam:best limits the ACC of a " in " ".join(without.stderr.split())

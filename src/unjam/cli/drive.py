@@ -14,7 +14,6 @@ from unjam.controller.domain import controller_notes
 from unjam.drivers.driver import Driver
 from unjam.errors import InputError, MissingPartError, invalid_value
 from unjam.files import check_parent_folder
-from unjam.measures.effect import effects_by_driver
 from unjam.measures.metrics import measure
 from unjam.measures.notes import episode_notes
 from unjam.processes import has_display
@@ -59,9 +58,10 @@ def drive_command(
     workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
     out: opt.OutOption = None,
     report: Annotated[bool, Option(help="Write the results and a report.html into a folder.")] = True,
+    show_all: opt.AllMetricsOption = False,
     json: opt.JsonOption = False,
 ) -> None:
-    """Run episodes with one or several drivers: a table of metrics and a report.
+    """Run episodes with one or several drivers: verdicts, a table of metrics and a report.
 
     Examples:
 
@@ -88,11 +88,7 @@ def drive_command(
     if json:
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
-        output.print_metrics(result.rows)
-        for label, effect in effects_by_driver(result.rows).items():
-            if count := effect.flow.count:
-                seeds = f"{count} paired seed{'' if count == 1 else 's'}"
-                console.print(f"{label} compared with human drivers, {seeds}: {effect.summary}", soft_wrap=True)
+        output.print_results(result.rows, show_all)
         output.print_notes(result.notes)
         if scenario.endswith(".sumocfg"):
             first = next(iter(result.rows.values()))[0]

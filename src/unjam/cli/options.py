@@ -44,6 +44,9 @@ ExecutorOption = Annotated[
 OutOption = Annotated[
     Path | None, Option("--out", help="Folder for the results.", show_default="a new one under runs/")
 ]
+AllMetricsOption = Annotated[
+    bool, Option("--all", help="Print all metrics, and their differences to human drivers or the best expert.")
+]
 JsonOption = Annotated[bool, Option("--json", help="Print only one JSON document.")]
 HumansOption = Annotated[
     str | None, Option("--humans", help="Human drivers: a file of `unjam fit-drivers`, unjam:ngsim or unjam:astazero.")

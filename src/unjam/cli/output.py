@@ -21,8 +21,10 @@ from unjam.cli.options import DEFAULT_WORKERS
 from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, MissingPartError, printable
 from unjam.files import to_json
-from unjam.measures.metric_table import TableCell, choose_baseline, metric_table
+from unjam.measures.metric_table import RowsByDriver, TableCell, choose_baseline, metric_table
+from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate
+from unjam.measures.verdict import short_table_metrics, verdict_lines
 
 PROGRESS_LINE_SECONDS = 5.0
 """time between two plain lines of progress without a terminal"""
@@ -65,14 +67,24 @@ def new_table(text_columns: Sequence[str] = (), number_columns: Sequence[str] = 
     return table
 
 
-def print_metrics(rows_by_driver: dict[str, list[dict[str, Any]]]) -> None:
-    """Print feasibility, all metrics with 95 % confidence intervals, and the differences to the baseline.
+def print_results(rows_by_driver: RowsByDriver, shows_all: bool) -> None:
+    """Print the verdicts on drivers and the metrics that matter on their road, or all metrics with differences."""
+    for line in verdict_lines(rows_by_driver):
+        console.print(line, soft_wrap=True)
+    if shows_all:
+        print_metrics(rows_by_driver, choose_baseline(rows_by_driver))
+    else:
+        print_metrics(rows_by_driver, "", short_table_metrics(rows_by_driver))
+        err_console.print("all metrics, with differences: --all")
+
+
+def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[str] = METRICS) -> None:
+    """Print feasibility, metrics with 95 % confidence intervals, and the differences to a baseline if there is one.
 
     If the terminal is too narrow for all drivers, there are several tables; if it is too narrow for one,
     intervals are below means.
     """
-    baseline = choose_baseline(rows_by_driver)
-    headings, rows = metric_table(rows_by_driver, baseline)
+    headings, rows = metric_table(rows_by_driver, baseline, names)
     columns = {label: [number] for number, label in enumerate(rows_by_driver)}
     compared = [label for label in columns if label != baseline]
     for label, number in zip(compared, range(len(columns), len(headings)), strict=False):

@@ -12,6 +12,7 @@ from typer import Argument, Option
 from unjam.cli import output
 from unjam.cli.options import (
     DEFAULT_WORKERS,
+    AllMetricsOption,
     HumansOption,
     JsonOption,
     WorkersOption,
@@ -37,6 +38,7 @@ def evaluate_command(
     humans: HumansOption = None,
     out: Annotated[Path | None, Option(help="Folder for the results.", show_default="the run's own")] = None,
     workers: WorkersOption = DEFAULT_WORKERS,
+    show_all: AllMetricsOption = False,
     json: JsonOption = False,
 ) -> None:
     """Compare a trained controller with every expert and the human baseline on fixed test seeds.
@@ -77,8 +79,8 @@ def evaluate_command(
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in evaluation.rows.items()]
         print_json({**facts, "drivers": drivers, "notes": results.metadata["notes"]})
         return
-    output.print_metrics(evaluation.rows)
     console.print(main_finding(results), soft_wrap=True)
+    output.print_results(evaluation.rows, show_all)
     output.print_notes(results.metadata["notes"])
     err_console.print(f"report: {page}")
 

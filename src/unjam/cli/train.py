@@ -41,6 +41,7 @@ def train_command(
     tensorboard: Annotated[
         bool, Option("--tensorboard", help="Write curves for: tensorboard --logdir FOLDER.")
     ] = False,
+    show_all: opt.AllMetricsOption = False,
     json: opt.JsonOption = False,
 ) -> None:
     """Train a residual on an expert, evaluate it on test seeds, and write a report.
@@ -94,9 +95,9 @@ def train_command(
     for name, road in (result.tasks or {"": result}).items():
         if name:
             console.print(f"{name}:")
-        output.print_metrics(road.rows)
         results = read_results(road.folder)
         console.print(main_finding(results), soft_wrap=True)
+        output.print_results(road.rows, show_all)
         output.print_notes(results.metadata["notes"])
         err_console.print(f"controller: {road.controller}")
         steps = max(config.steps, results.progress[-1]["environment_steps"])

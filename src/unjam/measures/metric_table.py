@@ -1,5 +1,6 @@
 """The table of all metrics, for terminals and pages alike: drivers, and their differences to a baseline."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,8 +60,10 @@ def choose_baseline(rows_by_driver: RowsByDriver) -> str:
     return max(returns, key=lambda label: np.nan_to_num(returns[label], nan=-np.inf), default="")
 
 
-def metric_table(rows_by_driver: RowsByDriver, baseline: str) -> tuple[list[str], list[TableRow]]:
-    """Return the headings; and verdicts, probabilities of improvement over the baseline, and all metrics.
+def metric_table(
+    rows_by_driver: RowsByDriver, baseline: str, names: Iterable[str] = METRICS
+) -> tuple[list[str], list[TableRow]]:
+    """Return the headings; and verdicts, probabilities of improvement over the baseline, and metrics by `names`.
 
     A row has a cell per driver, then the paired differences to the baseline; none without a baseline.
     """
@@ -78,7 +81,8 @@ def metric_table(rows_by_driver: RowsByDriver, baseline: str) -> tuple[list[str]
         ]
         cells = [*(TableCell("") for _ in rows_by_driver), *(estimate_cell(each, 2) for each in improvements)]
         table.append(TableRow("probability of improvement", "in return", description, cells))
-    for name, metric in METRICS.items():
+    for name in names:
+        metric = METRICS[name]
         estimates = [(metric_estimate(rows, name), len(rows)) for rows in rows_by_driver.values()]
         if not any(each.count for each, _ in estimates):
             continue  # it is not defined on this road

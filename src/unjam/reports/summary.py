@@ -13,6 +13,7 @@ from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, estimate_c
 from unjam.measures.metrics import METRICS
 from unjam.measures.notes import early_end_notes
 from unjam.measures.statistics import format_difference, gain_verdict, metric_estimate, pair_rows, paired_difference
+from unjam.measures.verdict import is_better
 from unjam.reports.results import PlotEpisode, Results
 
 CLOSE_TIME_GAP = 1.0
@@ -28,8 +29,6 @@ COMPARED_METRICS = (
     "collisions",
 )
 """metrics with the same meaning in the human baseline and with CAVs, in the order of the table"""
-HIGHER_IS_BETTER = {"mean_speed", "mean_speed_steady", "outflow_veh_per_h", "min_ttc"}
-"""lower values of the other `COMPARED_METRICS` are better"""
 
 
 @dataclass(frozen=True)
@@ -223,9 +222,8 @@ def baseline_differences(columns: Sequence[ReportColumn]) -> dict[str, Any]:
         metric, cells = METRICS[name], []
         for column, human in compared:
             gain, pairs = paired_difference(column.rows, human, name), len(pair_rows(column.rows, human))
-            is_marked = (gain.low > 0 or gain.high < 0) and gain.count == pairs
-            is_better = (gain.mean > 0) == (name in HIGHER_IS_BETTER)
-            mark = ("better" if is_better else "worse") if is_marked else ""
+            verdict = is_better(name, gain) if gain.count == pairs else None
+            mark = {True: "better", False: "worse", None: ""}[verdict]
             text = str(estimate_cell(gain, metric.digits, pairs, "+"))
             cells.append({"text": text, "mark": mark, "count": gain.count})
         if any(cell["count"] for cell in cells):

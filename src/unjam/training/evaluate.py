@@ -9,6 +9,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import sha256
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ from unjam.measures.metric_table import RowsByDriver, choose_baseline, metric_ta
 from unjam.measures.metrics import METRICS, measure
 from unjam.measures.notes import count_early_ends, episode_notes
 from unjam.measures.statistics import Estimate, paired_difference, summarize
+from unjam.measures.verdict import short_table_metrics, verdict_lines
 from unjam.parameters import check_integer
 from unjam.reports.results import (
     EPISODE_ENTRIES,
@@ -96,19 +98,20 @@ class DriveResult(Evaluation):
         """Mean of every metric over the episodes of the first driver."""
         return next(iter(self.means().values()))
 
-    def table(self) -> "pd.DataFrame":
-        """Return a row per metric with the mean and both ends of the 95 % CI of each driver.
+    def table(self, brief: bool = False) -> "pd.DataFrame":
+        """Return a row per metric with the mean and both ends of the 95 % CI of each driver; `brief`: what matters.
 
         `result.table().loc["mean_speed", ("pi", "mean")]` is one number.
         """
         import pandas as pd
 
+        names = short_table_metrics(self.rows) if brief else tuple(METRICS)
         numbers = {
-            (label, part): [getattr(estimate, part) for estimate in self.summary(label).values()]
+            (label, part): [getattr(self.summary(label)[name], part) for name in names]
             for label in self.rows
             for part in ("mean", "low", "high")
         }
-        frame = pd.DataFrame(numbers, index=pd.Index(METRICS, name="metric"))
+        frame = pd.DataFrame(numbers, index=pd.Index(names, name="metric"))
         return frame.rename_axis(columns=("driver", None))
 
     def episodes(self) -> "pd.DataFrame":
@@ -116,11 +119,12 @@ class DriveResult(Evaluation):
         return rows_to_frame(self.rows)
 
     def _repr_html_(self) -> str:
-        """Return every metric with its CI, and the trajectories of all vehicles, for notebooks."""
+        """Return the verdicts, the metrics that matter, and the trajectories of all vehicles, for notebooks."""
         from unjam.reports.figures import data_uri
         from unjam.reports.space_time import space_time_figure
 
-        table = metric_frame(self.rows).to_html(index=False, border=0)
+        verdicts = "".join(f"<p>{escape(line)}</p>" for line in verdict_lines(self.rows))
+        table = verdicts + metric_frame(self.rows).to_html(index=False, border=0)
         if not self.plot_episodes:
             return table
         episodes = [to_plot_episode(label, each) for label, each in self.plot_episodes.items()]
@@ -160,10 +164,10 @@ class DriveResult(Evaluation):
 
 
 def metric_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":
-    """Return the table of all metrics as texts: a row per metric, a column per driver and per difference."""
+    """Return the table of the metrics that matter on the road as texts: a row per metric, a column per driver."""
     import pandas as pd
 
-    headings, rows = metric_table(rows_by_driver, choose_baseline(rows_by_driver))
+    headings, rows = metric_table(rows_by_driver, "", short_table_metrics(rows_by_driver))
     cells = [[f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)] for row in rows]
     return pd.DataFrame(cells, columns=["", *headings])
 

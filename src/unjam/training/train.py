@@ -86,7 +86,7 @@ class TrainResult:
         """Return the metrics of all drivers as a table, by task, and the files."""
         if self.tasks:
             return "\n\n".join(f"{name}: {result}" for name, result in self.tasks.items())
-        table = metric_frame(self.rows).iloc[:, : 1 + len(self.rows)]  # the differences would make it too wide
+        table = metric_frame(self.rows)
         lines = [f"training run {self.folder}", table.to_string(index=False)]
         if self.gain:
             lines.append(

@@ -1,0 +1,74 @@
+"""Verdicts on drivers name what is shown, and nothing else."""
+
+from math import nan
+from typing import Any
+
+import pytest
+
+from tests.measures.test_effect import USUAL
+from unjam.measures.metrics import METRICS
+from unjam.measures.verdict import (
+    CLOSED_ROAD,
+    OPEN_ROAD,
+    RECORDED_ROAD,
+    road_metrics,
+    short_table_metrics,
+    verdict_lines,
+)
+
+ROW: dict[str, Any] = {"speed_std_fleet_steady": 1.0, "fuel_by_power": 60.0, "cav_mean_gap": 20.0, **USUAL}
+ROADS = {"closed": {"travel_time": nan}, "open": {}, "recorded": {"travel_time": nan, "time_behind_leader": 10.0}}
+
+
+def episodes(road: str = "closed", count: int = 4, **changes: float) -> list[dict[str, Any]]:
+    """Return rows whose changes vary a little from seed to seed."""
+    varied = ({name: value + 0.01 * seed for name, value in changes.items()} for seed in range(count))
+    return [{**ROW, **ROADS[road], **each, "seed": [7, seed]} for seed, each in enumerate(varied)]
+
+
+def test_each_kind_of_road_has_its_metrics() -> None:
+    found = [road_metrics({"human": episodes(road)}) for road in ROADS]
+    assert found == [CLOSED_ROAD, OPEN_ROAD, RECORDED_ROAD]
+    for road in ROADS:
+        names = short_table_metrics({"human": episodes(road)})
+        assert set(names) <= set(METRICS)
+        assert len(names) == len(set(names)) <= 8
+
+
+@pytest.mark.parametrize(
+    ("changes", "verdict"),
+    [
+        ({"mean_speed": 21.0}, "pi: feasible; mean speed better than that of human drivers, 4 paired seeds"),
+        ({"mean_speed": 19.0}, "pi: feasible; mean speed worse than that of human drivers, 4 paired seeds"),
+        ({}, "pi: feasible; mean speed undecided compared with human drivers, 4 paired seeds"),
+        (
+            {"mean_speed": 21.0, "outflow_veh_per_h": 1900.0},
+            "pi: feasible; mean speed better than that of human drivers, but less flow, 4 paired seeds",
+        ),
+        (
+            {"mean_speed": 21.0, "min_time_gap": 0.6},
+            "pi: infeasible: time gap 0.60 s (limit 0.9 s) (4 of 4); mean speed better than that of human drivers, "
+            "4 paired seeds",
+        ),
+    ],
+)
+def test_a_verdict_names_feasibility_the_first_metric_and_lost_flow(changes: dict[str, float], verdict: str) -> None:
+    assert verdict_lines({"human": episodes(), "pi": episodes("closed", 4, **changes)})[0] == verdict
+
+
+def test_differences_have_signs_intervals_and_units() -> None:
+    verdict, numbers = verdict_lines({"human": episodes("recorded"), "pi": episodes("recorded", fuel_by_power=58.0)})
+    assert verdict == "pi: feasible; fuel by power better than that of human drivers, 4 paired seeds"
+    assert numbers == "  fuel by power -2.0 [-2.0, -2.0] ml/km, flow 0 veh/h, CAV's mean gap 0.0 m"
+
+
+def test_few_seeds_decide_nothing() -> None:
+    (verdict, _) = verdict_lines({"human": episodes(count=1), "pi": episodes(count=1, mean_speed=30.0)})
+    assert verdict == "pi: feasible; mean speed undecided compared with human drivers, 1 paired seed, which are too few"
+
+
+def test_without_human_drivers_or_common_episodes_there_is_no_comparison() -> None:
+    failed = [{**row, **dict.fromkeys(METRICS, nan), "status": "failed"} for row in episodes()]
+    assert verdict_lines({"pi": episodes(), "idm": episodes()}) == []
+    assert verdict_lines({"human": episodes()}) == []
+    assert verdict_lines({"human": episodes(), "pi": failed}) == ["pi: no episode can be compared with human drivers"]
