@@ -1,10 +1,12 @@
 import json
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from unjam.drivers import IDM, LocalState, PISaturation, check_driver
@@ -215,6 +217,18 @@ def test_result_has_a_pandas_table_and_a_notebook_view(drive_result: DriveResult
     html = drive_result._repr_html_()
     assert "mean speed [m/s]" in html
     assert html.count('src="data:image/svg+xml;base64,') == 1
+    brief = drive_result.table(brief=True)
+    assert set(brief.index) < set(METRICS)
+    pd.testing.assert_frame_equal(brief, table.loc[list(brief.index)])
+
+
+def test_result_draws_its_episodes(drive_result: DriveResult) -> None:
+    assert [axes.get_title(loc="left") for axes in drive_result.plot().axes][:2] == ["pi", "idm"]
+    assert drive_result.plot("time-series").axes[0].get_ylabel() == "CAV's speed [m/s]"
+    with pytest.raises(InputError, match="kind: 'waves' is not allowed; allowed: space-time, time-series"):
+        drive_result.plot("waves")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="plot: all episodes failed"):
+        replace(drive_result, plot_episodes={}).plot()
 
 
 @pytest.fixture

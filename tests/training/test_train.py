@@ -264,3 +264,4 @@ def test_a_result_prints_a_table_of_its_drivers(finished_training: Trained) -> N
     assert any(row.strip().startswith("mean speed [m/s]") for row in rows)
     assert gain.startswith("return compared with the expert: ")
     assert controller == f"controller: {result.controller}"
+    assert result.plot().axes[0].get_ylabel() == "return of an episode"

@@ -11,7 +11,7 @@ from functools import partial
 from hashlib import sha256
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from safetensors.numpy import save
 
@@ -20,7 +20,7 @@ from unjam.controller.domain import controller_notes
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_names, unique_label
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, error_from_name, invalid_value
+from unjam.errors import InputError, error_from_name, invalid_value, unknown_name
 from unjam.files import atomic_write, make_folder, remove_leftovers, to_json
 from unjam.manifest import manifest
 from unjam.measures.effect import effects_by_driver
@@ -53,6 +53,7 @@ from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 if TYPE_CHECKING:  # imported late, so that commands start quickly
     import pandas as pd
+    from matplotlib.figure import Figure
 
 EFFECT_ENTRIES = ("travel_time", "delay_reduction", "speed", "flow", "fuel", "hard_braking")
 MISSING_ACC_NOTE = "limits the ACC of a CAV, but CAVs have none: --set actuation=cruise --set safety.active=false"
@@ -121,15 +122,28 @@ class DriveResult(Evaluation):
     def _repr_html_(self) -> str:
         """Return the verdicts, the metrics that matter, and the trajectories of all vehicles, for notebooks."""
         from unjam.reports.figures import data_uri
-        from unjam.reports.space_time import space_time_figure
 
         verdicts = "".join(f"<p>{escape(line)}</p>" for line in verdict_lines(self.rows))
         table = verdicts + metric_frame(self.rows).to_html(index=False, border=0)
         if not self.plot_episodes:
             return table
-        episodes = [to_plot_episode(label, each) for label, each in self.plot_episodes.items()]
         attributes = 'style="max-width: 100%" alt="every vehicle over time, dark is slow"'
-        return f'{table}<img {attributes} src="{data_uri(space_time_figure(episodes))}">'
+        return f'{table}<img {attributes} src="{data_uri(self.plot())}">'
+
+    def plot(self, kind: Literal["space-time", "time-series"] = "space-time") -> "Figure":
+        """Return a figure of an episode of each driver: positions and speeds of all vehicles, or quantities over time.
+
+        Raise `InputError` if all episodes failed, or for another `kind`.
+        """
+        from unjam.reports.figures import time_series_figure
+        from unjam.reports.space_time import space_time_figure
+
+        figures = {"space-time": space_time_figure, "time-series": time_series_figure}
+        if kind not in figures:
+            raise unknown_name("kind", kind, figures)
+        if not self.plot_episodes:
+            raise InputError("plot: all episodes failed; allowed: results with an episode")
+        return figures[kind]([to_plot_episode(label, each) for label, each in self.plot_episodes.items()])
 
     def document(self) -> dict[str, Any]:
         """Return the result as `unjam drive --json` prints it, with a document for each driver, also for one."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -57,6 +57,9 @@ from unjam.trust import expecting_code
 from unjam.worlds.batch.run import run_batched_if_supported
 from unjam.worlds.worker_pool import WorkerPool
 
+if TYPE_CHECKING:  # imported late, so that commands start quickly
+    from matplotlib.figure import Figure
+
 PROGRESS_METRICS = (
     *("mean_speed", "speed_std_fleet", "cav_mean_speed", "speed_std_cav", "mean_abs_accel"),
     "shield_override_share",
@@ -103,6 +106,12 @@ class TrainResult:
     def report(self) -> Path:
         """The page with the results."""
         return self.folder / "report.html"
+
+    def plot(self) -> "Figure":
+        """Return a figure of the learning curve: the return in training and in validation by environment steps."""
+        from unjam.reports.figures import learning_curve_figure
+
+        return learning_curve_figure({"": read_progress(self.folder)}, {})
 
 
 def train(
