@@ -6,6 +6,7 @@ import sys
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -79,9 +80,32 @@ def test_progress_names_the_road_with_the_smallest_difference(
     roads["eight"]["return_expert"] = 4.4
     with _TrainingProgress(RunConfig(steps=30), Path("run")) as progress:
         progress.show_iteration({**row, "return_validation": 6.0, "tasks": roads})
-        progress.show_iteration({**row, "iteration": 11, "return_validation": None, "tasks": {}})
+        progress.show_iteration(
+            {**row, "iteration": 11, "environment_steps": 30, "return_validation": None, "tasks": {}}
+        )
     text = "return 5, validation 6 (expert 4; smallest difference on eight: -3)"
-    assert [line.partition("steps, ")[2] for line in messages.getvalue().splitlines()] == [text, text]
+    lines = [line.partition("steps, ")[2] for line in messages.getvalue().splitlines()]
+    assert lines == [f"{text}, 0 s left", text]
+
+
+@pytest.mark.parametrize(("first", "expected"), [(1, ["3 min", "20 s"]), (21, ["", "10 s"])])
+def test_progress_has_the_time_that_is_left(
+    messages: StringIO, monkeypatch: pytest.MonkeyPatch, first: int, expected: list[str]
+) -> None:
+    module = sys.modules[_TrainingProgress.__module__]
+    monkeypatch.setattr(module, "err_console", output.err_console)
+    clock = iter([0.0, 50.0, 80.0])
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    row = {"return_mean": 5.0, "return_expert": 4.0, "return_validation": None}
+    progress = _TrainingProgress(RunConfig(steps=50), Path("run"))
+    for iteration, steps in ((first, 10), (first + 5, 40)):
+        progress.show_iteration({**row, "iteration": iteration, "environment_steps": steps})
+    left = [line.partition("expert 4)")[2].removeprefix(", ").removesuffix(" left") for line in lines_of(messages)]
+    assert left == expected
+
+
+def lines_of(messages: StringIO) -> list[str]:
+    return messages.getvalue().splitlines()
 
 
 def test_a_training_on_several_roads_is_resumed_as_a_whole(messages: StringIO) -> None:

@@ -1,5 +1,6 @@
 """`unjam train` runs one training, and `unjam search` many of them to find better settings."""
 
+import time
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from unjam.reports.results import read_progress, read_results
 from unjam.training.config import RunConfig, load_config, planned_steps
 from unjam.training.evaluate import Evaluation, evaluation_steps
 from unjam.training.run_folder import check_config, lock_new_folder, read_config
+from unjam.training.selection import format_duration
 from unjam.training.trial_log import REQUEST_FILE
 
 if TYPE_CHECKING:
@@ -78,6 +80,7 @@ def train_command(
 
     if resume is None and (steps := planned_steps(config)) > STEP_OVERRUN_RATIO * config.steps:
         err_console.print(f"note: iterations are complete: {steps:,} steps will be trained, not {config.steps:,}")
+    err_console.print(f"training {_plan_text(config)}, into {folder}", soft_wrap=True)
     write_curves = tensorboard_writer(folder) if tensorboard else None
     progress = nullcontext() if json else _TrainingProgress(config, folder)
     with output.suggest_resume(folder, workers), progress as display:
@@ -123,6 +126,8 @@ class _TrainingProgress(output.ProgressReporter):
         super().__init__(f"training into {folder}", "steps", config.steps)
         self._config, self._folder = config, folder
         self._validation_text, self._worst_road = "-", ""
+        self._start = time.monotonic()
+        self._first_row: tuple[int, float] | None = None
 
     def show_iteration(self, row: dict[str, Any]) -> None:
         """Show the progress row of an iteration."""
@@ -134,7 +139,18 @@ class _TrainingProgress(output.ProgressReporter):
         steps, total = row["environment_steps"], self._config.steps
         self._bar.update(self._task, completed=steps, description=text)
         if self._is_plain and (row["iteration"] % PROGRESS_LINE_INTERVAL == 1 or steps >= total):
-            err_console.print(f"iteration {row['iteration']}: {steps:,} of {total:,} steps, {text}")
+            left = self._time_left_text(row["iteration"], steps)
+            err_console.print(f"iteration {row['iteration']}: {steps:,} of {total:,} steps, {text}{left}")
+
+    def _time_left_text(self, iteration: int, steps: int) -> str:
+        """Return the time that the rest of the training will take; empty at the end, and if nothing is known yet."""
+        now, total = time.monotonic(), self._config.steps
+        if self._first_row is None:
+            self._first_row = (0, self._start) if iteration == 1 else (steps, now)  # else it was resumed
+        first_steps, start = self._first_row
+        if not first_steps < steps < total:
+            return ""
+        return f", {format_duration((total - steps) * (now - start) / (steps - first_steps))} left"
 
     def show_evaluation(self, episode: tuple[str, int], steps: int) -> None:
         """Show the progress of the evaluation after the training."""
@@ -146,6 +162,14 @@ class _TrainingProgress(output.ProgressReporter):
             if self._is_plain:
                 err_console.print(EVALUATION_LABEL)
         self.update(episode, steps)
+
+
+def _plan_text(config: "RunConfig") -> str:
+    """Return what a training will do."""
+    tasks = config.task_configs().values()
+    roads = f"{len(tasks)} roads" if len(tasks) > 1 else Path(config.scenario).name
+    policy = f"{config.agent} without an expert" if config.expert == "none" else f"{config.agent} on {config.expert}"
+    return f"{policy}: {roads}, {config.steps:,} environment steps"
 
 
 def _worst_road_text(roads: dict[str, dict[str, Any]]) -> str:
