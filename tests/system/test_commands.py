@@ -66,7 +66,7 @@ COMMANDS = [
     "fit-drivers",
     "tune",
 ]
-COMMANDS += ["report", "reproduce", "search", "export", "keys", "sign", "verify", "watch", "bench", "doctor"]
+COMMANDS += ["new", "report", "reproduce", "search", "export", "keys", "sign", "verify", "watch", "bench", "doctor"]
 
 
 def document(ran: subprocess.CompletedProcess[str]) -> Any:

@@ -33,6 +33,7 @@ INTERRUPTED_EXIT_CODE = 130
 COMMANDS = {
     "scenarios": "unjam.cli.catalog",
     "drivers": "unjam.cli.catalog",
+    "new": "unjam.cli.new",
     "drive": "unjam.cli.drive",
     "assess": "unjam.cli.drive",
     "benchmark": "unjam.cli.benchmark",

@@ -1,0 +1,34 @@
+"""Example networks of SUMO for users to edit: nodes, edges, connections, demand and a configuration."""
+
+import re
+from importlib.resources import files
+from pathlib import Path
+
+from unjam.errors import unknown_name
+from unjam.files import atomic_write
+from unjam.processes import PrivateFolder
+from unjam.worlds.sumo.networks import run_netconvert
+
+EXAMPLE_ROADS = ("on-ramp",)
+INPUT_FILES = {
+    "--node-files": "nodes.nod.xml",
+    "--edge-files": "edges.edg.xml",
+    "--connection-files": "connections.con.xml",
+}
+
+
+def write_example_road(name: str, folder: Path) -> Path:
+    """Write the files of an example network into a folder that exists, and return SUMO's configuration.
+
+    Raise `InputError` for an unknown name, `MissingPartError` without netconvert.
+    """
+    if name not in EXAMPLE_ROADS:
+        raise unknown_name("road", name, EXAMPLE_ROADS)
+    contents = {each.name: each.read_text(encoding="utf-8") for each in (files("unjam.worlds.sumo.example_roads") / name).iterdir()}
+    inputs = {(option, file): contents[file] for option, file in INPUT_FILES.items()}
+    with PrivateFolder() as private:
+        network = run_netconvert(inputs, [], Path(private)).read_text(encoding="utf-8")
+    contents[f"{name}.net.xml"] = re.sub(r"<!--.*?-->\n*", "", network, count=1, flags=re.DOTALL)  # it names files
+    for file, content in contents.items():
+        atomic_write(folder / file, content)
+    return folder / f"{name}.sumocfg"
