@@ -102,7 +102,8 @@ DRIVE_SETTINGS: dict[str, dict[str, Any]] = {
     "CAV without delay and lag": {"actuator": Actuator()},
     "CAV with a delay of 0.4 s and a lag of 0.6 s": {"actuator": Actuator(delay=0.4, lag=0.6)},
 }
-"""assumptions of which the saving may depend, each changed alone"""
+"""assumptions on which the saving may depend, each changed alone"""
+SETTING_METRICS = "fuel_by_power", "cav_mean_gap", "min_time_gap", "feasibility"
 WAVE_PERIODS = {"long": "periods above 60 s", "medium": "20 to 60 s", "short": "4 to 20 s"}
 SUMO_METRICS = ("fuel_ml_per_km", "fuel_by_power")
 
@@ -180,13 +181,14 @@ def measure_driver(folder: str, month: str, setting: str, name: str, workers: in
         driver = compared_driver(Path(folder), name)
     rows = [measure(episode) for episode in run_batches([EpisodeTask(each, driver, (0,)) for each in scenarios])]
     raise_failure(rows)
-    return _drive_rows(name, scenarios, rows, DRIVE_METRICS)
+    metrics = DRIVE_METRICS if setting == STANDARD_SETTING else SETTING_METRICS
+    return _drive_rows(name, scenarios, rows, metrics)
 
 
 def measure_fuel_in_sumo(folder: str, month: str, name: str, workers: int) -> Table:
     """Return the fuel of the platoon by SUMO's emission model behind each drive of a month."""
     scenarios, driver = recorded_drives(Path(folder), month), compared_driver(Path(folder), name)
-    rows = [measure(run_episode(each, driver, (0,))) for each in scenarios]
+    rows = [measure(run_episode(each, driver, (0,), record_details=True)) for each in scenarios]
     raise_failure(rows)
     return _drive_rows(name, scenarios, rows, SUMO_METRICS)
 
@@ -202,9 +204,14 @@ def _drive_rows(name: str, scenarios: Sequence[Recorded], rows: Table, metrics: 
     drives = (Path(each.recordings).stem for each in scenarios)
     label = _entry(name) if name.endswith(SUFFIX) else name
     return [
-        {"driver": label, "drive": drive, **{metric: row[metric] for metric in metrics}}
+        {"driver": label, "drive": drive, **{metric: _rounded(row[metric]) for metric in metrics}}
         for drive, row in zip(drives, rows, strict=True)
     ]
+
+
+def _rounded(value: float | str) -> float | str:
+    """Return a number with six digits: a third of the size of a results file."""
+    return value if isinstance(value, str) else float(f"{value:.6g}")
 
 
 def plan_driver(scenarios: list[Recorded]) -> PlannedDriver:
@@ -235,7 +242,7 @@ def make_recorded_parts(study_folder: StudyFolder, seeds: int) -> dict[str, Stud
             parts[f"{part}/{_entry(name)}"] = measure_driver, (root, month, STANDARD_SETTING, name)
     for name in names:
         parts[f"{SUMO_FUEL_PART}/{_entry(name)}"] = measure_fuel_in_sumo, (root, TEST_MONTH, name)
-        for setting in DRIVE_SETTINGS:
+        for setting in DRIVE_SETTINGS.keys() - {STANDARD_SETTING}:
             parts[f"{setting}/{_entry(name)}"] = measure_driver, (root, TEST_MONTH, setting, name)
     return parts
 
@@ -325,16 +332,21 @@ def waves_table(folder: Path) -> pd.DataFrame:
 
 def assumptions_table(folder: Path) -> pd.DataFrame:
     """Return the change of fuel by each driver under other assumptions, and by SUMO's emission model."""
-    tables = {setting: DriveResults(read_part(folder, setting)) for setting in DRIVE_SETTINGS}
-    rows = [_setting_row(setting, results, "fuel_by_power") for setting, results in tables.items()]
     in_sumo = DriveResults(read_part(folder, SUMO_FUEL_PART))
-    return pd.DataFrame([*rows, _setting_row("fuel by SUMO's emission model", in_sumo, "fuel_ml_per_km")])
+    labels = [label for label in in_sumo.groups() if label != HUMAN_LABEL]
 
+    def table_row(setting: str, results: DriveResults, metric: str = "fuel_by_power") -> dict[str, str]:
+        cells = {label.partition(":")[0]: results.change_text(label, metric) for label in labels}
+        return {"assumption": setting, **cells}
 
-def _setting_row(setting: str, results: DriveResults, metric: str) -> dict[str, str]:
-    labels = [label for label in results.groups() if label != HUMAN_LABEL]
-    cells = {label.partition(":")[0]: results.change_text(label, metric) for label in labels}
-    return {"assumption": setting, **cells}
+    changed = (setting for setting in DRIVE_SETTINGS if setting != STANDARD_SETTING)
+    return pd.DataFrame(
+        [
+            table_row(STANDARD_SETTING, DriveResults(read_part(folder, TEST_DRIVES_PART))),
+            *(table_row(setting, DriveResults(read_part(folder, setting))) for setting in changed),
+            table_row("fuel by SUMO's emission model", in_sumo, "fuel_ml_per_km"),
+        ]
+    )
 
 
 def residuals_table(folder: Path) -> pd.DataFrame:

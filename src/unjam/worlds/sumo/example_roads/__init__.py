@@ -24,7 +24,10 @@ def write_example_road(name: str, folder: Path) -> Path:
     """
     if name not in EXAMPLE_ROADS:
         raise unknown_name("road", name, EXAMPLE_ROADS)
-    contents = {each.name: each.read_text(encoding="utf-8") for each in (files("unjam.worlds.sumo.example_roads") / name).iterdir()}
+    contents = {
+        each.name: each.read_text(encoding="utf-8")
+        for each in (files("unjam.worlds.sumo.example_roads") / name).iterdir()
+    }
     inputs = {(option, file): contents[file] for option, file in INPUT_FILES.items()}
     with PrivateFolder() as private:
         network = run_netconvert(inputs, [], Path(private)).read_text(encoding="utf-8")
