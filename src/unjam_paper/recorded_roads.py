@@ -242,7 +242,7 @@ def make_recorded_parts(study_folder: StudyFolder, seeds: int) -> dict[str, Stud
             parts[f"{part}/{_entry(name)}"] = measure_driver, (root, month, STANDARD_SETTING, name)
     for name in names:
         parts[f"{SUMO_FUEL_PART}/{_entry(name)}"] = measure_fuel_in_sumo, (root, TEST_MONTH, name)
-        for setting in DRIVE_SETTINGS.keys() - {STANDARD_SETTING}:
+        for setting in (each for each in DRIVE_SETTINGS if each != STANDARD_SETTING):
             parts[f"{setting}/{_entry(name)}"] = measure_driver, (root, TEST_MONTH, setting, name)
     return parts
 
