@@ -297,16 +297,18 @@ class Picture:
 
 
 def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> str:
-    """Return a table in Markdown: names in its index break after a comma, intervals nowhere."""
+    """Return a table in Markdown: parameters of drivers break after a comma, commands and intervals nowhere."""
     texts = table.map(lambda cell: _cell_text(cell, digits))
     if index:
-        texts.insert(0, "", [str(name).replace(",", ", ") for name in table.index], allow_duplicates=True)
+        texts.insert(0, "", [_cell_text(name, digits) for name in table.index], allow_duplicates=True)
     return markdown_table(texts)
 
 
 def _cell_text(cell: Any, digits: int) -> str:
     text = f"{cell:.{digits}f}" if isinstance(cell, float) else str(cell)
     text = text.replace("\n", " ").replace("|", r"\|")
+    if not text.startswith("`"):
+        text = re.sub(r",(?=\w+=)", ", ", text)
     return re.sub(r"\[[^\[\]]*\]", lambda found: with_no_break_spaces(found[0]), text)
 
 
