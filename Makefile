@@ -15,7 +15,7 @@ BIN := $(VENV)/bin
 # Compiling all that is installed takes as long as installing it, and most of it is never imported
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --no-compile -c constraints.txt
 
-.PHONY: demo test test-all coverage check bless docs bench soak clean
+.PHONY: demo test test-all coverage check bless pages docs bench soak clean
 
 # Each process finds what another has compiled
 export PYTHONDONTWRITEBYTECODE =
@@ -51,9 +51,14 @@ check: $(VENV)/.installed-dev
 bless: $(VENV)/.installed-dev
 	$(BIN)/python tests/golden/bless.py "$(WHY)"
 
-# PAGES="-D nb_execution_mode=off" leaves out the code of the pages
+# The tables and pictures of the pages, and CLAIMS.md, from results/
+pages: $(VENV)/.installed-dev
+	$(BIN)/python docs/pages.py
+	$(BIN)/python docs/claims.py
+
+# SPHINXOPTS="-D nb_execution_mode=off" does not run the notebook
 docs: $(VENV)/.installed-dev
-	$(BIN)/python -m sphinx -q -E -W -b html $(PAGES) docs docs/_build/html
+	$(BIN)/python -m sphinx -q -E -W -b html $(SPHINXOPTS) docs docs/_build/html
 	@echo docs/_build/html/index.html
 
 # Thousands of injected faults, half an hour: results/soak.json

@@ -17,7 +17,7 @@ import pandas as pd
 from differences import differences_table
 from people import people_claims
 from studies import beyond_own_expert, rows_of
-from tables import results_part
+from tables import markdown_table, results_part
 from verdicts import HELD, INCONSISTENT, NOT_HELD, UNDECIDED, Finding, Values, compare, judge, list_values, worst
 
 from unjam.files import atomic_write
@@ -680,12 +680,6 @@ def summary(tables: Sequence[pd.DataFrame]) -> str:
         listed = "; ".join(f"{counts[kind]} {kind}" for kind in KINDS if counts[kind])
         sentences.append(f"- {len(verdicts)} claims {version}: {listed}")
     return "\n".join(sentences)
-
-
-def markdown_table(table: pd.DataFrame) -> str:
-    """Return a table in Markdown."""
-    lines = [table.columns, ["---"] * len(table.columns), *table.itertuples(index=False)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def page_text() -> str:

@@ -1,10 +1,7 @@
 """Learning with the virtual environment and without it, from what `unjam reproduce` made."""
 
-from io import BytesIO
-
 import numpy as np
 import pandas as pd
-from IPython.display import Image
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 from studies import rows_of
@@ -40,7 +37,7 @@ def validations(variant: str, study: str = "table-2", road: str = "ring") -> tup
 
 def draw(
     labels: dict[str, str] = LABELS, study: str = "table-2", lowest: float | None = None, road: str = "ring"
-) -> Image:
+) -> Figure:
     """Draw validation against actual steps: mean and range of the runs; from `lowest` on, steps by powers."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     axes = figure.subplots()
@@ -63,9 +60,7 @@ def draw(
     axes.legend(frameon=False)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-    content = BytesIO()
-    figure.savefig(content, format="png", dpi=130)
-    return Image(content.getvalue(), width=900)
+    return figure
 
 
 def judged() -> pd.DataFrame:

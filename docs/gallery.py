@@ -1,13 +1,12 @@
 """Cards of the gallery, made from results/gallery.json: no number is typed in."""
 
 import pandas as pd
-from IPython.display import HTML
 from tables import results_part, show
 
 CARDS = results_part("gallery/cards")
 
 
-def card(name: str) -> HTML:
+def card(name: str) -> str:
     """Return what there is to know of a packaged controller on its road."""
     found = CARDS[name]
     changes = "".join(f" --set {key}={value}" for key, value in found["changes"].items())
@@ -25,6 +24,6 @@ def card(name: str) -> HTML:
         "feasible": found["feasibility"],
         "made for": found["made_for"],
         "certified domain": certified,
-        "see it": command,
+        "see it": f"`{command}`",
     }
     return show(pd.DataFrame({"": rows}), index=True)

@@ -189,16 +189,16 @@ def commands() -> pd.DataFrame:
             changes = {key: value for key, value in road.items() if key != "scenario"} | dict(variant.changes)
             for key, value in changes.items():
                 words += ["--set", f"{key}={value}"]
-            said = {"study": name, "road": run.road, "row": variant.label, "command": shlex.join(words)}
+            said = {"study": name, "road": run.road, "row": variant.label, "command": f"`{shlex.join(words)}`"}
             table.setdefault(run.name, said)
     return pd.DataFrame(table.values())
 
 
 def drivers() -> pd.DataFrame:
     """Return how drivers that do not learn are named on the command line."""
-    on_all = [{"row": label, "--driver": name, "on": ""} for label, name in REFERENCE_DRIVERS.items()]
+    on_all = [{"row": label, "`--driver`": f"`{name}`", "on": ""} for label, name in REFERENCE_DRIVERS.items()]
     tuned = [
-        {"row": label, "--driver": name, "on": road}
+        {"row": label, "`--driver`": f"`{name}`", "on": road}
         for road, found in TUNED_REFERENCES.items()
         for label, name in found.items()
     ]

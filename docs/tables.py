@@ -2,12 +2,13 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from IPython.display import HTML
+from matplotlib.figure import Figure
 
 from unjam.measures.feasibility import overall_feasibility
 from unjam.measures.metric_table import choose_baseline, estimate_cell, with_no_break_spaces
@@ -17,6 +18,8 @@ from unjam.reports.model import error_text
 from unjam_paper.results_file import read_part
 
 RESULTS = Path(__file__).parent.parent / "results"
+NUMBERS = re.compile(r"[-+−–±.,%\s\[\]]*\d[-+−–±.,%\s\[\]\d]*")
+"""what columns contain that are aligned to the right"""
 
 
 def results_part(name: str) -> Any:
@@ -284,10 +287,33 @@ def soak_origin() -> str:
     return f"SUMO {made['packages']['libsumo']}, commit {', '.join(commits)}, {made['started'][:10]}"
 
 
-def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> HTML:
-    """Return a table in the style of the site: names in its index break after a comma, intervals nowhere."""
-    html = table.rename(index=lambda name: name.replace(",", ", ") if isinstance(name, str) else name).to_html(
-        index=index, border=0, justify="left", classes="docutils align-default", float_format=f"{{:.{digits}f}}".format
-    )
-    whole = re.sub(r"\[[^\[\]<>]*\]", lambda found: with_no_break_spaces(found[0]), html)
-    return HTML(f'<div class="table-wrapper">{whole}</div>')
+@dataclass(frozen=True)
+class Picture:
+    """A figure of a page: the name of its file, and the text for readers that do not see it."""
+
+    name: str
+    figure: Figure
+    alt: str
+
+
+def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> str:
+    """Return a table in Markdown: parameters of drivers break after a comma, commands and intervals nowhere."""
+    texts = table.map(lambda cell: _cell_text(cell, digits))
+    if index:
+        texts.insert(0, "", [_cell_text(name, digits) for name in table.index], allow_duplicates=True)
+    return markdown_table(texts)
+
+
+def _cell_text(cell: Any, digits: int) -> str:
+    text = f"{cell:.{digits}f}" if isinstance(cell, float) else str(cell)
+    text = text.replace("\n", " ").replace("|", r"\|")
+    if not text.startswith("`"):
+        text = re.sub(r",(?=\w+=)", ", ", text)
+    return re.sub(r"\[[^\[\]]*\]", lambda found: with_no_break_spaces(found[0]), text)
+
+
+def markdown_table(texts: pd.DataFrame) -> str:
+    """Return a table of texts in Markdown, with columns of numbers aligned to the right."""
+    rules = ["--:" if NUMBERS.fullmatch("".join(texts.iloc[:, n])) else "---" for n in range(texts.shape[1])]
+    lines = [texts.columns, rules, *texts.itertuples(index=False, name=None)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,65 +1,68 @@
-"""Code cells of the documentation are run and cached."""
+"""Pages of the documentation are plain Markdown, with the tables and pictures that the results give."""
 
 import re
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
+import pandas as pd
 import pytest
-from nbformat.v4 import new_code_cell, new_notebook
 
 from tests.system.conftest import ROOT
 
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.glob("*.md"))
+PICTURE = re.compile(r'!\[(.*?)\]\((\S+?)\)|<img alt="(.*?)" src="(.*?)"')
+
 
 @pytest.fixture
-def cells(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    return import_module("cells")
+def pages(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(DOCS))
+    return import_module("pages")
 
 
-def test_outputs_of_cells_are_cached_until_results_or_code_change(
-    cells: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cells, "ROOT", tmp_path)
-    sources = [tmp_path / "results/ring.json", tmp_path / "src/unjam/table.py", tmp_path / "docs/tables.py"]
-    for path in sources:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("1")
-    build, folders = tmp_path / "build", []
-    for path in (None, *sources):
-        if path:
-            path.write_text("2")
-        folders.append(cells.cache_folder(build))
-        folders[-1].mkdir(parents=True)
-    assert len(set(folders)) == 4
-    assert cells.cache_folder(build) == folders[-1]
-    assert list(build.iterdir()) == [folders[-1]]
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_has_the_tables_of_the_results(pages: ModuleType, page: Path) -> None:
+    assert page.read_text() == pages.render_page(page)[0], "run: make pages"
 
 
-def test_pages_share_a_kernel_but_no_variables(cells: ModuleType, tmp_path: Path) -> None:
-    code = "import os, sys; print(os.getpid(), os.getcwd(), 'mine' in globals(), 'unjam' in sys.modules)"
-    outputs = []
-    for name in ("one", "other"):
-        folder = tmp_path / name
-        folder.mkdir()
-        page = new_notebook(cells=[new_code_cell(code), new_code_cell("mine = 1")])
-        result = cells._run(page, str(folder), timeout=60, allow_errors=False)
-        assert result.err is None
-        assert len(page.cells) == 2
-        outputs.append(page.cells[0].outputs[0].text.split())
-    (process, *first), (other_process, *second) = outputs
-    assert process == other_process
-    assert first == [str(tmp_path / "one"), "False", "True"]
-    assert second == [str(tmp_path / "other"), "False", "True"]
+def test_pictures_of_pages_exist_with_an_alternative_text_and_none_is_left_over() -> None:
+    """Without the text, screen readers read the name of the file."""
+    found = [match for page in PAGES for match in PICTURE.findall(page.read_text())]
+    texts = {DOCS / (link or source): text or other for text, link, other, source in found}
+    assert len(texts) > 30
+    assert [path for path, text in texts.items() if len(text) < 20 or not path.is_file()] == []
+    assert set((DOCS / "pictures/pages").iterdir()) <= set(texts)
 
 
-def test_every_figure_of_a_cell_has_an_alternative_text() -> None:
-    """Without it, screen readers read the name of the file."""
-    figures = [
-        (page.name, cell)
-        for page in (ROOT / "docs").glob("*.md")
-        for cell in re.findall(r"^```{code-cell} ipython3\n(.*?)^```$", page.read_text(), re.DOTALL | re.MULTILINE)
-        if re.search(r"^(Image|draw)\(", cell, re.MULTILINE)
+def test_cells_share_variables_and_show_what_they_display(pages: ModuleType, tmp_path: Path) -> None:
+    loop = 'words = ["a", "b"]\nfor word in words:\n    display(word, None)\n'
+    last = 'from tables import Picture\n\nPicture("c", None, words[0])\n'
+    before = f"Text.\n\n<!-- cell\n{loop}-->\n\nold\n\n<!-- end -->\n\n<!-- cell\n{last}-->\n<!-- end -->\n"
+    after = before.replace("old", "a\n\nb").replace("-->\n<!-- end", "-->\n\n![a](pictures/pages/c.png)\n\n<!-- end")
+    page = tmp_path / "page.md"
+    for text in (before, after):
+        page.write_text(text)
+        rendered, pictures = pages.render_page(page)
+        assert rendered == after
+        assert [picture.name for picture in pictures] == ["c"]
+
+
+@pytest.mark.parametrize("cell", ["1\n-->\n", '"-->"\n-->\n\n<!-- end -->\n', "1 -->\n\n<!-- end -->\n"])
+def test_a_cell_that_readers_would_see_is_refused(pages: ModuleType, tmp_path: Path, cell: str) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(f"<!-- cell\n{cell}\n<!-- cell\n2\n-->\n\n2\n\n<!-- end -->\n")
+    with pytest.raises(ValueError, match=r"^page\.md: a cell without"):
+        pages.render_page(page)
+
+
+def test_tables_are_markdown_with_numbers_to_the_right_and_intervals_on_one_line(pages: ModuleType) -> None:
+    rows = {"a:b=1,c=2": (1.0, "+1 [-2, 3] %", 5, ""), "d": (2.0, "–", 12, "`e:f=1,g=2|h`\ni")}
+    table = pd.DataFrame.from_dict(rows, orient="index", columns=["x", "y", "n", ""])
+    text = import_module("tables").show(table, index=True, digits=1)
+    assert text.replace("\N{NO-BREAK SPACE}", "_").splitlines() == [
+        "|  | x | y | n |  |",
+        "| --- | --: | --: | --: | --- |",
+        "| a:b=1, c=2 | 1.0 | +1 [-2,_3] % | 5 |  |",
+        r"| d | 2.0 | – | 12 | `e:f=1,g=2\|h` i |",
     ]
-    assert len(figures) > 20
-    assert [page for page, cell in figures if not re.search(r"^    alt: .{20}", cell, re.MULTILINE)] == []
