@@ -204,14 +204,9 @@ def _drive_rows(name: str, scenarios: Sequence[Recorded], rows: Table, metrics: 
     drives = (Path(each.recordings).stem for each in scenarios)
     label = _entry(name) if name.endswith(SUFFIX) else name
     return [
-        {"driver": label, "drive": drive, **{metric: _rounded(row[metric]) for metric in metrics}}
+        {"driver": label, "drive": drive, **{metric: row[metric] for metric in metrics}}
         for drive, row in zip(drives, rows, strict=True)
     ]
-
-
-def _rounded(value: float | str) -> float | str:
-    """Return a number with six digits: a third of the size of a results file."""
-    return value if isinstance(value, str) else float(f"{value:.6g}")
 
 
 def plan_driver(scenarios: list[Recorded]) -> PlannedDriver:

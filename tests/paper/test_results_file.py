@@ -5,10 +5,7 @@ import pytest
 from unjam.files import to_json
 from unjam_paper.results_file import collect_results, read_part, read_parts, write_results
 
-TABLE = [
-    {"driver": "pi", "speed": 3.0000000000000004, "seed": [1, 0]},
-    {"driver": "human", "speed": 1e-7, "seed": [2, 0]},
-]
+TABLE = [{"driver": "pi", "speed": 3.0000001, "seed": [1, 0]}, {"driver": "human", "speed": 1e-7, "seed": [2, 0]}]
 PARTS = {
     "manifest": {"commit": "abc"},
     "table": TABLE,
@@ -24,11 +21,19 @@ def test_a_results_file_gives_back_what_was_written(tmp_path: Path) -> None:
     path = tmp_path / "study.json"
     write_results(path, PARTS)
     assert read_parts(path) == PARTS
-    assert to_json(read_parts(path)) == to_json(PARTS), "keys have the same order and numbers all digits"
+    assert to_json(read_parts(path)) == to_json(PARTS), "keys have the same order"
     assert read_part(path, "table") == TABLE
     assert len(path.read_text().splitlines()) == len(PARTS) + 2, "a line for each part"
     assert path.read_text().count("speed") == 3, "stored by columns"
     assert '"same": {"columns":{"a":1.0,"b":null,"c":[[1],[1]]}}' in path.read_text()
+
+
+def test_numbers_have_eight_digits(tmp_path: Path) -> None:
+    write_results(
+        tmp_path / "study.json", {"part": [1.0 / 3.0, 2.0e-9 / 3.0, 12345678901, 123456789.5, None, "0.123456789"]}
+    )
+    part = read_part(tmp_path / "study.json", "part")
+    assert part == [0.33333333, 6.6666667e-10, 12345678901, 123456790.0, None, "0.123456789"]
 
 
 def test_a_part_is_read_from_the_working_folder_or_from_the_file(tmp_path: Path) -> None:
