@@ -3,9 +3,10 @@
 A part is measured once, and again if its arguments, or the controllers that they name, have changed.
 
 Tables of rows with the same keys are stored by columns, `{"columns": {NAME: [VALUES]}}`; a number or a text that is the
-same in all rows is stored once, `{NAME: VALUE}`, and numbers have eight digits. This takes a fifth of the space. Figures
-and controllers are separate files: NAME-FIGURE.png and NAME-controllers.zip. Commands, scripts and controller names in manifests are those of the
-commit that made the results, and may have the names before version 0.1 (CONTRIBUTING.md).
+same in all rows is stored once, `{NAME: VALUE}`, and numbers have eight digits. This takes a fifth of the space.
+Figures and controllers are separate files: NAME-FIGURE.png and NAME-controllers.zip. Commands, scripts and controller
+names in manifests are those of the commit that made the results, and may have the names before version 0.1
+(CONTRIBUTING.md).
 """
 
 import json
