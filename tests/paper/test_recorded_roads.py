@@ -13,7 +13,7 @@ from unjam.errors import InputError
 from unjam.physics.fuel import fuel_rate
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.worker_pool import EpisodeTask
-from unjam_paper import fuel_optimal_plan, information_ahead, recorded_residuals, recorded_roads
+from unjam_paper import fuel_optimal_plan, information_ahead, recorded_residuals, recorded_roads, recorded_tables
 from unjam_paper.fuel_optimal_plan import PlanLimits, plan_speeds
 from unjam_paper.information_ahead import (
     FIXED_PARAMETERS,
@@ -35,11 +35,11 @@ from unjam_paper.recorded_roads import (
     RECORDINGS_FOLDER,
     TEST_DRIVES_PART,
     TRAINING_DRIVES_PART,
-    DriveResults,
     recorded_drives,
     tuned_name,
     untuned_driver,
 )
+from unjam_paper.recorded_tables import DriveResults
 from unjam_paper.results_file import read_part
 from unjam_paper.study import StudyFolder
 
@@ -102,9 +102,9 @@ def test_a_plan_saves_fuel_within_its_limits() -> None:
 
 def test_the_study_tunes_trains_and_then_compares_all_drivers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorded_roads, "SEARCH_BUDGET", SearchBudget(5, 6))
-    monkeypatch.setattr(
-        recorded_roads, "DRIVE_SETTINGS", {name: DRIVE_SETTINGS[name] for name in (*DRIVE_SETTINGS,)[:2]}
-    )
+    small_settings = {name: DRIVE_SETTINGS[name] for name in (*DRIVE_SETTINGS,)[:2]}
+    for module in (recorded_roads, recorded_tables):
+        monkeypatch.setattr(module, "DRIVE_SETTINGS", small_settings)
     monkeypatch.setitem(fuel_optimal_plan.OPTIMIZER_OPTIONS, "maxiter", 20)
     monkeypatch.setattr(recorded_residuals, "STEPS_PER_ITERATION", 2000)
     monkeypatch.setattr(recorded_residuals, "TRAINING_STEPS", 4000)
