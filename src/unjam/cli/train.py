@@ -16,7 +16,7 @@ from unjam.measures.notes import episode_notes
 from unjam.reports.results import read_progress, read_results
 from unjam.training.config import RunConfig, load_config, planned_steps
 from unjam.training.evaluate import Evaluation, evaluation_steps
-from unjam.training.run_folder import check_config, lock_new_folder, read_config
+from unjam.training.run_folder import check_config, lock_new_folder, make_new_folder, read_config, removing_if_empty
 from unjam.training.selection import format_duration
 from unjam.training.trial_log import REQUEST_FILE
 
@@ -80,6 +80,9 @@ def train_command(
 
     if resume is None and (steps := planned_steps(config)) > STEP_OVERRUN_RATIO * config.steps:
         err_console.print(f"note: iterations are complete: {steps:,} steps will be trained, not {config.steps:,}")
+    if resume is None:
+        with removing_if_empty(folder):  # a folder that is not empty is refused before the plan is printed
+            make_new_folder(folder, f", or --resume {folder}")
     err_console.print(f"training {_plan_text(config)}, into {folder}", soft_wrap=True)
     write_curves = tensorboard_writer(folder) if tensorboard else None
     progress = nullcontext() if json else _TrainingProgress(config, folder)
