@@ -9,11 +9,11 @@ from typing import Any
 from safetensors.numpy import save
 
 from unjam.controller import make_driver
-from unjam.controller.file import load_controller, sha256_of
+from unjam.controller.file import load_controller
 from unjam.drivers.network import network_weights
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError, unknown_name
-from unjam.files import make_folder
+from unjam.files import make_folder, sha256_of
 from unjam.manifest import manifest
 from unjam.reports.results import EVALUATION_FILE
 from unjam.scenarios import SCENARIOS
