@@ -24,6 +24,7 @@ if __name__ == "__main__":  # packages without their own code, which would impor
 
 from unjam.sumo_files.reader import (  # noqa: E402
     ALLOWED_VARIABLES,
+    NETWORK_ELEMENT,
     SUBSTITUTED_VARIABLES,
     UNKNOWN_VARIABLE,
     BrokenFileError,
@@ -93,9 +94,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
     files = [network, *additional, *routes, *weights]
     for file in files:
         check_file_exists(file)
-    folder = path.parent.resolve()
-    # No copy of the network is passed on.
-    readers = {file: XmlReader(demand.handlers(), folder=None if file == network else folder) for file in files}
+    readers = {file: XmlReader(demand.handlers()) for file in files}
     for file, reader in readers.items():
         reader.read(file)
         stamps = {**reader.sources, **stamps}
@@ -217,7 +216,7 @@ def _parse_time(text: str) -> float:
 
 def _check_network(path: Path, reader: "XmlReader") -> None:
     """Raise `BrokenFileError` unless it is a network with a version, without which SUMO would crash."""
-    if reader.root != "net":
+    if reader.root != NETWORK_ELEMENT:
         raise BrokenFileError(f"{path.name}: is not a SUMO network: it begins with <{reader.root}>")
     if not reader.version:
         raise BrokenFileError(f"{path.name}: the network has no version; convert it: netconvert -s {path.name} -o")
