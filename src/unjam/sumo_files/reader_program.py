@@ -73,6 +73,8 @@ READ_ELEMENTS = (
     *(f"carFollowing-{name}" for name in CAR_FOLLOWING_MODELS),
 )
 """elements with content that `_Demand` needs, and the ends of some"""
+MAX_VEHICLE_TYPES = 100_000
+"""maximum number of vehicle types, of which unjam makes others for CAVs"""
 TRUE_VALUES = ("true", "t", "yes", "on", "1", "x")
 """texts that SUMO accepts as true"""
 
@@ -269,7 +271,12 @@ class _Demand:
             case "vType":
                 name = attributes.get("refId") or attributes.get("id", "")
                 self._current_distribution.add(name)
+                if not name:  # SUMO would read millions of them and report each
+                    raise BrokenFileError("vType: an element without id is not allowed; allowed: an id for each type")
                 if "refId" not in attributes:
+                    if len(self.types) == MAX_VEHICLE_TYPES:
+                        limit = f"at most {MAX_VEHICLE_TYPES:,} vehicle types"
+                        raise BrokenFileError(f"vType: type {name[:60]!r} is not allowed; allowed: {limit}")
                     self._current_type, self.types[name], self.type_parameters[name] = name, dict(attributes), {}
             case "/vType":
                 self._current_type = ""
