@@ -13,10 +13,10 @@ import pytest
 from hypothesis import settings
 
 from tests.pictures import empty_pictures
-from unjam.controller.file import sha256_of
 from unjam.drivers import LocalState
 from unjam.drivers.network import Network
 from unjam.drivers.user_driver import FileDriver
+from unjam.files import sha256_of
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 

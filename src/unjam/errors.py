@@ -132,7 +132,9 @@ def printable(text: str) -> str:
 
     Otherwise file names, names in TOML files or messages of SUMO could move the cursor, or turn the direction of text.
     """
-    hidden = {letter for letter in text if not letter.isprintable() and letter != "\n" and category(letter) != "Zs"}
+    hidden = {
+        letter for letter in set(text) if not letter.isprintable() and letter != "\n" and category(letter) != "Zs"
+    }
     return "".join("?" if letter in hidden else letter for letter in text) if hidden else text
 
 

@@ -6,10 +6,12 @@ the disk is full or cannot be written.
 """
 
 import errno
+import hashlib
 import json
 import math
 import os
 import secrets
+import time
 import zipfile
 import zlib
 from collections import Counter
@@ -136,10 +138,15 @@ def remove(path: Path) -> None:
         folder.remove(path.name)
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Remove unfinished files that killed processes have left in a folder, which no other process writes now."""
-    for leftover in [*filter(is_leftover, folder.glob(".*"))]:
-        remove(leftover)
+def remove_leftovers(folder: Path, min_age: float = -math.inf) -> None:
+    """Remove unfinished files that killed processes have left in a folder, where they can be removed.
+
+    They are older than `min_age` [s], which is only needed if other processes may write to the folder now.
+    """
+    for leftover in filter(is_leftover, [*folder.glob(".*")]):
+        with suppress(FileNotFoundError, DiskError):  # another process has just removed it
+            if time.time() - leftover.lstat().st_mtime > min_age:
+                remove(leftover)
 
 
 def remove_if_empty(folder: Path) -> None:
@@ -218,6 +225,17 @@ def _integer_64_bits(text: str) -> int:
     if len(text) > MAX_INTEGER_LENGTH or not -(2**63) <= (value := int(text)) < 2**63:
         raise ValueError(f"the integer {text[:20]}... has more than 64 bits")
     return value
+
+
+def sha256_of(content: bytes) -> str:
+    """Return the SHA-256 of some bytes in hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def sha256_of_file(path: Path) -> str:
+    """Return the SHA-256 of a file, without reading it into memory as a whole."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def to_json(value: Any, indent: int | None = None) -> str:

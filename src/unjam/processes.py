@@ -62,6 +62,26 @@ def redirect_user_output() -> AbstractContextManager[object]:
     return redirect_stdout(sys.stderr) if _is_command_line else nullcontext()
 
 
+@contextmanager
+def ending_forks() -> Iterator[None]:
+    """End a fork of this process, made by code of users within the block, where it would leave the block.
+
+    It would go on with the episode of this process, or end SUMO and remove files that this process needs.
+    """
+    process, code = os.getpid(), 0
+    try:
+        yield
+    except BaseException as error:
+        own = error.code if isinstance(error, SystemExit) else 1
+        code = own if isinstance(own, int) else int(own is not None)
+        raise
+    finally:
+        if os.getpid() != process:
+            for stream in (sys.stdout, sys.stderr):
+                stream.flush()
+            os._exit(code)
+
+
 def exit_with_parent(signum: int) -> None:
     """Let Linux send this process a signal when its parent ends, if the parent used `bind_to_parent`.
 

@@ -11,7 +11,9 @@ import platform
 import runpy
 import struct
 import sys
-from contextlib import suppress
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
@@ -30,6 +32,7 @@ IO_URING_SETUP = 425
 X32_SYSCALL_BIT = 0x40000000
 """marks other numbers of the same system calls (x32)"""
 EPERM = 1
+_limit_lock = threading.Lock()
 
 
 def limit_resources(memory: int, seconds: int = 0) -> None:
@@ -44,6 +47,25 @@ def limit_resources(memory: int, seconds: int = 0) -> None:
                 resource.setrlimit(kind, (smallest := min([limit, *limits]), smallest))
         if seconds:
             signal.alarm(seconds)  # also if it only waits
+
+
+@contextmanager
+def limit_memory_growth(memory: int) -> Iterator[None]:
+    """Raise `MemoryError` if this process, with all its threads, takes so much more memory [bytes]; on Linux only."""
+    if sys.platform != "linux":
+        yield
+        return
+    import resource
+
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    with _limit_lock:
+        before, hard = resource.getrlimit(resource.RLIMIT_AS)
+        limits = [limit for limit in (before, hard) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_AS, (min([pages * resource.getpagesize() + memory, *limits]), hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, (before, hard))
 
 
 def confine_process(*writable: Path) -> None:

@@ -1,6 +1,5 @@
 """Trust in Python code that a folder names: it runs if its user ran the same code at the same place before."""
 
-import hashlib
 import json
 import os
 import threading
@@ -12,7 +11,7 @@ from typing import Any
 import platformdirs
 
 from unjam.errors import InputError, UnjamError
-from unjam.files import atomic_write, make_folder
+from unjam.files import atomic_write, make_folder, sha256_of
 from unjam.user_code import UserCode, read_code
 
 TRUSTED_VARIABLE = "UNJAM_TRUSTED"
@@ -131,7 +130,7 @@ def _code_files(text: str) -> Iterable[Path]:
 
 
 def _trust_key(code: Path, sha256: str) -> str:
-    return hashlib.sha256(os.fsencode(code) + b"\0" + sha256.encode()).hexdigest()
+    return sha256_of(os.fsencode(code) + b"\0" + sha256.encode())
 
 
 def _is_remembered(key: str) -> bool:

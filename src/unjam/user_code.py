@@ -7,7 +7,6 @@ begin with one that belongs to the file, and only they find each other by `impor
 
 import ast
 import builtins
-import hashlib
 import importlib.util
 import linecache
 import sys
@@ -22,6 +21,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from unjam.errors import InputError
+from unjam.files import sha256_of
 
 USER_MODULE_PREFIX = "unjam_user_"
 """beginning of the names of users' modules in `sys.modules`"""
@@ -40,11 +40,11 @@ class UserCode:
     @property
     def sha256(self) -> str:
         """The hash of all code that can run; for a single file, that of its bytes."""
-        hashes = {name: hashlib.sha256(source).hexdigest() for name, (_, source) in self.modules.items()}
+        hashes = {name: sha256_of(source) for name, (_, source) in self.modules.items()}
         if len(hashes) == 1:
             return hashes[""]
         lines = (f"{name} {self.modules[name][0].name} {sha256}\n" for name, sha256 in sorted(hashes.items()))
-        return hashlib.sha256("".join(lines).encode()).hexdigest()
+        return sha256_of("".join(lines).encode())
 
     def run(self) -> ModuleType:
         """Run the file and return its module; its imports from its folder run again too."""

@@ -2,23 +2,29 @@
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from safetensors.numpy import save
 
+import unjam
 from unjam.controller import make_driver
-from unjam.controller.file import load_controller, sha256_of
+from unjam.controller.file import load_controller
+from unjam.drivers.driver import Driver
 from unjam.drivers.network import network_weights
+from unjam.drivers.registry import driver_recipe
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError, unknown_name
-from unjam.files import make_folder
-from unjam.manifest import manifest
-from unjam.reports.results import EVALUATION_FILE
-from unjam.scenarios import SCENARIOS
+from unjam.files import make_folder, sha256_of, sha256_of_file, to_json
+from unjam.manifest import manifest, package_versions
+from unjam.reports.results import read_results
+from unjam.scenarios import SCENARIOS, scenario_recipe
+from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
-from unjam.training.config import load_config
+from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import evaluate, raise_failures, save_evaluation
 from unjam.training.executors import Executor, run_all, training_command
 from unjam.training.run_folder import read_config
@@ -42,6 +48,10 @@ MODEL_ROLLOUT_SECONDS = 60.0
 """additional duration with a model of rows, for a model ratio up to one [s]"""
 REFERENCE_SECONDS = {"ring": 60.0, "figure-eight": 60.0, "merge": 400.0, "motorway": 1500.0}
 """duration of the reference drivers on a road [s]"""
+INPUTS_HASH = "inputs_sha256"
+"""entry of the metadata of reference evaluations: hash of all that they depend on"""
+EPISODE_PARTS = ("drivers", "measures", "physics", "scenarios", "worlds")
+"""subpackages of unjam that episodes and their metrics depend on"""
 
 
 @dataclass(frozen=True)
@@ -55,7 +65,7 @@ class StudyPlan:
     """trainings that are not finished"""
     finished_count: int
     roads: list[str]
-    """roads on which the reference drivers have not been evaluated"""
+    """roads on which the reference drivers have not been evaluated, or by other code, packages, drivers or settings"""
 
     def seconds(self, workers: int) -> float:
         """Return the estimated duration on `workers` cores [s]."""
@@ -80,7 +90,7 @@ def make_plan(names: Sequence[str], seeds: int, study_folder: StudyFolder) -> St
                 raise InputError(f"out: {str(folder)!r} was trained with other settings; allowed: a new folder")
     missing = [run for run in runs if not study_folder.is_finished(run)]
     roads = dict.fromkeys(road for study in studies.values() for road in study.roads)
-    undriven = [road for road in roads if not (study_folder.reference_folder(road) / EVALUATION_FILE).is_file()]
+    undriven = [road for road in roads if not _has_current_references(road, study_folder)]
     return StudyPlan(tuple(studies), seeds, study_folder, missing, len(runs) - len(missing), undriven)
 
 
@@ -142,16 +152,45 @@ def run_plan(
 
 def drive_references(road: str, study_folder: StudyFolder, workers: int) -> None:
     """Evaluate the reference drivers of a road on the test seeds of the trainings."""
+    config, scenario, drivers = _reference_drivers(road)
+    with WorkerPool(workers) as pool:
+        evaluation = evaluate(scenario, drivers, held_out_seeds(config.evaluation.episodes), pool)
+    raise_failures(evaluation)
+    metadata = {"scenario": config.scenario, "manifest": manifest(), INPUTS_HASH: _reference_inputs_hash(road)}
+    save_evaluation(study_folder.reference_folder(road), evaluation, metadata)
+
+
+def _reference_drivers(road: str) -> tuple[RunConfig, Scenario, dict[str, Driver]]:
+    """Return the settings and the scenario of a road, and the reference drivers that can drive it, by label."""
     config = load_config(changes=STUDY_ROADS[road])
     scenario = config.make_scenario()
     names = {**REFERENCE_DRIVERS, **TUNED_REFERENCES.get(ORIGINAL_ROADS.get(road, road), {})}
     drivers = {label: make_driver(name, scenario.control_step) for label, name in names.items()}
-    drivers = {label: driver for label, driver in drivers.items() if can_drive(driver, scenario)}
-    with WorkerPool(workers) as pool:
-        evaluation = evaluate(scenario, drivers, held_out_seeds(config.evaluation.episodes), pool)
-    raise_failures(evaluation)
-    metadata = {"scenario": config.scenario, "manifest": manifest()}
-    save_evaluation(study_folder.reference_folder(road), evaluation, metadata)
+    return config, scenario, {label: driver for label, driver in drivers.items() if can_drive(driver, scenario)}
+
+
+def _reference_inputs_hash(road: str) -> str:
+    """Return a hash of all that the evaluation of the reference drivers depends on."""
+    config, scenario, drivers = _reference_drivers(road)
+    recipes = [(label, *driver_recipe(driver)) for label, driver in drivers.items()]
+    weights = b"".join(save(arrays) for _, _, arrays in recipes)
+    settings = [config.evaluation.episodes, scenario_recipe(scenario), [recipe for *recipe, _ in recipes]]
+    return sha256_of(to_json([*settings, package_versions(), _episode_code_hash()]).encode() + weights)
+
+
+@cache
+def _episode_code_hash() -> str:
+    """Return a hash of the source code that episodes and their metrics depend on."""
+    sources = sorted(path for part in EPISODE_PARTS for path in (Path(unjam.__file__).parent / part).rglob("*.py"))
+    return sha256_of("".join(map(sha256_of_file, sources)).encode())
+
+
+def _has_current_references(road: str, study_folder: StudyFolder) -> bool:
+    """Return whether the reference drivers of a road were evaluated by this code, and the results are intact."""
+    with suppress(InputError):
+        stored = read_results(study_folder.reference_folder(road)).metadata.get(INPUTS_HASH)
+        return stored == _reference_inputs_hash(road)
+    return False
 
 
 def _training_record(run: PlannedRun, study_folder: StudyFolder) -> dict[str, Any]:

@@ -15,7 +15,6 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from matplotlib.figure import Figure
 
 from unjam.child_processes import initialize_pool_process, isolated_start
 from unjam.controller import controller_hash
-from unjam.files import atomic_write, make_folder, to_json
+from unjam.files import atomic_write, make_folder, sha256_of, to_json
 from unjam.reports.figures import png_bytes
 
 COLUMNS = "columns"
@@ -188,7 +187,7 @@ def measure_parts(folder: Path, parts: Mapping[str, StudyPart], workers: int) ->
 
 def _stamp(part: StudyPart) -> str:
     """Return a text that changes with the arguments of a part, and with the controllers that they name."""
-    return sha256(repr(_describe(part)).encode()).hexdigest()[:12]
+    return sha256_of(repr(_describe(part)).encode())[:12]
 
 
 def _describe(value: Any) -> Any:

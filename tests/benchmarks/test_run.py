@@ -17,8 +17,8 @@ from unjam.benchmarks.leaderboard import read_leaderboard
 from unjam.benchmarks.result import RoadRecord, read_result
 from unjam.benchmarks.suites import SUITES, Suite
 from unjam.cli import app
-from unjam.controller.file import sha256_of_file
 from unjam.errors import InputError
+from unjam.files import sha256_of_file
 from unjam.scenarios import make_scenario
 
 ROADS = "ring-22-no-warm-up", "figure-eight-14"

@@ -11,16 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unjam.controller import file as files
-from unjam.controller.file import (
-    ARCHIVE_PARTS,
-    MANIFEST_PART,
-    MAX_PART_BYTES,
-    WEIGHTS_PART,
-    pack_parts,
-    sha256_of,
-    unpack_parts,
-)
+from unjam.controller.file import ARCHIVE_PARTS, MANIFEST_PART, MAX_PART_BYTES, WEIGHTS_PART, pack_parts, unpack_parts
 from unjam.errors import InputError
+from unjam.files import sha256_of
 
 WHOLE = {MANIFEST_PART: b"{}", WEIGHTS_PART: b"numbers"}
 

@@ -21,7 +21,6 @@ from unjam.controller.file import (
     pack_parts,
     read_controller,
     sample_bytes,
-    sha256_of,
     unpack_parts,
 )
 from unjam.controller.string_stability import human_gain, string_gains
@@ -31,6 +30,7 @@ from unjam.drivers.car_following import Constant
 from unjam.drivers.safety import INSTANT_ACTUATOR, Actuator, SafetyFilter
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError
+from unjam.files import sha256_of
 from unjam.physics.idm import PAPER_IDM, IDMParameters, equilibrium_gap
 from unjam.reports.certificate import write_certificate_page
 from unjam.scenarios import Ring

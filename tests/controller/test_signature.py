@@ -40,12 +40,12 @@ from unjam.controller.file import (
     add_signature,
     pack_parts,
     read_controller,
-    sha256_of,
     unpack_parts,
 )
 from unjam.controller.signature import fingerprint_of, make_keys, read_private_key, read_public_key
 from unjam.controller.verify import verify_controller_file
 from unjam.errors import DiskError, InputError
+from unjam.files import sha256_of
 
 KEY, OTHER = (Ed25519PrivateKey.from_private_bytes(bytes([number] * 32)) for number in (1, 2))
 FINGERPRINT = fingerprint_of(KEY.public_key())

@@ -22,12 +22,12 @@ from unjam.controller.file import (
     pack_parts,
     read_controller,
     sample_bytes,
-    sha256_of,
     unpack_parts,
 )
 from unjam.controller.verify import check_parts, verify_controller_file
 from unjam.drivers import IDM, Constant, Driver, PISaturation, ResidualDriver
 from unjam.errors import InputError, MissingPartError
+from unjam.files import sha256_of
 from unjam.physics.idm import PAPER_IDM, equilibrium_gap
 from unjam.trust import trusting_code
 

@@ -14,19 +14,21 @@ import pytest
 from unjam.controller import make_driver
 from unjam.errors import InputError
 from unjam.files import atomic_write
+from unjam.reports.results import PLOT_EPISODES_FILE
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import load_config
 from unjam.training.run_folder import read_config
 from unjam.worlds.episode import check_can_drive
 from unjam.worlds.sumo.backend import SumoBackend
+from unjam_paper import reproduce
 from unjam_paper.all_roads import measure_road
 from unjam_paper.comparison import comparison_study
-from unjam_paper.reproduce import estimated_seconds, find_studies, make_plan, run_plan
+from unjam_paper.reproduce import drive_references, estimated_seconds, find_studies, make_plan, run_plan
 from unjam_paper.results_file import read_parts
 from unjam_paper.studies import STUDIES, STUDY_GROUPS
-from unjam_paper.study import STUDY_ROADS, DriverSource, PlannedRun, StudyFolder, evaluate_metrics
-from unjam_paper.variants import VARIANTS
+from unjam_paper.study import STUDY_ROADS, DriverSource, PlannedRun, Study, StudyFolder, evaluate_metrics
+from unjam_paper.variants import TUNED_REFERENCES, VARIANTS
 
 Made = tuple[Path, list[str]]
 
@@ -134,6 +136,31 @@ def test_finished_trainings_are_not_repeated(reproduced: Made) -> None:
     run_plan(plan_now, 2, on_message=messages.append)
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(messages) == 1
+
+
+def test_reference_drivers_are_evaluated_again_after_a_change(
+    tmp_path: Path, small_study: pytest.MonkeyPatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(STUDIES, "references", Study("", roads=("small",)))
+    studies = StudyFolder(tmp_path)
+
+    def missing_roads() -> list[str]:
+        return make_plan(["references"], 0, studies).roads
+
+    drive_references("small", studies, 1)
+    assert missing_roads() == []
+    for change in (
+        lambda patch: patch.setitem(STUDY_ROADS, "small", {**STUDY_ROADS["small"], "scenario_options.horizon": 90}),
+        lambda patch: patch.setitem(TUNED_REFERENCES, "small", {"tuned PI": "pi:window=30"}),
+        lambda patch: patch.setattr(reproduce, "package_versions", lambda: {"libsumo": "1.0"}),
+        lambda patch: patch.setattr(reproduce, "_episode_code_hash", lambda: "of another version"),
+    ):
+        with monkeypatch.context() as patch:
+            change(patch)
+            assert missing_roads() == ["small"]
+    assert missing_roads() == []
+    atomic_write(studies.reference_folder("small") / PLOT_EPISODES_FILE, "of another evaluation")
+    assert missing_roads() == ["small"]
 
 
 def test_the_table_has_the_means_of_the_trainings(reproduced: Made) -> None:

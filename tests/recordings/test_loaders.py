@@ -1,19 +1,23 @@
 import gzip
+import resource
 import subprocess
-from collections.abc import Callable
+import sys
+import tracemalloc
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow
 import pytest
-from pyarrow.parquet import ParquetFile
+from pyarrow.parquet import ParquetFile, ParquetWriter
 
 from tests.worlds.sumo.user_networks import built
 from unjam.errors import InputError
 from unjam.recordings import loaders, tables
 from unjam.recordings.loaders import METERS_PER_FOOT, ReadOptions, read_trajectories
-from unjam.recordings.tables import NGSIM_COLUMN_ORDER
+from unjam.recordings.tables import NGSIM_COLUMN_ORDER, read_table
 from unjam.worlds.sumo.networks import sumo_program
 
 SHORT = ReadOptions(min_seconds=1.0)
@@ -325,11 +329,77 @@ def test_long_text_that_parquet_stores_once_is_refused_before_it_is_repeated(
         read_trajectories(tmp_path / "t.parquet")
 
 
+def forge_footer(path: Path, value: int, forged: int, count: int) -> None:
+    """Replace the first integers with this value in the footer of a Parquet file."""
+
+    def encode(value: int, length: int = 0) -> bytes:
+        groups = [2 * value >> shift & 127 for shift in range(0, max(7 * length, (2 * value).bit_length()), 7)]
+        return bytes([*(group | 128 for group in groups[:-1]), groups[-1]])
+
+    content = path.read_bytes()
+    start = len(content) - 8 - int.from_bytes(content[-8:-4], "little")
+    old = encode(value)
+    assert old in content[start:]
+    path.write_bytes(content[:start] + content[start:].replace(old, encode(forged, len(old)), count))
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_numbers_of_rows_that_contradict_each_other_are_refused_before_reading(
+    count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pd.DataFrame({"pair": 1, "time": np.zeros(99_999)}).to_parquet(tmp_path / "t.parquet", index=False)
+    forge_footer(tmp_path / "t.parquet", 99_999, 9, count)
+    monkeypatch.setattr(ParquetFile, "read", pytest.fail)
+    with pytest.raises(InputError, match=r"t\.parquet: cannot be read: its numbers of rows contradict each other"):
+        read_trajectories(tmp_path / "t.parquet")
+
+
+@pytest.fixture
+def system_memory_pool() -> Iterator[None]:
+    """Let Arrow take no memory in advance."""
+    pool = pyarrow.default_memory_pool()
+    pyarrow.set_memory_pool(pyarrow.system_memory_pool())
+    yield
+    pyarrow.set_memory_pool(pool)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is limited on Linux only")
+def test_pages_of_parquet_that_unpack_to_more_than_the_footer_says_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, system_memory_pool: None
+) -> None:
+    monkeypatch.setattr(tables, "MAX_PARQUET_MEMORY", 128 << 20)
+    good = write_table_file(tmp_path / "good.parquet")
+    table = pyarrow.Table.from_pydict({"pair": [str(number).zfill(100_000) for number in range(100)]})
+    with ParquetWriter(tmp_path / "t.parquet", table.schema, compression="gzip") as writer:
+        for _ in range(30):  # 300 MB of text
+            writer.write_table(table)
+    size = ParquetFile(tmp_path / "t.parquet").metadata.row_group(0).column(0).total_uncompressed_size
+    forge_footer(tmp_path / "t.parquet", size, 1000, -1)
+    with pytest.raises(InputError, match=r"t\.parquet: cannot be read: it takes more than 0\.125 GiB of memory"):
+        read_trajectories(tmp_path / "t.parquet")
+    assert len(read_trajectories(good, options=SHORT).trajectories) == 2
+    assert resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY
+
+
 def test_nested_columns_of_parquet_are_not_read(tmp_path: Path) -> None:
     rows = pd.read_parquet(write_table_file(tmp_path / "t.parquet"))
     rows.assign(extra=[[1.0] * 99] * len(rows), gap=[{"m": 1.0}] * len(rows)).to_parquet(tmp_path / "t.parquet")
     with pytest.raises(InputError, match="no column 'gap'; it has: pair, time, speed, leader_speed; required"):
         read_trajectories(tmp_path / "t.parquet")
+
+
+def test_fcd_output_is_read_in_parts_that_take_little_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "FCD_PART_ROWS", 10_000)
+    rows = "".join(f'<timestep time="{n}.12345"><vehicle id="v{n}" speed="{n}.1"/></timestep>' for n in range(50_000))
+    (tmp_path / "fcd.xml").write_text(f"<fcd-export>{rows}</fcd-export>")
+    read_table(tmp_path / "fcd.xml")
+    tracemalloc.start()
+    frame = read_table(tmp_path / "fcd.xml")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert list(frame.columns) == ["timestep_time", "vehicle_id", "vehicle_speed", "line"]
+    assert frame.iloc[-1].tolist() == ["49999.12345", "v49999", "49999.1", 1]
+    assert peak < 300 * len(frame)
 
 
 @pytest.mark.parametrize("limit", ["MAX_FCD_VEHICLES", "MAX_CELLS"])

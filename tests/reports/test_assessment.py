@@ -163,3 +163,11 @@ def test_figure_without_outflow_omits_its_relative_differences() -> None:
 def test_a_folder_without_an_assessment_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"has no assessment.json"):
         write_assessment(tmp_path, tmp_path / "page.html")
+
+
+def test_names_of_drivers_have_no_hidden_characters(tmp_path: Path) -> None:
+    path = assessment_folder(tmp_path, [HELPS, HARMS]) / ASSESSMENT_FILE
+    path.write_text(path.read_text().replace(f'"{HELPS.driver}"', '"p\\u202ei"'))
+    page = render_assessment(tmp_path)
+    assert "p?i" in page
+    assert "\u202e" not in page

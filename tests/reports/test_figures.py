@@ -18,6 +18,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 from tests.reports.open_roads import merge_episode, plot_episode_of, user_episode
+from unjam.errors import printable
 from unjam.reports.figures import (
     CAV_PLOT_COLOR,
     LINE_COLORS,
@@ -26,6 +27,7 @@ from unjam.reports.figures import (
     data_uri,
     learning_curve_figure,
     png_bytes,
+    svg_bytes,
     time_series_figure,
     training_time_figure,
 )
@@ -421,3 +423,10 @@ def test_time_series_of_an_open_road_have_mean_speed_waves_and_backlog() -> None
         for axes, values in zip(panels, expected, strict=True):
             found = np.asarray(drawn_lines(axes)[number].get_ydata())
             np.testing.assert_allclose(found, values, rtol=1e-4)
+
+
+def test_names_in_figures_have_neither_hidden_characters_nor_formulas() -> None:
+    figure = time_series_figure([make_episode("p\u202ei\x1b $\\frac$")])
+    text = svg_bytes(figure).decode()
+    assert "p?i? $\\frac$" in text
+    assert text == printable(text)

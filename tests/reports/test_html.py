@@ -4,6 +4,7 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from tests.measures.test_metrics import LENGTH, episode_of
 from tests.reports.test_model import facts_of, progress_of
 from tests.reports.test_replay import decode
 from unjam import __version__
-from unjam.errors import DiskError, InputError
+from unjam.errors import DiskError, InputError, printable
 from unjam.files import to_json
 from unjam.measures.metrics import METRICS, measure
 from unjam.reports.figures import learning_curve_figure
@@ -224,6 +225,15 @@ def test_texts_of_a_folder_are_escaped(tmp_path: Path) -> None:
     assert "SUMO &lt;cannot&gt; start" in text
     assert "ring?gnir" in text, "bidirectional marks would turn the text around"
     assert "\u202e" not in text
+
+
+def test_names_have_no_hidden_characters_in_data_of_a_page(tmp_path: Path) -> None:
+    text, page = page_of(results_in(tmp_path / "drive", "human", "p\u202ei\x1b[31m"))
+    assert [driver["name"] for driver in page.replay["drivers"]] == ["human", "p?i?[31m"]
+    [csv] = [unquote(link["href"]) for link in page.of("a") if "text/csv" in link["href"]]
+    assert "p?i?[31m" in csv
+    assert text == printable(text)
+    assert csv == printable(csv)
 
 
 def test_failed_episodes_are_listed_with_their_reason(tmp_path: Path) -> None:

@@ -260,4 +260,4 @@ def test_a_difference_shows_its_sign() -> None:
 def test_csv_has_no_cells_that_a_spreadsheet_calculates() -> None:
     table = pd.DataFrame({"=a": ["+1", "@x", "-", "\t=1", "plain"], "number": [-1.0, 2.0, 3.0, 4.0, 5.0]})
     text = csv_text(table)
-    assert text == "'=a,number\n'+1,-1.0\n'@x,2.0\n'-,3.0\n'\t=1,4.0\nplain,5.0\n"
+    assert text == "'=a,number\n'+1,-1.0\n'@x,2.0\n'-,3.0\n'?=1,4.0\nplain,5.0\n"

@@ -15,6 +15,7 @@ from unjam import sandbox, sumo_files
 from unjam.errors import InputError
 from unjam.sumo_files import read_lanes, read_sumo_files, write_harmless_copy
 from unjam.sumo_files import reader_program as reader
+from unjam.sumo_files.variants import write_variant
 
 LAUGHS = "".join(f'<!ENTITY l{n} "{f"&l{n - 1};" * 10 if n else "lol"}">' for n in range(10))
 DEFINITIONS = {
@@ -125,7 +126,7 @@ def test_included_files_are_read_wherever_they_are_included(tmp_path: Path) -> N
     (tmp_path / "deep" / "types.xml").write_text(
         '<routes><vType id="a"/><edgeData id="e" file="x"/><include href="more.xml"/></routes>'
     )
-    (tmp_path / "deep" / "more.xml").write_text('<x><vehicle id="w" type="a"/></x>')
+    (tmp_path / "deep" / "more.xml").write_text('<routes><vehicle id="w" type="a"/></routes>')
     mixture = '<vTypeDistribution id="m"><include href="deep/types.xml"/></vTypeDistribution>'
     path = configuration(tmp_path, routes=f'<routes>{mixture}<flow id="f" type="m"/></routes>')
     found = read_sumo_files(path)
@@ -134,36 +135,40 @@ def test_included_files_are_read_wherever_they_are_included(tmp_path: Path) -> N
     assert found.dropped_items == ("edgeData",)
     assert found.copy_sources == {routes: (routes, types, more)}
     assert found.sources == (path, tmp_path / "road.net.xml", routes, more, types)
-    more.write_text('<x><vehicle id="w" type="b"/></x>')
+    more.write_text('<routes><vehicle id="w" type="b"/></routes>')
     assert read_sumo_files(path).used_types == {"a", "b"}
     write_harmless_copy(routes, tmp_path / "copy.xml")
     (copied,) = ElementTree.parse(tmp_path / "copy.xml").iter("vTypeDistribution")
-    assert [each.tag for each in copied.iter()][1:] == ["routes", "vType", "x", "vehicle"]
+    assert [each.tag for each in copied.iter()][1:] == ["routes", "vType", "routes", "vehicle"]
 
 
-FOREIGN = {
-    "types": ('<additional><vType id="a"/></additional>', ""),
-    "settings": ('<settings><server password="hunter2"/></settings>', "element 'settings' is not allowed"),
-    "text": ("<additional><param>hunter2</param></additional>", "text is not allowed; allowed: elements of SUMO"),
-}
-
-
-@pytest.mark.parametrize("name", FOREIGN)
+@pytest.mark.parametrize("folder", ["mine", "elsewhere"])
 @pytest.mark.parametrize("is_included", [True, False])
-def test_files_outside_the_folder_have_only_elements_of_sumo(is_included: bool, name: str, tmp_path: Path) -> None:
-    content, words = FOREIGN[name]
-    (tmp_path / "foreign.xml").write_text(content)
-    (tmp_path / "project").mkdir()
-    include = '<include href="../foreign.xml"/>' if is_included else ""
-    path = configuration(tmp_path / "project", routes=ROUTES.replace("<routes>", f"<routes>{include}"))
+def test_a_file_that_is_none_of_sumo_is_refused_in_any_folder(is_included: bool, folder: str, tmp_path: Path) -> None:
+    for name in ("mine", "elsewhere"):
+        (tmp_path / name).mkdir()
+    (tmp_path / folder / "secret.xml").write_text('<settings><param key="password" value="hunter2"/></settings>')
+    if folder != "mine":
+        (tmp_path / "mine" / "secret.xml").symlink_to(tmp_path / folder / "secret.xml")
+    include = '<include href="secret.xml"/>' if is_included else ""
+    path = configuration(tmp_path / "mine", routes=ROUTES.replace("<routes>", f"<routes>{include}"))
     if not is_included:
-        path.write_text(path.read_text().replace("road.rou.xml", "road.rou.xml,../foreign.xml"))
-    if not words:
-        assert "a" in read_sumo_files(path).types
-        return
-    message = refusal_message(path)
-    assert message.startswith(f"foreign.xml: {words}")
-    assert "hunter2" not in message
+        path.write_text(path.read_text().replace("road.rou.xml", "road.rou.xml,secret.xml"))
+    assert refusal_message(path).startswith("secret.xml: begins with <settings>; allowed: an element of SUMO")
+
+
+def test_copies_have_neither_elements_unknown_to_sumo_nor_text(tmp_path: Path) -> None:
+    inside = '<server password="hunter2"><vType id="a"/></server><vType id="b">hunter2</vType>'
+    path = configuration(tmp_path, routes=ROUTES.replace("<routes>", f"<routes>{inside}"))
+    found = read_sumo_files(path)
+    assert found.dropped_items == ("element server",)
+    assert "b" in found.types
+    assert "a" not in found.types
+    (tmp_path / "new").mkdir()
+    write_variant(found, {}, 1.0, tmp_path / "new" / "other.sumocfg")
+    copied = "".join(file.read_text() for file in (tmp_path / "new").iterdir())
+    assert "hunter2" not in copied
+    assert 'id="b"' in copied
 
 
 def test_elements_for_vehicle_types_apply_to_their_cavs(tmp_path: Path) -> None:
@@ -204,4 +209,4 @@ def test_a_large_file_takes_no_memory_and_needs_no_copy(tmp_path: Path, monkeypa
     ],
 )
 def test_the_first_departure_is_known_if_files_define_it(routes: str, first: float | None, tmp_path: Path) -> None:
-    assert read_sumo_files(configuration(tmp_path, routes=f"<x>{routes}</x>")).first_departure == first
+    assert read_sumo_files(configuration(tmp_path, routes=f"<routes>{routes}</routes>")).first_departure == first

@@ -191,6 +191,11 @@ BROKEN = {
         *(NETWORK, '<routes><vType id="car" emissionClass="PHEMlight/../../x"/><vehicle id="v" type="car"/></routes>'),
         *("", "road.rou.xml: emissionClass: 'PHEMlight/../../x' is not allowed"),
     ),
+    "types without id": (NETWORK, "<routes><vType/></routes>", "", "vType: an element without id is not allowed"),
+    "too many types": (
+        *(NETWORK, "<routes>" + "".join(f'<vType id="{number}"/>' for number in range(100_001)) + "</routes>", ""),
+        "vType: type '100000' is not allowed; allowed: at most 100,000 vehicle types",
+    ),
     "no vehicles": (NETWORK, "<routes/>", "", "road.sumocfg: its route and additional files have no vehicle"),
     "configuration that is no XML": (NETWORK, ROUTES, "<configuration>", "road.sumocfg: cannot be read"),
 }

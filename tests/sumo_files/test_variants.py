@@ -73,9 +73,11 @@ def test_included_types_are_changed_and_weights_of_edges_are_kept(tmp_path: Path
     mine.mkdir()
     new.mkdir()
     (mine / "types.xml").write_text('<routes><vType id="car" tau="1"/></routes>')
-    (mine / "w.xml").write_text('<m><edge id="a" traveltime="9"/></m>')
+    (mine / "w.xml").write_text('<weights><edge id="a" traveltime="9"/></weights>')
     routes = '<routes><include href="types.xml"/><vehicle id="v" type="car"/></routes>'
     files = read_sumo_files(configuration(mine, '<w value="w.xml"/>', routes=routes))
     found = read_sumo_files(write_variant(files, {"car": {"tau": "1.5"}}, 1.0, new / "other.sumocfg"))
     assert found.types["car"] == {"id": "car", "tau": "1.5"}
-    assert [path.read_text() for path in found.weight_files] == ['<m><edge id="a" traveltime="9"></edge></m>']
+    assert [path.read_text() for path in found.weight_files] == [
+        '<weights><edge id="a" traveltime="9"></edge></weights>'
+    ]

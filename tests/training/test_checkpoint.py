@@ -11,8 +11,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save
 
-from unjam.controller.file import sha256_of
 from unjam.errors import DiskError, InputError
+from unjam.files import sha256_of
 from unjam.training import run_folder
 from unjam.training.run_folder import load_checkpoint, save_checkpoint
 

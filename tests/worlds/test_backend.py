@@ -15,7 +15,6 @@ import torch
 
 import unjam
 from tests.test_architecture import EXAMPLES
-from unjam.controller.file import sha256_of_file
 from unjam.drivers import IDM, Constant, Human, PISaturation
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.road_experts import Cruise
@@ -23,6 +22,7 @@ from unjam.drivers.safety import SafetyFilter
 from unjam.drivers.user_driver import FileReference
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import InputError, UnjamError
+from unjam.files import sha256_of_file
 from unjam.measures.feasibility import feasibility
 from unjam.measures.metrics import measure
 from unjam.physics.arrays import Array

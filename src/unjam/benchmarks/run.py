@@ -21,12 +21,12 @@ from unjam.benchmarks.result import (
 from unjam.benchmarks.suites import DEFAULT_SUITE, Suite, find_suite
 from unjam.controller import DEFAULT_DRIVER, controller_hash, controller_path, make_driver
 from unjam.controller.domain import SB3_SUFFIX, control_step_note
-from unjam.controller.file import read_controller, sha256_of, sha256_of_file
+from unjam.controller.file import read_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable, user_code_recipes
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, invalid_value, one_line, unknown_name
-from unjam.files import make_folder, to_json
+from unjam.files import make_folder, sha256_of, sha256_of_file, to_json
 from unjam.manifest import manifest, without_folders
 from unjam.measures.gain import EpisodeRows
 from unjam.measures.metric_table import HUMAN_LABEL

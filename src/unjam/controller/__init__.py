@@ -14,7 +14,6 @@ from unjam.controller.file import (
     load_controller,
     packaged_file,
     packaged_names,
-    sha256_of,
 )
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import DRIVERS, driver_from_name
@@ -22,7 +21,7 @@ from unjam.drivers.user_driver import DriverLike, as_driver, is_file_reference
 from unjam.drivers.wrappers import MixedDriver
 from unjam.errors import invalid_value
 from unjam.file_names import split_names
-from unjam.files import PACKAGED_PREFIX
+from unjam.files import PACKAGED_PREFIX, sha256_of
 
 __all__ = ["controller_bytes", "load_controller", "make_driver", "make_expert", "packaged_file", "packaged_names"]
 

@@ -1,6 +1,5 @@
 """Writing and reading a `.unjam` file: archive, manifest and recorded sample, and the checks of them."""
 
-import hashlib
 import io
 import os
 import stat
@@ -20,7 +19,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import COMMON_FIELDS, FIELD_SIZES, LocalState
 from unjam.drivers.registry import driver_from_recipe, driver_recipe, user_code_recipes
 from unjam.errors import InputError, invalid_value, unknown_name
-from unjam.files import PACKAGED_PREFIX, UNREADABLE_ERRORS, atomic_write, to_json
+from unjam.files import PACKAGED_PREFIX, UNREADABLE_ERRORS, atomic_write, sha256_of, to_json
 from unjam.physics.arrays import Floats
 from unjam.trust import check_trusted
 from unjam.user_code import read_code
@@ -155,17 +154,6 @@ def packaged_file(name: str) -> Path:
         known = [f"{PACKAGED_PREFIX}{name}" for name in packaged_names()]
         raise unknown_name("driver", f"{PACKAGED_PREFIX}{name}", known)
     return PACKAGED_FOLDER / f"{name}{SUFFIX}"
-
-
-def sha256_of(part: bytes) -> str:
-    """Return the SHA-256 of a part, as in the manifest."""
-    return hashlib.sha256(part).hexdigest()
-
-
-def sha256_of_file(path: Path) -> str:
-    """Return the SHA-256 of a file, without reading it into memory as a whole."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _check_hashes(name: str, hashes: dict[str, str], parts: dict[str, bytes]) -> None:

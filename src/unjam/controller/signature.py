@@ -5,7 +5,6 @@ sorted by name and including the manifest. This module loads `cryptography`, so 
 signatures.
 """
 
-import hashlib
 import json
 import os
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from unjam.errors import InputError, invalid_value, missing_package_error
-from unjam.files import check_parent_folder, remove, to_json, write_new_file
+from unjam.files import check_parent_folder, remove, sha256_of, to_json, write_new_file
 
 try:
     from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -118,7 +117,7 @@ def is_weak_point(point: bytes) -> bool:
 
 def fingerprint_of(key: Ed25519PublicKey) -> str:
     """Return the SHA-256 of a public key in DER: `openssl pkey -pubin -outform DER | sha256sum`."""
-    return hashlib.sha256(key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)).hexdigest()
+    return sha256_of(key.public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo))
 
 
 def signature_of(parts: dict[str, bytes], key: Ed25519PrivateKey) -> bytes:
@@ -160,7 +159,7 @@ def forged_error(name: str) -> InputError:
 
 
 def _signed_message(parts: dict[str, bytes], public_key: bytes) -> bytes:
-    hashes = [f"{hashlib.sha256(part).hexdigest()}  {name}" for name, part in sorted(parts.items())]
+    hashes = [f"{sha256_of(part)}  {name}" for name, part in sorted(parts.items())]
     return "".join(f"{line}\n" for line in (SIGNATURE_HEADER, f"public key {public_key.hex()}", *hashes)).encode()
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from unjam.controller import file as archive
 from unjam.controller.certificate import describe_worst_cases, make_certificate
 from unjam.controller.domain import road_description
-from unjam.controller.file import Controller, Floats, read_controller, read_sample, replay_states, sha256_of
+from unjam.controller.file import Controller, Floats, read_controller, read_sample, replay_states
 from unjam.controller.graph import check_graph, run_graph
 from unjam.controller.manifest import PROVENANCE_ENTRIES, driver_interface, first_difference, short_text
 from unjam.drivers.check import random_state
@@ -24,7 +24,7 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_recipe, user_code_recipes
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError, MissingPartError
-from unjam.files import parse_json, reject_damaged, to_json
+from unjam.files import parse_json, reject_damaged, sha256_of, to_json
 
 REPLAY_TOLERANCE = 1e-9
 """allowed difference between recorded accelerations and those on this machine [m/s2]"""

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 from unjam.errors import InputError
+from unjam.sandbox import limit_memory_growth
 from unjam.sumo_files.reader import BrokenFileError, XmlAttributes, parse_xml
 
 HEAD_BYTES = 1 << 16
@@ -23,6 +24,8 @@ MAX_TEXT_BYTES, MAX_CELLS, MAX_FCD_VEHICLES = 1 << 30, 1 << 27, 1 << 23
 FCD output as XML; each takes about five times as much memory"""
 MAX_BINARY_LENGTH = 16
 """longest value of a column of equally long binary values in Parquet that is read [bytes], as decimal numbers have"""
+MAX_PARQUET_MEMORY = 8 << 30
+"""maximum memory that a Parquet file takes while it is read [bytes]"""
 HEAD_LINES = 20
 """first lines of a table, among which its header is"""
 RECONSTRUCTED_COLUMN_ORDER = (
@@ -40,6 +43,8 @@ HEADERLESS_COLUMNS = {len(names): list(names) for names in (RECONSTRUCTED_COLUMN
 """by their number"""
 FCD_ATTRIBUTES = ("id", "speed", "leaderID", "leaderSpeed", "leaderGap")
 """attributes of a vehicle in SUMO's FCD output that are read; as CSV, their names begin with `vehicle_`"""
+FCD_PART_ROWS = 1 << 16
+"""number of `vehicle` elements that are converted at a time"""
 ALLOWED_FILES = "CSV with a line for each row, Parquet, or SUMO's FCD output"
 
 
@@ -65,6 +70,8 @@ def read_table(path: Path) -> pd.DataFrame:
             return _read_csv(path, file, head)
     except (ValueError, NotImplementedError, OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
+    except MemoryError:
+        raise _refused_file(path, f"it takes more than {MAX_PARQUET_MEMORY / 2**30:g} GiB of memory") from None
     except BrokenFileError as error:
         raise InputError(str(error)) from None
 
@@ -96,21 +103,30 @@ def _read_parquet(path: Path) -> pd.DataFrame:
     flat = [schema.column(number) for number in range(len(schema))]
     flat = [each for each in flat if each.path == each.name and each.max_repetition_level == 0]
     flat = [each for each in flat if each.length <= MAX_BINARY_LENGTH]
-    texts = {each.name for each in flat if each.physical_type == "BYTE_ARRAY"}
-    _check_cells(path, metadata.num_rows * metadata.num_columns)
+    names, texts = {each.name for each in flat}, {each.name for each in flat if each.physical_type == "BYTE_ARRAY"}
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-    chunks = [group.column(number) for group in groups for number in range(metadata.num_columns)]
-    _check_text_bytes(path, sum(each.total_uncompressed_size for each in chunks if each.path_in_schema in texts))
-    with ParquetFile(path, read_dictionary=sorted(texts)) as file:
-        table = file.read([each.name for each in flat])
-    dictionaries = [number for number, kind in enumerate(table.schema.types) if pa.types.is_dictionary(kind)]
-    arrays = [array for number in dictionaries for array in table.column(number).chunks]
-    lengths = (call_function("binary_length", [each.dictionary]).take(each.indices) for each in arrays)
-    _check_text_bytes(path, sum(each.sum().as_py() or 0 for each in lengths))
-    for number in dictionaries:
-        kind = table.schema.field(number).type.value_type
-        table = table.set_column(number, table.column_names[number], table.column(number).cast(kind))
-    return table.to_pandas(ignore_metadata=True).assign(line=lambda frame: np.arange(len(frame)) + 2)
+    chunks = [(group, group.column(number)) for group in groups for number in range(metadata.num_columns)]
+    chunks = [(group, chunk) for group, chunk in chunks if chunk.path_in_schema in names]
+    has_same_rows = all(chunk.num_values == group.num_rows for group, chunk in chunks)
+    if not has_same_rows or sum(group.num_rows for group in groups) != metadata.num_rows:
+        raise _refused_file(path, "its numbers of rows contradict each other")
+    _check_cells(path, metadata.num_rows * metadata.num_columns)
+    text_bytes = sum(chunk.total_uncompressed_size for _, chunk in chunks if chunk.path_in_schema in texts)
+    _check_text_bytes(path, text_bytes)
+    total_bytes = sum(chunk.total_uncompressed_size for _, chunk in chunks)
+    _check_cells(path, (total_bytes - text_bytes) // MAX_BINARY_LENGTH)
+    # The data can unpack to more than the footer says.
+    with ParquetFile(path, read_dictionary=sorted(texts)) as file, limit_memory_growth(MAX_PARQUET_MEMORY):
+        table = file.read([each.name for each in flat], use_threads=False)
+        dictionaries = [number for number, kind in enumerate(table.schema.types) if pa.types.is_dictionary(kind)]
+        arrays = [array for number in dictionaries for array in table.column(number).chunks]
+        lengths = (call_function("binary_length", [each.dictionary]).take(each.indices) for each in arrays)
+        _check_text_bytes(path, sum(each.sum().as_py() or 0 for each in lengths))
+        for number in dictionaries:
+            kind = table.schema.field(number).type.value_type
+            table = table.set_column(number, table.column_names[number], table.column(number).cast(kind))
+        frame = table.to_pandas(ignore_metadata=True, use_threads=False)
+    return frame.assign(line=np.arange(len(frame)) + 2)
 
 
 def _check_cells(path: Path, cells: int) -> None:
@@ -139,23 +155,28 @@ def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     if b"<fcd-export" not in head:
         raise _refused_file(path, "it is XML, but not SUMO's FCD output")
     parser, time = expat.ParserCreate(), ""
-    columns = {"timestep_time": list[Any](), **{f"vehicle_{name}": list[Any]() for name in FCD_ATTRIBUTES}, "line": []}
+    names = ["timestep_time", *(f"vehicle_{name}" for name in FCD_ATTRIBUTES)]
+    rows, parts = list[tuple[Any, ...]](), list[pd.DataFrame]()
+
+    def store_rows() -> None:  # as columns, which take a tenth of the memory
+        parts.append(pd.DataFrame(rows, columns=[*names, "line"]))
+        rows.clear()
 
     def on_start(tag: str, attributes: XmlAttributes) -> None:
         nonlocal time
         if tag == "timestep":
             time = attributes.get("time", "")
         elif tag == "vehicle":
-            if len(columns["line"]) == MAX_FCD_VEHICLES:
+            if len(parts) * FCD_PART_ROWS + len(rows) == MAX_FCD_VEHICLES:
                 raise _refused_file(path, f"it has more than {MAX_FCD_VEHICLES:,} elements 'vehicle'")
-            row = (time, *map(attributes.get, FCD_ATTRIBUTES), parser.CurrentLineNumber)
-            for column, value in zip(columns.values(), row, strict=True):
-                column.append(value)
+            rows.append((time, *map(attributes.get, FCD_ATTRIBUTES), parser.CurrentLineNumber))
+            if len(rows) == FCD_PART_ROWS:
+                store_rows()
 
     parser.StartElementHandler = on_start
     parse_xml(path, parser, iter(lambda: file.read(HEAD_BYTES), b""))
-    known = {name: column for name, column in columns.items() if any(value is not None for value in column)}
-    return pd.DataFrame(known)
+    store_rows()
+    return pd.concat(parts, ignore_index=True).dropna(axis="columns", how="all")
 
 
 def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:

@@ -13,7 +13,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
-from unjam.errors import one_line
+from unjam.errors import one_line, printable
 from unjam.reports.results import PlotEpisode, seconds_by_part
 
 SPEED_COLORMAP = "viridis"
@@ -34,6 +34,7 @@ MAX_PLOT_TIMES = 600
 PLOT_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
+    "text.parse_math": False,  # names of drivers may have dollar signs
     "text.usetex": False,  # in a program, a matplotlibrc could enable LaTeX, which runs code
     "axes.edgecolor": MUTED_COLOR,
     "axes.labelcolor": TEXT_COLOR,
@@ -75,7 +76,7 @@ def svg_bytes(figure: Figure) -> bytes:
     return re.sub(
         rb'(?<=data:image/png;base64,)[^"]+',
         lambda match: base64.b64encode(_reduce_colors(base64.b64decode(match[0]))),
-        content.getvalue(),
+        printable(content.getvalue().decode()).encode(),  # labels are in its comments, too
     )
 
 

@@ -64,17 +64,19 @@ def _damaged_folder(results: Sequence[Results]) -> Path:
 
 
 def render_template(template: str, **values: Any) -> str:
-    """Return a page of the folder `page/` as text, with common style and script; values are escaped and `printable`."""
+    """Return a page of the folder `page/` as `printable` text, with common style and script; values are escaped.
+
+    Values in figures, JSON and addresses are encoded, and must be printable before.
+    """
     environment = Environment(
         loader=PackageLoader("unjam.reports", "page"),
         autoescape=True,
-        finalize=lambda value: value if hasattr(value, "__html__") else printable(str(value)),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     common = {"version": __version__, "style": _page_file("report.css"), "downloads": _page_file("downloads.js")}
-    return environment.get_template(template).render(**common, **values)
+    return printable(environment.get_template(template).render(**common, **values))
 
 
 def _page_file(name: str) -> Markup:
@@ -179,7 +181,7 @@ def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
         "colors": figures.color_table(),
         "vehicle_length": VEHICLE_LENGTH,
         "no_value": REPLAY_NAN,
-        "drivers": [{"name": episode.driver, **_replay_track(episode, step, frames)} for episode in panels],
+        "drivers": [{"name": printable(episode.driver), **_replay_track(episode, step, frames)} for episode in panels],
     }
 
 

@@ -4,7 +4,6 @@ import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load
 
 from unjam.errors import InputError, resume_hint
-from unjam.files import INVALID_DATA_ERRORS, read_json_lines
+from unjam.files import INVALID_DATA_ERRORS, read_json_lines, sha256_of
 from unjam.folders import reject_special_files
 from unjam.measures.metrics import METRICS
 from unjam.worlds.record import Episode, Floats
@@ -149,7 +148,7 @@ def read_results(folder: Path) -> Results:
     metadata, rows = read_evaluation(folder)
     try:
         packed = (folder / PLOT_EPISODES_FILE).read_bytes()
-        if metadata.pop(PLOT_EPISODES_HASH, None) not in (None, sha256(packed).hexdigest()):
+        if metadata.pop(PLOT_EPISODES_HASH, None) not in (None, sha256_of(packed)):
             reason = f"{PLOT_EPISODES_FILE} does not belong to {EVALUATION_FILE}"
             raise InputError(f"report: {str(folder)!r}: {reason}; allowed: repeat the command that wrote them")
         stored, episodes = load(packed), {}

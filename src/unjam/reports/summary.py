@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from unjam.errors import printable
 from unjam.measures.effect import Effect, effects_by_driver
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, estimate_cell
@@ -239,9 +240,9 @@ def episodes_as_csv(columns: Sequence[ReportColumn]) -> str:
 
 
 def csv_text(table: pd.DataFrame) -> str:
-    """Return a table as CSV; texts that a spreadsheet would calculate begin with an apostrophe."""
+    """Return a table as `printable` CSV; texts that a spreadsheet would calculate begin with an apostrophe."""
 
     def protect(value: Any) -> Any:
         return f"'{value}" if isinstance(value, str) and value[:1] in FORMULA_STARTS else value
 
-    return table.rename(columns=protect).map(protect).to_csv(index=False, lineterminator="\n")
+    return printable(table.rename(columns=protect).map(protect).to_csv(index=False, lineterminator="\n"))

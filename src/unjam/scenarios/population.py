@@ -4,7 +4,6 @@ A population is a file `NAME.json`; its residual network, if it has one, is `NAM
 Nothing in it is ever executed.
 """
 
-import hashlib
 import json
 import os
 from dataclasses import asdict, dataclass, field
@@ -20,7 +19,7 @@ from safetensors.numpy import load, save
 from unjam import __version__
 from unjam.drivers.network import Network, network_weights
 from unjam.errors import InputError, invalid_value, unknown_name
-from unjam.files import INVALID_DATA_ERRORS, PACKAGED_PREFIX, atomic_write, to_json
+from unjam.files import INVALID_DATA_ERRORS, PACKAGED_PREFIX, atomic_write, sha256_of, to_json
 from unjam.parameters import build_dataclass
 from unjam.physics.arrays import Array, clip, namespace
 from unjam.physics.idm import IDM_PARAMETER_NAMES, IDMParameters
@@ -101,7 +100,7 @@ def write_population(path: Path, population: Population) -> None:
     if population.residual is not None:
         weights = save(network_weights(population.residual))
         weights_file = path.with_suffix(".safetensors")
-        sha256 = hashlib.sha256(weights).hexdigest()
+        sha256 = sha256_of(weights)
         residual = {"file": weights_file.name, "sha256": sha256, "authority": population.residual.authority}
         atomic_write(weights_file, weights)
     details = population.details or ({},) * len(population.drivers)
@@ -181,7 +180,7 @@ def _read_residual(path: Path, entry: dict[str, Any] | None) -> Network | None:
     if weights_file.stat().st_size > MAX_POPULATION_BYTES:
         raise InputError(f"population {path.name}: its residual is too large")
     weights = weights_file.read_bytes()
-    if hashlib.sha256(weights).hexdigest() != entry["sha256"]:
+    if sha256_of(weights) != entry["sha256"]:
         raise InputError(f"population {path.name}: damaged: {weights_file.name} does not have the hash it names")
     arrays = load(weights)
     layers = ((arrays[f"{index}.weight"], arrays[f"{index}.bias"]) for index in range(len(arrays) // 2))

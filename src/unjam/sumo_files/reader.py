@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 from xml.parsers import expat
-from xml.sax.saxutils import escape, quoteattr
+from xml.sax.saxutils import quoteattr
 
 XML_CHUNK_BYTES, MAX_UNPACKED_BYTES = 1 << 18, 1 << 22
 """maximum number of bytes that are read, and that are unpacked, at a time"""
@@ -35,11 +35,14 @@ routeProbReroute parkingAreaReroute stationReroute overtakingReroute viaProbRero
 busStop trainStop containerStop chargingStation overheadWire overheadWireClamp overheadWireSegment tractionSubstation
 poly poi tlLogic phase condition assignment function WAUT wautJunction wautSwitch railSignalConstraints predecessor
 insertionPredecessor insertionOrder foeInsertion bidiPredecessor deadlock conflict ptLine ptLines preference
-restriction stopOffset neigh connection
+restriction stopOffset neigh connection multiLaneAreaDetector edgeFollowDetector additionals pois polys vss weights
+edgedata
 """
 SUMO_ELEMENTS = set(_ELEMENTS.split())
 """elements of SUMO's demand, additional files and weights of edges, and the outermost elements of such files"""
 FOLLOWING_MODEL_PREFIX = "carFollowing-"
+NETWORK_ELEMENT = "net"
+"""outermost element of a network, of which all elements are read; included files are no networks"""
 NULL_FILE = "NUL"
 """name of a file that SUMO never creates"""
 FILE_ATTRIBUTES = ("file", "output", "dest", "href")
@@ -97,14 +100,8 @@ class XmlReader:
     """
 
     def __init__(
-        self,
-        handlers: XmlHandlers,
-        out: IO[str] | None = None,
-        type_changes: dict[str, XmlAttributes] | None = None,
-        folder: Path | None = None,
+        self, handlers: XmlHandlers, out: IO[str] | None = None, type_changes: dict[str, XmlAttributes] | None = None
     ) -> None:
-        self._folder = folder
-        """files outside it may contain only elements of SUMO; None: no file is outside"""
         self._handlers, self._type_changes = handlers, type_changes or {}
         self._write = out.write if out else None
         self._dropped_depth = 0
@@ -138,11 +135,9 @@ class XmlReader:
         self._parsers.append(parser)
         parser.buffer_text = True
         parser.XmlDeclHandler = self._on_declaration
-        parser.StartElementHandler = self._on_start
+        parser.StartElementHandler = self._on_outermost
         if self._write is not None:
             parser.EndElementHandler, parser.CharacterDataHandler = self._on_end, self._on_text
-        if self._folder is not None and not path.resolve().is_relative_to(self._folder):
-            parser.StartElementHandler, parser.CharacterDataHandler = self._on_foreign_start, self._on_foreign_text
         self.needs_copy |= any(character in str(path) for character in ",; \t$%")
         parse_xml(path, parser, self._chunks(path))
         self._open_files.pop()
@@ -183,19 +178,22 @@ class XmlReader:
         elif self._write is not None:
             self._write_start(tag, attributes)
 
-    def _on_foreign_start(self, tag: str, attributes: XmlAttributes) -> None:
-        """Refuse elements that no file of SUMO has: copies of the files are passed on to others."""
-        if tag not in SUMO_ELEMENTS and not tag.startswith(FOLLOWING_MODEL_PREFIX):
-            self._refuse_foreign(f"element {tag!r}")
+    def _on_outermost(self, tag: str, attributes: XmlAttributes) -> None:
+        """Refuse a file that is none of SUMO: a configuration can name any file, and copies are passed on to others."""
+        is_network = tag == NETWORK_ELEMENT and len(self._open_files) == 1
+        if not is_network and not is_sumo_element(tag):
+            allowed = "an element of SUMO, such as <additional> or <routes>"
+            raise BrokenFileError(f"{self._open_files[-1].name}: begins with <{tag[:60]}>; allowed: {allowed}")
+        self._parsers[-1].StartElementHandler = self._on_start if is_network else self._on_inner
         self._on_start(tag, attributes)
 
-    def _on_foreign_text(self, text: str) -> None:
-        if text.strip():
-            self._refuse_foreign("text")
-
-    def _refuse_foreign(self, content: str) -> None:
-        allowed = "elements of SUMO, as the file lies outside the folder of the configuration"
-        raise BrokenFileError(f"{self._open_files[-1].name}: {content} is not allowed; allowed: {allowed}")
+    def _on_inner(self, tag: str, attributes: XmlAttributes) -> None:
+        """Leave out elements that SUMO does not have, with their content."""
+        if self._dropped_depth or is_sumo_element(tag):
+            self._on_start(tag, attributes)
+        else:
+            self._record_dropped(f"element {tag[:60]}")
+            self._drop_content()
 
     def _process_element(self, tag: str, attributes: XmlAttributes) -> None:
         """Write the harmless parts of an element that may name a file; read the file that it includes."""
@@ -237,8 +235,8 @@ class XmlReader:
             self._parsers[-1].EndElementHandler = None
 
     def _on_text(self, text: str) -> None:
-        if self._write is not None and not self._dropped_depth:
-            self._write(escape(text))
+        if self._write is not None and text.isspace():  # SUMO reads no text
+            self._write(text)
 
     def _write_start(self, tag: str, attributes: XmlAttributes) -> None:
         if self._write is not None:
@@ -286,6 +284,11 @@ class XmlReader:
     def _record_dropped(self, name: str) -> None:
         self.dropped_items.add(name)
         self.needs_copy = True
+
+
+def is_sumo_element(tag: str) -> bool:
+    """Return whether SUMO's demand, additional files or weights of edges have such an element."""
+    return tag in SUMO_ELEMENTS or tag.startswith(FOLLOWING_MODEL_PREFIX)
 
 
 def is_harmless_attribute(name: str) -> bool:

@@ -24,6 +24,7 @@ if __name__ == "__main__":  # packages without their own code, which would impor
 
 from unjam.sumo_files.reader import (  # noqa: E402
     ALLOWED_VARIABLES,
+    NETWORK_ELEMENT,
     SUBSTITUTED_VARIABLES,
     UNKNOWN_VARIABLE,
     BrokenFileError,
@@ -72,6 +73,8 @@ READ_ELEMENTS = (
     *(f"carFollowing-{name}" for name in CAR_FOLLOWING_MODELS),
 )
 """elements with content that `_Demand` needs, and the ends of some"""
+MAX_VEHICLE_TYPES = 100_000
+"""maximum number of vehicle types, of which unjam makes others for CAVs"""
 TRUE_VALUES = ("true", "t", "yes", "on", "1", "x")
 """texts that SUMO accepts as true"""
 
@@ -93,9 +96,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
     files = [network, *additional, *routes, *weights]
     for file in files:
         check_file_exists(file)
-    folder = path.parent.resolve()
-    # No copy of the network is passed on.
-    readers = {file: XmlReader(demand.handlers(), folder=None if file == network else folder) for file in files}
+    readers = {file: XmlReader(demand.handlers()) for file in files}
     for file, reader in readers.items():
         reader.read(file)
         stamps = {**reader.sources, **stamps}
@@ -217,7 +218,7 @@ def _parse_time(text: str) -> float:
 
 def _check_network(path: Path, reader: "XmlReader") -> None:
     """Raise `BrokenFileError` unless it is a network with a version, without which SUMO would crash."""
-    if reader.root != "net":
+    if reader.root != NETWORK_ELEMENT:
         raise BrokenFileError(f"{path.name}: is not a SUMO network: it begins with <{reader.root}>")
     if not reader.version:
         raise BrokenFileError(f"{path.name}: the network has no version; convert it: netconvert -s {path.name} -o")
@@ -270,7 +271,12 @@ class _Demand:
             case "vType":
                 name = attributes.get("refId") or attributes.get("id", "")
                 self._current_distribution.add(name)
+                if not name:  # SUMO would read millions of them and report each
+                    raise BrokenFileError("vType: an element without id is not allowed; allowed: an id for each type")
                 if "refId" not in attributes:
+                    if len(self.types) == MAX_VEHICLE_TYPES:
+                        limit = f"at most {MAX_VEHICLE_TYPES:,} vehicle types"
+                        raise BrokenFileError(f"vType: type {name[:60]!r} is not allowed; allowed: {limit}")
                     self._current_type, self.types[name], self.type_parameters[name] = name, dict(attributes), {}
             case "/vType":
                 self._current_type = ""

@@ -17,7 +17,6 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.samplers import TPESampler
 from optuna.trial import TrialState
 
-from unjam.controller.file import sha256_of_file
 from unjam.errors import (
     EpisodeError,
     InputError,
@@ -27,7 +26,7 @@ from unjam.errors import (
     spelling_hint,
     unknown_name,
 )
-from unjam.files import atomic_write, to_json
+from unjam.files import atomic_write, sha256_of_file, to_json
 from unjam.manifest import manifest
 from unjam.measures.detectors import Agreement, Measurement, aggregate_passages, compute_agreement, read_detectors
 from unjam.measures.metrics import UNBOUNDED

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
-from hashlib import sha256
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,7 +20,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_names, unique_label
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, error_from_name, invalid_value, unknown_name
-from unjam.files import atomic_write, make_folder, remove_leftovers, to_json
+from unjam.files import atomic_write, make_folder, remove_leftovers, sha256_of, to_json
 from unjam.manifest import manifest
 from unjam.measures.effect import effects_by_driver
 from unjam.measures.feasibility import feasibility_by_driver
@@ -280,7 +279,7 @@ def save_evaluation(folder: Path, evaluation: Evaluation, metadata: dict[str, An
     }
     entries = [{"driver": each.driver, **{name: getattr(each, name) for name in EPISODE_ENTRIES}} for each in episodes]
     packed = save(arrays)
-    document = {**metadata, "rows": rows, "plot_episodes": entries, PLOT_EPISODES_HASH: sha256(packed).hexdigest()}
+    document = {**metadata, "rows": rows, "plot_episodes": entries, PLOT_EPISODES_HASH: sha256_of(packed)}
     atomic_write(folder / PLOT_EPISODES_FILE, packed)
     atomic_write(folder / "episodes.parquet", rows_to_frame(evaluation.rows).to_parquet())
     atomic_write(folder / EVALUATION_FILE, to_json(document, indent=1))

@@ -8,11 +8,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from unjam.controller.file import sha256_of, sha256_of_file
 from unjam.drivers.registry import driver_recipe
 from unjam.drivers.user_driver import FileReference, is_file_reference
 from unjam.errors import InputError, invalid_value
-from unjam.files import to_json
+from unjam.files import sha256_of, sha256_of_file, to_json
 from unjam.kernels import kernel_info
 from unjam.manifest import package_versions
 from unjam.parameters import flatten_keys

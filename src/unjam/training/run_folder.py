@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import tomli_w
 
 from unjam.controller import make_driver
-from unjam.controller.file import sha256_of
 from unjam.drivers.check import PROBE_ROWS, check_row_independence, probe_state
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
@@ -32,6 +31,7 @@ from unjam.files import (
     remove,
     remove_if_empty,
     remove_leftovers,
+    sha256_of,
     to_json,
 )
 from unjam.folders import reject_special_files
@@ -333,7 +333,8 @@ def check_run_files(folder: Path, config: RunConfig, command: str) -> None:
 
 def _remove_old_checkpoints(folder: Path) -> None:
     """Remove all but the newest two checkpoints, and incomplete ones."""
-    for old in [*_checkpoint_files(folder)[:-MAX_CHECKPOINTS], *filter(is_leftover, folder.glob(".*"))]:
+    remove_leftovers(folder)
+    for old in _checkpoint_files(folder)[:-MAX_CHECKPOINTS]:
         with suppress(DiskError):
             remove(old)
 

@@ -13,6 +13,7 @@ from unjam.drivers.command import Command
 from unjam.drivers.local_state import COMMON_FIELDS, FIELD_SIZES, LocalState
 from unjam.drivers.user_driver import object_reference
 from unjam.errors import InputError, UnjamError
+from unjam.processes import ending_forks
 from unjam.scenarios.scenario import Scenario
 from unjam.user_code import USER_MODULE_PREFIX
 from unjam.worlds.audit import OVERRIDE_TOLERANCE
@@ -42,7 +43,8 @@ def call_backend(label: str, function: Callable[..., Any], *arguments: Any) -> A
     Errors of unjam itself, such as those of a driver, pass through.
     """
     try:
-        return function(*arguments)
+        with ending_forks():
+            return function(*arguments)
     except UnjamError:
         raise
     except (Exception, SystemExit) as error:

@@ -9,6 +9,7 @@ import numpy as np
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler, carry_over_memory, scalar_memory
 from unjam.drivers.residual import EXPERT_KEY
 from unjam.errors import InputError, RowError
+from unjam.processes import ending_forks
 from unjam.tree import map_leaves
 from unjam.worlds.world import DriverLog, ProgressCallback, RecordT, World
 
@@ -56,7 +57,9 @@ class DriveLoop:
                     decision = None
                     advance(None)
                 else:
-                    decision = decide(local_state(), self.memory, noise)
+                    state = local_state()
+                    with ending_forks():
+                        decision = decide(state, self.memory, noise)
                     self.memory = decision.memory
                     advance(decision.command)
                 if world.remaining_rows is not None or world.entered_count > len(self.initial_memories):

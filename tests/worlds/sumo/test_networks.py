@@ -14,6 +14,7 @@ import numpy as np
 import platformdirs
 import pytest
 
+from unjam import files
 from unjam.errors import DiskError, EpisodeError, MissingPartError
 from unjam.files import is_leftover
 from unjam.scenarios import Ring
@@ -270,6 +271,6 @@ def test_leftovers_are_removed_when_they_are_old_also_by_several_at_once(
         gone.unlink(missing_ok=True)
         return is_leftover(path)
 
-    monkeypatch.setattr(networks, "is_leftover", listed)
+    monkeypatch.setattr(files, "is_leftover", listed)
     made = network_file(road_of(230))
     assert files_in(cache) == {made, new}

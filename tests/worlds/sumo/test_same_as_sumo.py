@@ -153,7 +153,7 @@ FORMS: dict[str, tuple[Files, str]] = {
     "travel times of edges": (
         {
             "r.xml": f"<routes>{TYPE}{TRIPS}</routes>",
-            "w.xml": '<m><interval begin="0" end="999"><edge id="bc" traveltime="900"/></interval></m>',
+            "w.xml": '<weights><interval begin="0" end="999"><edge id="bc" traveltime="900"/></interval></weights>',
         },
         '<route-files value="r.xml"/><weight-files value="w.xml"/>',
     ),

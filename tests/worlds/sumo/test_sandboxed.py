@@ -1,6 +1,8 @@
 """Programs that drive on users' networks: SUMO is sandboxed, the driver is not."""
 
 import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -74,6 +76,34 @@ def test_a_drivers_function_runs_in_its_own_process(road: Scenario, tmp_path: Pa
     result = drive(road.file, mine, 1, scenario_options={"penetration_rate": 0.5, "horizon": 5})  # pyright: ignore
     assert [row["status"] for rows in result.rows.values() for row in rows] == ["completed"]
     assert set(seen) == {os.getpid()}
+
+
+FORKING = """
+import os, sys
+from unjam import run_episode
+from unjam.scenarios import make_scenario
+codes = []
+def forking(state):
+    if not codes:
+        child = os.fork()
+        if child == 0:
+            sys.exit(3)
+        codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    return 0 * state.speed
+if __name__ == "__main__":
+    options = {"penetration_rate": 0.5, "horizon": 5}
+    print(run_episode(make_scenario(sys.argv[1], options), forking, 0).status, codes)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
+def test_a_fork_that_ends_in_a_driver_leaves_the_episode_to_its_parent(road: Scenario, tmp_path: Path) -> None:
+    program, file = tmp_path / "forking.py", tmp_path / "straight.sumocfg"
+    program.write_text(FORKING)
+    done = subprocess.run([sys.executable, program, file], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "completed [3]\n", done.stderr
+    in_worker = drive(str(file), f"{program}:forking", 1, scenario_options={"penetration_rate": 0.5, "horizon": 5})
+    assert [row["status"] for rows in in_worker.rows.values() for row in rows] == ["completed"]
 
 
 @pytest.mark.long

@@ -1,11 +1,9 @@
 """Network files for SUMO, made once for each content and cached; and SUMO's programs."""
 
 import errno
-import hashlib
 import os
 import shutil
 import subprocess
-import time
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
@@ -20,7 +18,7 @@ import numpy as np
 import platformdirs
 
 from unjam.errors import DISK_ERRNOS, DiskError, EpisodeError, MissingPartError, disk_error, invalid_value
-from unjam.files import atomic_write, is_leftover, make_folder, remove
+from unjam.files import atomic_write, make_folder, remove_leftovers, sha256_of
 from unjam.processes import PrivateFolder
 from unjam.scenarios.road import Edge, RoadNetwork
 from unjam.sumo_files import file_stamp, read_lanes
@@ -104,7 +102,7 @@ def network_file(network: RoadNetwork) -> Path:
         files["--connection-files", "road.con.xml"] = xml_document("connections", "connection", connections)
     options = ["--no-turnarounds", "true", *([] if network.has_internal_links else ["--no-internal-links", "true"])]
     content = "\n".join([sumo_version(), *options, *files.values()])
-    name = hashlib.sha256(content.encode()).hexdigest()[:24]
+    name = sha256_of(content.encode())[:24]
     target = cache_folder() / "networks" / f"{name}.net.xml"
     if is_intact(target):
         return target
@@ -112,10 +110,7 @@ def network_file(network: RoadNetwork) -> Path:
         make_folder(target.parent)
     except DiskError as error:
         raise DiskError(f"{error}; UNJAM_CACHE can name another folder") from None
-    for leftover in filter(is_leftover, target.parent.glob(".*")):  # of processes that were killed
-        with suppress(FileNotFoundError, DiskError):  # another process has just removed it
-            if time.time() - leftover.lstat().st_mtime > STALE_FILE_SECONDS:
-                remove(leftover)
+    remove_leftovers(target.parent, min_age=STALE_FILE_SECONDS)
     try:
         with PrivateFolder() as folder:
             made = run_netconvert(files, options, Path(folder)).read_bytes()
@@ -201,7 +196,7 @@ def cache_folder() -> Path:
 
 def checksum_line(content: bytes) -> bytes:
     """Return the last line of a cached network: the hash of the lines before it."""
-    return f"<!-- sha256 {hashlib.sha256(content).hexdigest()} -->\n".encode()
+    return f"<!-- sha256 {sha256_of(content)} -->\n".encode()
 
 
 def is_intact(network: Path) -> bool:

@@ -75,7 +75,7 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
         with _process_starter_lock:
             starter = _process_starter(os.getpid())
         start = starter.submit(start_child, "unjam.worlds.sumo.sandboxed", TMPDIR=self._folder.name)
-        self._process = start.result()
+        self._process, self._owner = start.result(), os.getpid()
         self.episode_lock = Lock()
 
     @property
@@ -114,7 +114,9 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
         return unpack(_return_type(name), content["answer"], arrays)
 
     def close(self) -> None:
-        """End the process; may be called twice."""
+        """End the process; may be called twice, and has no effect in a fork of this one."""
+        if os.getpid() != self._owner:
+            return
         self._process.kill()
         self._process.communicate()
         self._folder.cleanup()
