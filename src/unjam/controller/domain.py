@@ -15,7 +15,10 @@ from unjam.files import UNREADABLE_ERRORS, parse_json
 from unjam.parameters import build_dataclass, flatten_keys
 from unjam.worlds.record import Episode
 
-IRRELEVANT_PARAMETERS = {"horizon", "emission_class", "remember_warmup", "population", "recordings", "begin", "window"}
+IRRELEVANT_PARAMETERS = {
+    *("horizon", "emission_class", "remember_warmup", "population"),
+    *("recordings", "begin", "window", "platoon"),
+}
 """scenario parameters that do not make it another scenario"""
 KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")
 """parameters that distinguish scenarios of a kind in a short description"""

@@ -74,7 +74,7 @@ class Effect:
             less = f"{format_share(self.delay_reduction)} less delay"
             time += f" ({less if self.travel_time.high < 0 else 'more delay'})"
         first = time if self.travel_time.count else f"mean speed {format_difference(self.speed, 2)} m/s"
-        loss = ": a loss, whatever the speed" if self.flow.high < 0 else ""
+        loss = ": a loss, whatever the speed" if self.travel_time.count and self.flow.high < 0 else ""
         return f"{first}, flow {format_difference(self.flow)} veh/h{loss}, fuel {format_difference(self.fuel, 1)} ml/km"
 
     @property

@@ -26,8 +26,10 @@ class RoadMetrics:
 
 CLOSED_ROAD = RoadMetrics(("mean_speed", FLOW_METRIC, "speed_std_fleet_steady"), ("time_to_dissolve",))
 OPEN_ROAD = RoadMetrics((TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC), ("mean_speed",))
-RECORDED_ROAD = RoadMetrics((POWER_FUEL_METRIC, FLOW_METRIC, "cav_mean_gap"), ("amplification",))
-COMMON_METRICS = ("return", "min_time_gap", "cav_max_braking", "collisions")
+RECORDED_ROAD = RoadMetrics(
+    (POWER_FUEL_METRIC, FLOW_METRIC, "cav_mean_gap"), ("amplification_long", "amplification_medium")
+)
+COMMON_METRICS = ("min_time_gap", "cav_max_braking", "human_max_braking", "collisions")
 
 
 def road_metrics(rows_by_driver: RowsByDriver) -> RoadMetrics:

@@ -160,7 +160,8 @@ class Recorded(Scenario):
         seconds, speeds = [each.seconds for each in found], np.concatenate([each.speed for each in found])
         parts = f"{len(found)} parts of {min(seconds):.0f} to" if len(found) > 1 else ""
         text = f"{parts} {max(seconds):.0f} s with speeds of {speeds.min():.1f} to {speeds.max():.1f} m/s"
-        return f"recordings: {path.name} has {text.strip()}"
+        same = "; episodes differ in the noise of human drivers alone" if len(found) == 1 and not self.window else ""
+        return f"recordings: {path.name} has {text.strip()}{same}"
 
     def stratum(self, index: int, count: int) -> Self:
         """Return this road with the recordings of one of `count` equal parts, if there are as many files."""
