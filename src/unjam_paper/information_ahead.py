@@ -138,7 +138,7 @@ def measure_test_value(
 
 
 def plan_behind_humans(scenarios: list[Recorded]) -> PlannedDriver:
-    """Return the plan of a CAV that knows the future of the human driver ahead, who does not react to it."""
+    """Return the plan of a CAV that knows the future of the vehicle ahead, which does not react to it."""
     human = make_driver(HUMAN_LABEL, TIME_STEP)
     speeds, gaps = list[Floats](), list[float]()
     for episode in run_batches([EpisodeTask(each, human, (0,)) for each in scenarios]):

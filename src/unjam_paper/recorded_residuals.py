@@ -26,8 +26,8 @@ TRAINING_CHANGES: dict[str, Any] = {
     **{"evaluation.validation_episodes": 64, "evaluation.validation_interval": 3},
     **{"evaluation.episodes": 2, "evaluation.baselines": []},
 }
-"""those of nine trials, one training each with up to 12,000,000 steps, whose validations fell least; windows are drawn
-from the training drives"""
+"""the best of nine trials in validation, one training each with up to 12,000,000 steps; windows are drawn from the
+training drives"""
 MODEL_RATIOS = {"without model": 0.0, "with model": 1.0}
 """model steps for each environment step, by the name of the residual"""
 

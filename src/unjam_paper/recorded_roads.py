@@ -42,6 +42,7 @@ from unjam_paper.recorded_tables import (
     SUMO_FUEL_PART,
     TEST_DRIVES_PART,
     TRAINING_DRIVES_PART,
+    WAVE_METRICS,
     assumptions_table,
     drivers_table,
     residuals_table,
@@ -86,8 +87,7 @@ SEARCH_SPACES: dict[str, dict[str, FloatDistribution]] = {
 DRIVE_METRICS = (
     *("fuel_by_power", "cav_fuel_by_power", "human_fuel_by_power", "cav_mean_gap", "cav_gap_95", "cav_max_gap"),
     *("min_time_gap", "share_short_time_gap", "time_behind_leader", "outflow_veh_per_h", "cav_max_braking"),
-    *("amplification_long", "amplification_medium", "amplification_short", "mean_abs_jerk", "filter_override_share"),
-    "feasibility",
+    *(*WAVE_METRICS, "mean_abs_jerk", "filter_override_share", "feasibility"),
 )
 IDEAL_CAR: dict[str, Any] = {"actuator": Actuator(), "safety": SafetyFilter(active=False), "actuation": "raw"}
 """the car of a plan"""

@@ -10,6 +10,7 @@ import pandas as pd
 from unjam.drivers.safety import Actuator
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
+from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate_on_shared_seeds
 from unjam.physics.arrays import Floats
 from unjam_paper.recorded_residuals import MODEL_RATIOS
@@ -38,7 +39,7 @@ DRIVE_SETTINGS: dict[str, dict[str, Any]] = {
     "CAV with a delay of 0.4 s and a lag of 0.6 s": {"actuator": Actuator(delay=0.4, lag=0.6)},
 }
 """assumptions on which the saving may depend, each changed alone"""
-WAVE_PERIODS = {"long": "periods above 60 s", "medium": "20 to 60 s", "short": "4 to 20 s"}
+WAVE_METRICS = ("amplification_long", "amplification_medium", "amplification_short")
 
 
 @dataclass(frozen=True)
@@ -108,11 +109,10 @@ def waves_table(folder: Path) -> pd.DataFrame:
     return pd.DataFrame(
         {
             "driver": label.partition(":")[0],
-            **{
-                f"amplification, {period}": f"{results.values(label, f'amplification_{name}').mean():.2f}"
-                for name, period in WAVE_PERIODS.items()
-            },
-            "hardest braking [m/s²]": f"{results.values(label, 'cav_max_braking').max():.1f}",
+            **{METRICS[name].label: f"{results.values(label, name).mean():.2f}" for name in WAVE_METRICS},
+            "hardest braking [m/s²]": NO_VALUE_TEXT
+            if label == HUMAN_LABEL
+            else f"{results.values(label, 'cav_max_braking').max():.1f}",
             "mean jerk [m/s³]": f"{results.values(label, 'mean_abs_jerk').mean():.2f}",
         }
         for label in results.groups()

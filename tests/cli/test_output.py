@@ -21,6 +21,7 @@ from unjam.measures.metric_table import choose_baseline
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate
 from unjam.parameters import parse_assignments
+from unjam.scenarios import Recorded
 from unjam.training.config import RunConfig
 
 USUAL: dict[str, Any] = {"status": "completed", "reason": "", **dict.fromkeys(METRICS, 1.0)}
@@ -106,6 +107,15 @@ def test_progress_has_the_time_that_is_left(
 
 def lines_of(messages: StringIO) -> list[str]:
     return messages.getvalue().splitlines()
+
+
+def test_human_drivers_are_to_be_compared_with_the_controller_of_the_road(
+    messages: StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["unjam", "drive", "recorded", "-d", "human"])
+    output.suggest_after_drive("recorded", ["human"], {}, "", controller=Recorded.controller)
+    suggestion = "compare with a controller: unjam drive recorded -d human -d unjam:recorded-tuned\n"
+    assert messages.getvalue() == suggestion
 
 
 def test_a_training_on_several_roads_is_resumed_as_a_whole(messages: StringIO) -> None:

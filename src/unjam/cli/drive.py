@@ -97,7 +97,7 @@ def drive_command(
         if result.report is not None:
             err_console.print(f"report: {result.report}")
         is_drawable = all(len(each.outline) or len(each.poses) for each in result.plot_episodes.values())
-        output.suggest_after_drive(scenario, driver, changes, reward, backend, is_drawable)
+        output.suggest_after_drive(scenario, driver, changes, reward, backend, is_drawable, road.controller)
     raise_failures(result)
 
 

@@ -24,8 +24,9 @@ def new_command(
     """
     with lock_new_folder(out):
         configuration = write_example_road(road, out)
+    names = sorted(path.name for path in out.glob("[!.]*"))
     if json:
-        print_json({"configuration": str(configuration), "files": sorted(path.name for path in out.iterdir())})
+        print_json({"configuration": str(configuration), "files": names})
         return
-    console.print(f"{out}: {', '.join(sorted(path.name for path in out.iterdir() if not path.name.startswith('.')))}")
+    console.print(f"{out}: {', '.join(names)}")
     print_next_command("drive there", "drive", configuration, "--penetration-rate", 0.1)

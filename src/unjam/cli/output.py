@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from unjam.cli.options import DEFAULT_WORKERS
+from unjam.controller import DEFAULT_DRIVER
 from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, MissingPartError, printable
 from unjam.files import to_json
@@ -174,13 +175,14 @@ def suggest_after_drive(
     reward: str,
     backend: str = "sumo",
     is_drawable: bool = True,
+    controller: str = DEFAULT_DRIVER,
 ) -> None:
     """Suggest the next command on the same road: compare with others, train on an expert, or watch if possible."""
     controllers = [driver for driver in drivers if driver != "human"]
     if "human" not in drivers:
         print_next_command("compare with human drivers", *_arguments_without_out(), "-d", "human")
     elif not controllers:
-        print_next_command("compare with a controller", *_arguments_without_out(), "-d", "unjam:best")
+        print_next_command("compare with a controller", *_arguments_without_out(), "-d", controller)
     elif all(driver.partition(":")[0] in DRIVERS for driver in controllers):
         command = "train", scenario, "--expert", controllers[-1], "--preset", "demo"
         options = setting_options(changes, "scenario_options.", reward, backend)

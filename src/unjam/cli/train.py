@@ -78,11 +78,11 @@ def train_command(
     from unjam.training.tensorboard import tensorboard_writer
     from unjam.training.train import train
 
-    if resume is None and (steps := planned_steps(config)) > STEP_OVERRUN_RATIO * config.steps:
-        err_console.print(f"note: iterations are complete: {steps:,} steps will be trained, not {config.steps:,}")
     if resume is None:
         with removing_if_empty(folder):  # a folder that is not empty is refused before the plan is printed
             make_new_folder(folder, f", or --resume {folder}")
+        if (steps := planned_steps(config)) > STEP_OVERRUN_RATIO * config.steps:
+            err_console.print(f"note: iterations are complete: {steps:,} steps will be trained, not {config.steps:,}")
     err_console.print(f"training {_plan_text(config)}, into {folder}", soft_wrap=True)
     write_curves = tensorboard_writer(folder) if tensorboard else None
     progress = nullcontext() if json else _TrainingProgress(config, folder)

@@ -1,6 +1,6 @@
 """Effect of CAVs on a road: paired differences to the human baseline on the same seeds."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import isfinite, nan
 from typing import Any
@@ -28,7 +28,8 @@ SMALLEST_EFFECT = 0.005
 """difference of travel time below which there is neither gain nor harm, as a share of the baseline's travel time"""
 
 TIME_METRIC, FLOW_METRIC, FUEL_METRIC = "travel_time", "outflow_veh_per_h", "fuel_ml_per_km"
-POWER_FUEL_METRIC = "fuel_by_power"
+POWER_FUEL_METRIC, LAG_METRIC = "fuel_by_power", "time_behind_leader"
+"""the second one is defined behind recorded vehicles alone"""
 TOO_SMALL = f"less than {100 * SMALLEST_EFFECT:g} %, which is too small to matter"
 """text for a difference of travel time below `SMALLEST_EFFECT`"""
 
@@ -109,6 +110,11 @@ def is_too_small(difference: Estimate, baseline_time: float) -> bool:
     return -limit < difference.low and difference.high < limit
 
 
+def is_measured(rows: Iterable[dict[str, Any]], metric: str) -> bool:
+    """Return whether any episode has a metric, which is not defined on all roads."""
+    return any(isfinite(row.get(metric, nan)) for row in rows)
+
+
 def effect_of(
     rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str, Any]], confidence: float = CONFIDENCE
 ) -> Effect:
@@ -119,8 +125,8 @@ def effect_of(
     seeds = {str(row["seed"]) for row in rows}
     baseline = [row for row in baseline if str(row["seed"]) in seeds]
     ran, baseline_ran = ([row for row in each if row["status"] != "failed"] for each in (rows, baseline))
-    is_recorded = any(isfinite(row.get("time_behind_leader", nan)) for row in ran)
-    metrics = TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC if is_recorded else FUEL_METRIC, HARD_BRAKING_METRIC
+    fuel_metric = POWER_FUEL_METRIC if is_measured(ran, LAG_METRIC) else FUEL_METRIC
+    metrics = TIME_METRIC, FLOW_METRIC, fuel_metric, HARD_BRAKING_METRIC
     differences = (paired_difference(rows, baseline, name, confidence) for name in metrics)
     teleports, baseline_teleports = (sum(row.get("teleports", 0) for row in each) for each in (rows, baseline))
     return Effect(

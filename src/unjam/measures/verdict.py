@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, nan
+from math import isfinite
 
-from unjam.measures.effect import FLOW_METRIC, POWER_FUEL_METRIC, TIME_METRIC
+from unjam.measures.effect import FLOW_METRIC, LAG_METRIC, POWER_FUEL_METRIC, TIME_METRIC, is_measured
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import HUMAN_LABEL, RowsByDriver, estimate_cell
 from unjam.measures.metrics import METRICS
@@ -34,13 +34,10 @@ COMMON_METRICS = ("min_time_gap", "cav_max_braking", "human_max_braking", "colli
 
 def road_metrics(rows_by_driver: RowsByDriver) -> RoadMetrics:
     """Return what matters on the road of these rows, which their metrics show."""
-
-    def is_known(metric: str) -> bool:
-        return any(isfinite(row.get(metric, nan)) for rows in rows_by_driver.values() for row in rows)
-
-    if is_known("time_behind_leader"):
+    rows = [row for own in rows_by_driver.values() for row in own]
+    if is_measured(rows, LAG_METRIC):
         return RECORDED_ROAD
-    return OPEN_ROAD if is_known(TIME_METRIC) else CLOSED_ROAD
+    return OPEN_ROAD if is_measured(rows, TIME_METRIC) else CLOSED_ROAD
 
 
 def short_table_metrics(rows_by_driver: RowsByDriver) -> tuple[str, ...]:

@@ -106,9 +106,10 @@ class DriveResult(Evaluation):
         import pandas as pd
 
         names = short_table_metrics(self.rows) if brief else tuple(METRICS)
+        summaries = {label: self.summary(label) for label in self.rows}
         numbers = {
-            (label, part): [getattr(self.summary(label)[name], part) for name in names]
-            for label in self.rows
+            (label, part): [getattr(summary[name], part) for name in names]
+            for label, summary in summaries.items()
             for part in ("mean", "low", "high")
         }
         frame = pd.DataFrame(numbers, index=pd.Index(names, name="metric"))
