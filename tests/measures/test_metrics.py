@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from unjam.drivers import LocalState
 from unjam.measures.metrics import METRICS, measure
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.worlds.audit import Audit, FollowingStatistics, following_statistics
+from unjam.worlds.audit import Audit, BrakingStatistics, FollowingStatistics, following_statistics
 from unjam.worlds.ordered_road import loop_neighbors, loop_state
 from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode
 from unjam.worlds.reward import episode_reward_terms
@@ -342,6 +342,15 @@ def test_row_has_facts_drawn_values_and_every_metric() -> None:
     assert row["length"] == LENGTH
     assert measure(episode_of(steady(4.0), seed=(7,)))["seed"] == 7
     assert all(isinstance(row[name], float) for name in METRICS)
+
+
+def test_hard_braking_of_human_drivers_is_the_same_with_a_cav_that_changes_nothing() -> None:
+    """One human driver brakes hard twice; in one episode another vehicle of five is a CAV."""
+    twice = BrakingStatistics(max_braking=5.0, exceedances=(2, 2, 0))
+    human = Audit(human_braking=replace(twice, samples=500))
+    mixed = Audit(human_braking=replace(twice, samples=400), cav_braking=BrakingStatistics(samples=100))
+    values = [metric("human_braking_beyond_4_5", episode_of(steady(4.0), audit=each)) for each in (human, mixed)]
+    assert values == [4000.0, 4000.0]
 
 
 @pytest.mark.parametrize("name", METRICS)

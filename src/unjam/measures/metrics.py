@@ -345,11 +345,13 @@ def _braking_metrics(group: Literal["CAV", "human"]) -> dict[str, Metric]:
 
     def exceedance(index: int, limit: float) -> EpisodeFunction:
         def per_million(episode: Episode) -> float:
-            braking = episode.audit.cav_braking if group == "CAV" else episode.audit.human_braking
-            return 1e6 * braking.exceedances[index] / braking.samples if braking.samples else nan
+            cavs, humans = episode.audit.cav_braking, episode.audit.human_braking
+            braking, samples = (cavs, cavs.samples) if group == "CAV" else (humans, cavs.samples + humans.samples)
+            return 1e6 * braking.exceedances[index] / samples if braking.samples else nan
 
+        person, steps = ("CAV", "those of CAVs") if group == "CAV" else ("human driver", "those of all vehicles")
         per_million.__doc__ = (
-            f"Vehicle-steps ({group}, simulation steps) with braking beyond {limit:g} m/s2 [per million]. "
+            f"Vehicle-steps (simulation) in which a {person} brakes beyond {limit:g} m/s2, of {steps} [per million]. "
             "ISO 15622 allows 3.5 above 20 m/s; dry asphalt hardly allows 9."
         )
         return per_million
