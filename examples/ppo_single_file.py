@@ -3,21 +3,17 @@
 Run: python examples/ppo_single_file.py [updates], then: unjam drive ring-jammed -d policy.onnx -d human
 """
 
-import logging
 import sys
-import warnings
-from pathlib import Path
 
 import gymnasium
-import tomli_w
 import torch
 from torch import Tensor, nn
 
-from unjam.adapters import PolicyInput
+from unjam.adapters import PolicyInput, PolicyOutput, write_onnx_policy
 
 RINGS, STEPS, EPOCHS, BATCH, GAMMA, LAMBDA, CLIP = 64, 75, 5, 1200, 0.99, 0.9, 0.2
 SCALES = {"speed": 10.0, "leader_relative_speed": 5.0, "leader_gap": 20.0}
-INPUTS = [{"quantity": name, "scale": scale} for name, scale in SCALES.items()]
+INPUTS = [PolicyInput(name, scale=scale) for name, scale in SCALES.items()]
 """what the policy observes, in SI units: in the environment, and in the description of the ONNX file"""
 
 
@@ -59,9 +55,9 @@ def learn(*columns: Tensor) -> None:
 
 
 def main(updates: int) -> None:
-    """Train, and write policy.onnx and policy.toml."""
+    """Train, and write policy.onnx."""
     # An action in each second
-    settings = {"features": [PolicyInput(**each) for each in INPUTS], "steps_per_control_step": 10, "horizon": 300}
+    settings = {"features": INPUTS, "steps_per_control_step": 10, "horizon": 300}
     rings = gymnasium.make_vec("unjam/ring-22-grown-v1", num_envs=RINGS, device="cpu", exact=False, **settings)
     (observation, _), ended = rings.reset(seed=1), torch.zeros(RINGS, dtype=torch.bool)
     for update in range(updates):
@@ -77,18 +73,7 @@ def main(updates: int) -> None:
                 speeds = info["episode_metrics"]["mean_speed"][info["_episode_metrics"]]
                 print(f"update {update}: mean speed {speeds.mean():.2f} m/s in {len(speeds)} episodes", flush=True)
         learn(*map(torch.stack, zip(*steps, strict=True)))
-
-    # torch warns of packages that are not needed here, and of its own deprecated code
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    warnings.filterwarnings("ignore", category=FutureWarning)
-    program = torch.onnx.export(actor.eval(), (observation,), dynamic_shapes=({0: "n"},), verbose=False)
-    assert program is not None
-    for node in program.model.graph:
-        node.metadata_props.clear()  # stack traces, with paths of this machine
-    program.save("policy.onnx")
-    Path("policy.toml").write_text(
-        tomli_w.dumps({"inputs": INPUTS, "output": {"limits": [-1.0, 1.0]}, "time_step": 1.0})
-    )
+    write_onnx_policy(actor, "policy.onnx", INPUTS, PolicyOutput(limits=(-1.0, 1.0)), time_step=1.0)
 
 
 if __name__ == "__main__":

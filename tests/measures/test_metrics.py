@@ -512,3 +512,7 @@ def test_amplification_is_that_of_waves_in_each_range_of_periods() -> None:
     for name, factor in factors.items():
         assert metric(f"amplification_{name}", episode) == pytest.approx(factor, rel=0.02)
         assert np.isnan(metric(f"amplification_{name}", episode_of(steady(4.0))))
+    calm = np.full_like(recorded, 20.0) + 0.03 * waves["medium"]  # rounding and noise are no waves
+    motion = np.stack([np.cumsum(calm) * 0.1, calm], -1)[:, None]
+    names = "amplification", *(f"amplification_{name}" for name in factors)
+    assert all(np.isnan(metric(name, episode_of(last[:, None], replayed_motion=motion))) for name in names)

@@ -7,14 +7,7 @@ import pytest
 
 from tests.measures.test_effect import USUAL
 from unjam.measures.metrics import METRICS
-from unjam.measures.verdict import (
-    CLOSED_ROAD,
-    OPEN_ROAD,
-    RECORDED_ROAD,
-    road_metrics,
-    short_table_metrics,
-    verdict_lines,
-)
+from unjam.measures.verdict import CLOSED_ROAD, OPEN_ROAD, RECORDED_ROAD, road_metrics, short_table_metrics, verdicts
 
 ROW: dict[str, Any] = {"speed_std_fleet_steady": 1.0, "fuel_by_power": 60.0, "cav_mean_gap": 20.0, **USUAL}
 ROADS = {"closed": {"travel_time": nan}, "open": {}, "recorded": {"travel_time": nan, "time_behind_leader": 10.0}}
@@ -24,6 +17,10 @@ def episodes(road: str = "closed", count: int = 4, **changes: float) -> list[dic
     """Return rows whose changes vary a little from seed to seed."""
     varied = ({name: value + 0.01 * seed for name, value in changes.items()} for seed in range(count))
     return [{**ROW, **ROADS[road], **each, "seed": [7, seed]} for seed, each in enumerate(varied)]
+
+
+def lines_of(**rows_by_driver: list[dict[str, Any]]) -> list[str]:
+    return [line for verdict in verdicts(rows_by_driver) for line in verdict.lines]
 
 
 def test_each_kind_of_road_has_its_metrics() -> None:
@@ -53,22 +50,25 @@ def test_each_kind_of_road_has_its_metrics() -> None:
     ],
 )
 def test_a_verdict_names_feasibility_the_first_metric_and_lost_flow(changes: dict[str, float], verdict: str) -> None:
-    assert verdict_lines({"human": episodes(), "pi": episodes("closed", 4, **changes)})[0] == verdict
+    assert lines_of(human=episodes(), pi=episodes("closed", 4, **changes))[0] == verdict
 
 
 def test_differences_have_signs_intervals_and_units() -> None:
-    verdict, numbers = verdict_lines({"human": episodes("recorded"), "pi": episodes("recorded", fuel_by_power=58.0)})
-    assert verdict == "pi: feasible; fuel by power better than that of human drivers, 4 paired seeds"
-    assert numbers == "  fuel by power -2.0 [-2.0, -2.0] ml/km, flow 0 veh/h, CAV's mean gap 0.0 m"
+    assert lines_of(human=episodes("recorded"), pi=episodes("recorded", fuel_by_power=58.0)) == [
+        "pi: feasible; fuel by power better than that of human drivers, 4 paired seeds",
+        "  fuel by power   -2.0 [-2.0, -2.0] ml/km (-3.3 %)",
+        "  flow            0 veh/h",
+        "  CAV's mean gap  0.0 m",
+    ]
 
 
 def test_few_seeds_decide_nothing() -> None:
-    (verdict, _) = verdict_lines({"human": episodes(count=1), "pi": episodes(count=1, mean_speed=30.0)})
+    verdict = lines_of(human=episodes(count=1), pi=episodes(count=1, mean_speed=30.0))[0]
     assert verdict == "pi: feasible; mean speed undecided compared with human drivers, 1 paired seed, which are too few"
 
 
 def test_without_human_drivers_or_common_episodes_there_is_no_comparison() -> None:
     failed = [{**row, **dict.fromkeys(METRICS, nan), "status": "failed"} for row in episodes()]
-    assert verdict_lines({"pi": episodes(), "idm": episodes()}) == []
-    assert verdict_lines({"human": episodes()}) == []
-    assert verdict_lines({"human": episodes(), "pi": failed}) == ["pi: no episode can be compared with human drivers"]
+    assert lines_of(pi=episodes(), idm=episodes()) == []
+    assert lines_of(human=episodes()) == []
+    assert lines_of(human=episodes(), pi=failed) == ["pi: no episode can be compared with human drivers"]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Page, Request, Route, sync_playwright
 
@@ -14,6 +15,7 @@ import unjam
 from tests.reports.test_assessment import HARMS, HELPS, assessment_folder
 from unjam.measures.metrics import METRICS, Metric
 from unjam.reports.assessment import write_assessment
+from unjam.reports.results import read_results
 
 CHROMIUM = shutil.which("chromium")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium found: apt-get install chromium")
@@ -222,16 +224,24 @@ def test_replay_shows_the_vehicles_of_every_driver(open_page: Opener, drive_repo
            })""",
     )
     assert len(found) == 2
-    for width, drawn, red in found:
+    for width, drawn, _ in found:
         assert width >= 200
         assert drawn > width * 10, "a road and vehicles"
-        assert red > 20, "the CAV has a red outline"
+    human, driven = (red for _, _, red in found)
+    assert human == 0 < 20 < driven, "a CAV has a red outline, and a human driver in its place has none"
+
+
+def test_replay_opens_when_speeds_differ(open_page: Opener, drive_report: Path) -> None:
+    human = read_results(drive_report.parent).plot_episodes["human"]
+    spread = np.interp(open_page(drive_report).time(), human.times, human.speeds.std(1))
+    assert spread > 0.8 * human.speeds.std(1).max()
 
 
 @pytest.mark.long
 def test_play_starts_and_pause_stops_the_replay(open_page: Opener, drive_report: Path) -> None:
     visit = open_page(drive_report)
     page, button = visit.page, visit.page.locator(".play")
+    page.locator(".time").fill("0")
     before = visit.canvases()
     assert (visit.time(), button.inner_text()) == (0.0, "Play")
     page.locator(".pace").select_option("1")
@@ -285,6 +295,7 @@ def test_replay_of_an_open_road_plays_the_whole_episode(open_page: Opener, merge
 
 def test_pace_is_the_speed_relative_to_real_time(open_page: Opener, drive_report: Path) -> None:
     visit = open_page(drive_report)
+    visit.page.locator(".time").fill("0")
     visit.page.locator(".pace").select_option("5")
     ratio = visit.page.evaluate(
         """() => new Promise(done => {
@@ -315,6 +326,7 @@ def test_slider_selects_the_time(open_page: Opener, drive_report: Path) -> None:
 def test_replay_shows_the_current_mean_speed(open_page: Opener, drive_report: Path) -> None:
     visit = open_page(drive_report)
     means = visit.page.locator("figcaption small")
+    visit.page.locator(".time").fill("0")
     assert means.all_inner_texts() == ["mean 0.0 m/s"] * 2
     visit.page.locator(".time").fill("12")
     assert all(float(text.split()[1]) > 1 for text in means.all_inner_texts())
@@ -397,10 +409,13 @@ def test_metric_names_stay_visible_when_a_phone_scrolls_the_table(open_page: Ope
 def test_report_of_a_run_has_finding_and_configuration(open_page: Opener, training_report: Path) -> None:
     page = open_page(training_report).page
     assert page.title() == page.locator("h1").inner_text() == "ring: a trained residual on pi"
-    finding = page.locator(".lead").inner_text()
-    assert finding.startswith("Compared with the human baseline on ring, 2 paired test seeds")
-    assert "Return difference to its expert" in finding
-    assert page.locator(".card").last.inner_text().startswith("Return difference to expert")
+    assert page.locator(".lead").inner_text().startswith("Return difference to its expert, pi, on 2 test seeds: ")
+    drivers = page.locator(".verdict strong").all_inner_texts()
+    assert drivers == [label for label in read_results(training_report.parent).rows if label != "human"]
+    for verdict in page.locator(".verdict").all_inner_texts():
+        assert "feasible" in verdict
+        assert "2 paired seeds" in verdict
+        assert "mean speed" in verdict
     code = page.locator("details code")
     assert not code.is_visible()
     page.locator("summary", has_text="Configuration").click()

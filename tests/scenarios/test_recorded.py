@@ -82,8 +82,18 @@ def test_notes_say_what_was_read(tmp_path: Path) -> None:
     times = np.where(TIMES < 30.0, TIMES, TIMES + 9.0)
     pd.DataFrame({"time": times, "speed": 2.0 + 0.1 * TIMES}).to_csv(path, index=False)
     note, _ = Recorded(recordings=str(path)).notes
-    assert note == "recordings: a.csv has 2 parts of 30 to 60 s with speeds of 2.0 to 11.0 m/s"
-    assert Recorded(recordings=str(tmp_path)).notes[0].startswith("recordings: 1 files of")
+    assert note == "recordings: a.csv: 2 parts of 30 to 60 s with speeds of 2.0 to 11.0 m/s"
+    assert Recorded(recordings=str(tmp_path)).notes[0].startswith("recordings: 1 file of ")
+    write_drive(tmp_path / "b.csv")
+    assert Recorded(recordings=str(tmp_path)).notes[0].endswith(", drawn at random")
+    assert Recorded(recordings=str(tmp_path), order="name").notes[0].endswith(", in the order of their names")
+
+
+def test_files_in_the_order_of_their_names_are_driven_once_each(tmp_path: Path) -> None:
+    for name in "cab":
+        write_drive(tmp_path / f"{name}.csv")
+    roads = [Recorded(recordings=str(tmp_path), order="name").draw_from_seed((5, seed))[0] for seed in range(4)]
+    assert [road.drawn_values["file"] for road in roads] == [0, 1, 2, 0]
 
 
 def test_a_begin_after_the_end_is_refused(tmp_path: Path) -> None:

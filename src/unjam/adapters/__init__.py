@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.vector import VectorEnv
 
+from unjam.adapters.onnx_export import write_onnx_policy
 from unjam.adapters.onnx_file import onnx_driver
 from unjam.adapters.policies import policy_driver
 from unjam.drivers.observation import PolicyInput
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from unjam.adapters.stable_baselines3_env import SB3VecEnv
 
 __all__ = ["PolicyDescription", "PolicyInput", "PolicyMemory", "PolicyOutput", "onnx_driver", "policy_driver"]
-__all__ += ["to_sb3_vec_env"]
+__all__ += ["to_sb3_vec_env", "write_onnx_policy"]
 
 
 def to_sb3_vec_env(environment: VectorEnv[Any, Any, Any]) -> "SB3VecEnv":

@@ -25,7 +25,7 @@ from unjam.files import to_json
 from unjam.measures.metric_table import RowsByDriver, TableCell, choose_baseline, metric_table
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate
-from unjam.measures.verdict import short_table_metrics, verdict_lines
+from unjam.measures.verdict import short_table_metrics, verdicts
 
 PROGRESS_LINE_SECONDS = 5.0
 """time between two plain lines of progress without a terminal"""
@@ -70,8 +70,11 @@ def new_table(text_columns: Sequence[str] = (), number_columns: Sequence[str] = 
 
 def print_results(rows_by_driver: RowsByDriver, shows_all: bool) -> None:
     """Print the verdicts on drivers and the metrics that matter on their road, or all metrics with differences."""
-    for line in verdict_lines(rows_by_driver):
-        console.print(line, soft_wrap=True)
+    for verdict in verdicts(rows_by_driver):
+        for line in verdict.lines:
+            hanging = " " * (2 + len(line) - len(line.lstrip()))
+            wrapping = {"subsequent_indent": hanging, "break_long_words": False, "break_on_hyphens": False}
+            console.print(fill(line, console.width, **wrapping), soft_wrap=True)
     if shows_all:
         print_metrics(rows_by_driver, choose_baseline(rows_by_driver))
     else:

@@ -126,8 +126,8 @@ class _TrainingProgress(output.ProgressReporter):
     """Progress of training: a bar with the latest returns on a terminal, plain lines elsewhere."""
 
     def __init__(self, config: "RunConfig", folder: Path) -> None:
-        super().__init__(f"training into {folder}", "steps", config.steps)
-        self._config, self._folder = config, folder
+        self._config, self._folder, self._steps = config, folder, max(config.steps, planned_steps(config))
+        super().__init__(f"training into {folder}", "steps", self._steps)
         self._validation_text, self._worst_road = "-", ""
         self._start = time.monotonic()
         self._first_row: tuple[int, float] | None = None
@@ -139,7 +139,7 @@ class _TrainingProgress(output.ProgressReporter):
             self._worst_road = _worst_road_text(row.get("tasks", {}))
         expert = f"expert {row['return_expert']:.0f}"
         text = f"return {row['return_mean']:.0f}, validation {self._validation_text} ({expert}{self._worst_road})"
-        steps, total = row["environment_steps"], self._config.steps
+        steps, total = row["environment_steps"], self._steps
         self._bar.update(self._task, completed=steps, description=text)
         if self._is_plain and (row["iteration"] % PROGRESS_LINE_INTERVAL == 1 or steps >= total):
             left = self._time_left_text(row["iteration"], steps)
@@ -147,7 +147,7 @@ class _TrainingProgress(output.ProgressReporter):
 
     def _time_left_text(self, iteration: int, steps: int) -> str:
         """Return the time that the rest of the training will take; empty at the end, and if nothing is known yet."""
-        now, total = time.monotonic(), self._config.steps
+        now, total = time.monotonic(), self._steps
         if self._first_row is None:
             self._first_row = (0, self._start) if iteration == 1 else (steps, now)  # else it was resumed
         first_steps, start = self._first_row

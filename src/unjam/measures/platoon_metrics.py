@@ -10,6 +10,9 @@ from unjam.measures.averages import mean_over_cavs, per_kilometer, row_chunks
 from unjam.physics.fuel import fuel_rate
 from unjam.worlds.record import Episode, Floats
 
+MIN_WAVE_STD = 0.05
+"""standard deviation of the recorded speed below which there are no waves that could be amplified [m/s]"""
+
 
 def fuel_by_power(episode: Episode) -> float:
     """Fuel of all vehicles by the power that a mid-size petrol car needs [ml/km], with 0.9 l/h at standstill.
@@ -70,12 +73,12 @@ def time_behind_leader(episode: Episode) -> float:
 def amplification(episode: Episode) -> float:
     """Standard deviation over time of the last vehicle's speed over that of the recorded vehicle; NaN elsewhere.
 
-    Above 1 the platoon amplifies the waves of the vehicle ahead, below 1 it dampens them.
+    Above 1 the platoon amplifies the waves of the vehicle ahead, below 1 it dampens them. NaN without waves, too.
     """
     if not episode.has_recorded_leader:
         return nan
     spread = float(np.std(episode.replayed_motion[1:, 0, 1]))
-    return float(np.std(episode.speeds[1:, 0])) / spread if spread else nan
+    return float(np.std(episode.speeds[1:, 0])) / spread if spread > MIN_WAVE_STD else nan
 
 
 def period_amplification(longest: float, shortest: float) -> Callable[[Episode], float]:
@@ -88,18 +91,20 @@ def period_amplification(longest: float, shortest: float) -> Callable[[Episode],
         frequencies = np.fft.rfftfreq(len(last), episode.control_step)
         is_in_band = (frequencies > 1.0 / longest) & (frequencies <= 1.0 / shortest)
         recorded_spectrum, last_spectrum = (_spectrum(speeds)[is_in_band] for speeds in (recorded, last))
-        energy = float(np.sum(recorded_spectrum**2))
-        return float(np.sqrt(np.sum(last_spectrum**2) / energy)) if energy else nan
+        recorded_std, last_std = (float(np.sqrt(np.sum(each**2))) for each in (recorded_spectrum, last_spectrum))
+        return last_std / recorded_std if recorded_std > MIN_WAVE_STD else nan
 
     limits = f"above {shortest:g} s" if longest == inf else f"of {shortest:g} to {longest:g} s"
     ratio.__doc__ = (
-        f"Amplification of waves with periods {limits} from the recorded to the last vehicle; NaN elsewhere."
+        f"Amplification of waves with periods {limits} from the recorded to the last vehicle; NaN elsewhere, and if "
+        f"the recorded vehicle has waves of less than {MIN_WAVE_STD:g} m/s."
     )
     return ratio
 
 
 def _spectrum(speeds: Floats) -> Floats:
-    """Return the amplitudes of the oscillations of a speed, without its trend, which a Hann window needs."""
-    steps = np.arange(len(speeds))
+    """Return the standard deviation of a speed at each frequency, without its trend, which a Hann window needs."""
+    steps, window = np.arange(len(speeds)), np.hanning(len(speeds))
     trend = np.polynomial.Polynomial.fit(steps, speeds, 1)(steps)
-    return np.abs(np.fft.rfft((speeds - trend) * np.hanning(len(speeds))))
+    scale = np.sqrt(2.0 / (len(speeds) * np.sum(window**2)))
+    return scale * np.abs(np.fft.rfft((speeds - trend) * window))

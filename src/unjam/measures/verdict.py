@@ -3,13 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
+from typing import Any
 
 from unjam.measures.effect import FLOW_METRIC, LAG_METRIC, POWER_FUEL_METRIC, TIME_METRIC, is_measured
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import HUMAN_LABEL, RowsByDriver, estimate_cell
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import Estimate, paired_difference
+from unjam.measures.statistics import Estimate, paired_difference, relative_difference
 
+Rows = Sequence[dict[str, Any]]
+"""a row of metrics for each episode"""
 HIGHER_IS_BETTER = {"mean_speed", "mean_speed_steady", "outflow_veh_per_h", "min_ttc"}
 """metrics that are compared with human drivers, of which lower values are worse; of the others they are better"""
 
@@ -46,24 +49,71 @@ def short_table_metrics(rows_by_driver: RowsByDriver) -> tuple[str, ...]:
     return *metrics.compared, *metrics.others, *COMMON_METRICS
 
 
-def verdict_lines(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return two lines for each driver: the verdict, and the paired differences to human drivers; none without them."""
-    human = rows_by_driver.get(HUMAN_LABEL)
-    if human is None or len(rows_by_driver) == 1:
-        return []
-    names, lines = road_metrics(rows_by_driver).compared, list[str]()
-    for label, feasible in feasibility_by_driver(rows_by_driver).items():
-        if label == HUMAN_LABEL:
-            continue
-        differences = {name: paired_difference(rows_by_driver[label], human, name) for name in names}
-        pairs = max(each.count for each in differences.values())
-        if not pairs:
-            lines.append(f"{label}: no episode can be compared with human drivers")
-            continue
-        drivable = feasible if feasible in ("", FEASIBLE) else f"infeasible: {feasible}"
-        verdict = "; ".join(filter(None, [drivable, _comparison(differences, pairs)]))
-        lines += [f"{label}: {verdict}", f"  {', '.join(_difference_texts(differences))}"]
-    return lines
+@dataclass(frozen=True)
+class DifferenceText:
+    """A paired difference to human drivers, as text."""
+
+    label: str
+    text: str
+    """mean and CI with the unit, and the mean as a share of the human baseline"""
+    is_better: bool | None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is shown of a driver compared with human drivers on the same seeds."""
+
+    driver: str
+    feasibility: str
+    """`FEASIBLE`, the first reason against it, or empty"""
+    comparison: str
+    """whether the metric that decides is better or worse, and at which price"""
+    is_better: bool | None
+    """whether the metric that decides is shown to be better; None: undecided"""
+    differences: tuple[DifferenceText, ...] = ()
+
+    @property
+    def feasibility_text(self) -> str:
+        """Feasibility in a few words; empty if it is unknown."""
+        return self.feasibility if self.feasibility in ("", FEASIBLE) else f"infeasible: {self.feasibility}"
+
+    @property
+    def lines(self) -> list[str]:
+        """The verdict as text: a line, and an indented line for each difference."""
+        width = max((len(each.label) for each in self.differences), default=0)
+        numbers = (f"  {each.label:{width}}  {each.text}" for each in self.differences)
+        return [f"{self.driver}: {'; '.join(filter(None, [self.feasibility_text, self.comparison]))}", *numbers]
+
+
+def verdicts(rows_by_driver: RowsByDriver) -> list[Verdict]:
+    """Return the verdict on each driver but the human baseline; none without this baseline."""
+    human = rows_by_driver.get(HUMAN_LABEL, [])
+    names = road_metrics(rows_by_driver).compared
+    found = feasibility_by_driver(rows_by_driver) if human else {}
+    return [
+        _verdict(label, rows_by_driver[label], human, feasible, names)
+        for label, feasible in found.items()
+        if label != HUMAN_LABEL
+    ]
+
+
+def _verdict(label: str, rows: Rows, human: Rows, feasible: str, names: Sequence[str]) -> Verdict:
+    differences = {name: paired_difference(rows, human, name) for name in names}
+    pairs = max(each.count for each in differences.values())
+    if not pairs:
+        return Verdict(label, "", "no episode can be compared with human drivers", None)
+    texts = (
+        DifferenceText(
+            METRICS[name].label.partition(",")[0],
+            _difference_text(name, difference, relative_difference(rows, human, name).mean),
+            is_better(name, difference),
+        )
+        for name, difference in differences.items()
+        if difference.count
+    )
+    return Verdict(
+        label, feasible, _comparison(differences, pairs), is_better(names[0], differences[names[0]]), (*texts,)
+    )
 
 
 def _comparison(differences: dict[str, Estimate], pairs: int) -> str:
@@ -79,16 +129,14 @@ def _comparison(differences: dict[str, Estimate], pairs: int) -> str:
     return f"{label} {word} than that of human drivers{price}, {seeds}"
 
 
+def _difference_text(name: str, difference: Estimate, relative: float) -> str:
+    metric = METRICS[name]
+    share = f" ({100 * relative:+.1f} %)" if isfinite(relative) and difference.mean else ""
+    return f"{estimate_cell(difference, metric.digits, sign='+')} {metric.unit}".strip() + share
+
+
 def is_better(metric: str, difference: Estimate) -> bool | None:
     """Return whether a paired difference is shown to be an improvement; None if its CI contains zero."""
     if difference.low > 0 or difference.high < 0:
         return (difference.mean > 0) == (metric in HIGHER_IS_BETTER)
     return None
-
-
-def _difference_texts(differences: dict[str, Estimate]) -> Sequence[str]:
-    return [
-        f"{metric.label.partition(',')[0]} {estimate_cell(difference, metric.digits, sign='+')} {metric.unit}".strip()
-        for metric, difference in ((METRICS[name], each) for name, each in differences.items())
-        if difference.count
-    ]

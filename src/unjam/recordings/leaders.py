@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unjam.errors import invalid_value
+from unjam.errors import invalid_value, shorten_list
 from unjam.physics.arrays import Floats
 from unjam.recordings.trajectories import even_times
 
@@ -52,6 +52,8 @@ def recording_files(path: Path) -> list[Path]:
         if fnmatchcase(each.name, pattern) and each.suffix.lower() in FILE_SUFFIXES and each.is_file()
     )
     if not found:
-        endings = ", ".join(FILE_SUFFIXES)
-        raise invalid_value("recordings", str(path), f"a folder or a pattern with files that end in {endings}")
+        endings, others = ", ".join(FILE_SUFFIXES), sorted(each.name for each in folder.iterdir())
+        allowed = f"a folder or a pattern with at least one file that ends in {endings}"
+        content = f"; {folder.name or '.'} has {shorten_list(others)}" if others else ""
+        raise invalid_value("recordings", str(path), f"{allowed}{content}")
     return found

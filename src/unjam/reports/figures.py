@@ -108,7 +108,7 @@ def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     """
     figure = new_figure(6.2)
     panels = figure.subplots(3, 1, sharex=True)
-    has_same_vehicles = all(episode.is_closed or episode.has_recorded_leader for episode in episodes)
+    has_same_vehicles = all(episode.has_same_vehicles for episode in episodes)
     for episode, color in zip(episodes, LINE_COLORS, strict=False):
         stride = max(1, len(episode.times) // MAX_PLOT_TIMES)
         for axes, (label, values) in zip(panels, _time_series(episode, has_same_vehicles).items(), strict=True):

@@ -34,6 +34,8 @@ MAX_REPLAY_VALUES = 600_000
 """vehicles times frames of all drivers of a replay: about three megabytes"""
 REPLAY_NAN = 65535
 """code of NaN in the arrays of a replay"""
+WORST_SHARE = 0.9
+"""share of the largest variance of speeds at which a replay opens"""
 REPLAY_STEP = 0.5
 """time between two frames of the replay [s]"""
 
@@ -99,7 +101,8 @@ def render_report(results: Sequence[Results]) -> str:
         "report.html",
         title=summary.report_title(results),
         single=single is not None,
-        findings=[(name, summary.main_finding(result)) for name, result in sources],
+        verdicts=summary.driver_verdicts(columns),
+        findings=[(name, finding) for name, result in sources if (finding := summary.main_finding(result))],
         notes=[(name, note) for name, result in sources for note in summary.report_notes(result)],
         cards=summary.key_figures(single) if single else [],
         figures={name: figures.data_uri(figure) for name, figure in _report_figures(sources, panels).items()},
@@ -173,23 +176,34 @@ def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
     max_frames = min(MAX_REPLAY_FRAMES, max(1, MAX_REPLAY_VALUES // max(1, vehicles)))
     step = max(REPLAY_STEP, longest / max_frames, *(episode.control_step for episode in panels))
     frames = 1 + int(longest / step + 1e-9)
+    longest_platoon = max((-each.lane_lines[:, 0].min() for each in panels if each.has_recorded_leader), default=0.0)
+    tracks = ((printable(each.driver), _replay_track(each, step, frames, longest_platoon)) for each in panels)
     return {
         "step": step,
         "frames": frames,
-        "start": 0,
+        "start": round(_worst_time(panels[0]), 1),
         "max_speed": space_time.speed_scale(panels).vmax,
         "colors": figures.color_table(),
         "vehicle_length": VEHICLE_LENGTH,
         "no_value": REPLAY_NAN,
-        "drivers": [{"name": printable(episode.driver), **_replay_track(episode, step, frames)} for episode in panels],
+        "drivers": [{"name": name, **track} for name, track in tracks],
     }
 
 
-def _replay_track(episode: PlotEpisode, step: float, frames: int) -> dict[str, Any]:
+def _worst_time(episode: PlotEpisode) -> float:
+    """Return the first time at which speeds differ nearly as much as ever: a wave is on the road [s]."""
+    count = np.sum(~np.isnan(episode.speeds), axis=1)
+    mean = np.nansum(episode.speeds, axis=1) / count.clip(1)
+    variance = np.nansum((episode.speeds - mean[:, None]) ** 2, axis=1) / count.clip(1)
+    return float(episode.times[(variance >= WORST_SHARE * variance.max()).argmax()])
+
+
+def _replay_track(episode: PlotEpisode, step: float, frames: int, longest_platoon: float) -> dict[str, Any]:
     """Return the positions and speeds of the vehicles, and the lines of the road.
 
     On a closed road positions are along the loop, otherwise on the plane. A line has rows (coordinate along the road,
-    x, y) [m]. After an early end the vehicles stand still.
+    x, y) [m]. After an early end the vehicles stand still. Behind a recorded vehicle the line has the same length for
+    all drivers [m].
     """
     indices = np.round(np.arange(frames) * step / episode.control_step).astype(int)
     indices = indices.clip(max=len(episode.speeds) - 1)
@@ -197,14 +211,14 @@ def _replay_track(episode: PlotEpisode, step: float, frames: int) -> dict[str, A
     if episode.is_closed:
         return {
             "vehicles": speeds.shape[1],
-            "cavs": episode.cav_columns,
+            "cavs": episode.controlled_columns,
             "loop_length": episode.loop_length,
             "speeds": [_encode_array(speeds)],
             "positions": [_encode_array(episode.positions[indices])],
             "lines": [np.round(episode.outline, 2).tolist()],
         }
     vehicles = np.flatnonzero(~np.isnan(speeds).all(axis=0))
-    is_present, is_cav = ~np.isnan(speeds[:, vehicles]), np.isin(vehicles, episode.cav_columns)
+    is_present, is_cav = ~np.isnan(speeds[:, vehicles]), np.isin(vehicles, episode.controlled_columns)
     first, last = is_present.argmax(axis=0), frames - 1 - is_present[::-1].argmax(axis=0)
     columns = assign_columns(first, last, is_cav.tolist())
     values = np.concatenate([episode.poses[indices], speeds[..., None]], axis=-1)
@@ -212,6 +226,8 @@ def _replay_track(episode: PlotEpisode, step: float, frames: int) -> dict[str, A
     for vehicle, column, present in zip(vehicles, columns, is_present.T, strict=True):
         packed[present, column] = values[present, vehicle]
     lines = split_lines(episode.lane_lines)
+    if episode.has_recorded_leader:
+        lines = [np.array([[-longest_platoon, 0.0], [0.0, 0.0]])]
     return {
         "vehicles": packed.shape[1],
         "cavs": np.unique(columns[is_cav]).tolist(),

@@ -15,6 +15,7 @@ from safetensors.numpy import load
 from unjam.errors import InputError, resume_hint
 from unjam.files import INVALID_DATA_ERRORS, read_json_lines, sha256_of
 from unjam.folders import reject_special_files
+from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import METRICS
 from unjam.worlds.record import Episode, Floats
 
@@ -55,6 +56,16 @@ class PlotEpisode(Episode):
     def is_closed(self) -> bool:
         """Whether the road is a loop."""
         return len(self.outline) > 0
+
+    @property
+    def controlled_columns(self) -> list[int]:
+        """Columns of the CAVs, which in the human baseline are driven as all others."""
+        return [] if self.driver.rpartition(": ")[2] == HUMAN_LABEL else self.cav_columns
+
+    @property
+    def has_same_vehicles(self) -> bool:
+        """Whether all vehicles are there from begin to end."""
+        return self.is_closed or self.has_recorded_leader
 
     @property
     def has_poses(self) -> bool:

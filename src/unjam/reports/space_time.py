@@ -123,9 +123,9 @@ def _branch_row(episodes: Sequence[PlotEpisode], branch: str, is_main: bool) -> 
         if episode.is_closed:
             loop_length, max_step, width = episode.loop_length, episode.loop_length / 2, 1.0  # no line over the seam
             positions, grid = positions % loop_length, np.linspace(0.0, loop_length, SPEED_FIELD_POSITIONS)
-        field = speed_field(positions, speeds, grid, loop_length)
+        field = speed_field(positions, speeds, grid, loop_length, episode.has_recorded_leader)
         axes.pcolormesh(times, grid, field, cmap=figures.SPEED_COLORMAP, norm=scale, rasterized=True)
-        is_cav = np.isin(np.arange(speeds.shape[1]), episode.cav_columns)
+        is_cav = np.isin(np.arange(speeds.shape[1]), episode.controlled_columns)
         for group, style in ((~is_cav, HUMAN_LINE_STYLE), (is_cav, CAV_LINE_STYLE)):
             style = {**style, "linewidths": width * style["linewidths"]}
             add_vehicle_lines(axes, times, positions[:, group], max_step, **style)
@@ -156,12 +156,15 @@ def _branch_positions(episode: PlotEpisode, branch: str, is_main: bool) -> np.nd
     return np.where(own | merged if is_main else own & ~merged, episode.positions, np.nan)
 
 
-def speed_field(positions: np.ndarray, speeds: np.ndarray, grid: np.ndarray, loop_length: float) -> np.ndarray:
+def speed_field(
+    positions: np.ndarray, speeds: np.ndarray, grid: np.ndarray, loop_length: float, is_platoon: bool = False
+) -> np.ndarray:
     """Return the speed along the road at each time [m/s], shape (grid points, times).
 
-    It is interpolated between vehicles, and NaN far from all of them. Lines alone would leave white stripes, which make
-    moiré patterns on screens. `positions` [m] and `speeds` [m/s] of the vehicles have the shape (times, N), NaN off the
-    road; `grid` has the positions of the result [m], ascending; `loop_length` [m] is 0 for an open road.
+    It is interpolated between vehicles, and NaN far from all of them; in a platoon NaN outside of it. Lines alone would
+    leave white stripes, which make moiré patterns on screens. `positions` [m] and `speeds` [m/s] of the vehicles have
+    the shape (times, N), NaN off the road; `grid` has the positions of the result [m], ascending; `loop_length` [m] is
+    0 for an open road.
     """
     field = np.full((len(grid), len(positions)), np.nan)
     for step, (position, speed) in enumerate(zip(positions, speeds, strict=True)):
@@ -177,6 +180,8 @@ def speed_field(positions: np.ndarray, speeds: np.ndarray, grid: np.ndarray, loo
         ahead = (behind + 1).clip(max=len(position) - 1)
         nearest = np.where(np.abs(grid - position[behind]) < np.abs(grid - position[ahead]), behind, ahead)
         is_near = np.abs(grid - position[nearest]) <= FILL_DISTANCE + FILL_SECONDS * speed[nearest]
+        if is_platoon:
+            is_near = (grid >= position[0]) & (grid <= position[-1])
         field[is_near, step] = np.interp(grid, position, speed)[is_near]
     return field
 
@@ -255,7 +260,7 @@ def _lane_row(first: PlotEpisode, lane: int, extent: tuple[float, float, float],
         edges = np.linspace(0.0, longest + episode.control_step, columns + 1), np.linspace(start, end, rows + 1)
         axes.pcolormesh(*edges, speeds, cmap=figures.SPEED_COLORMAP, norm=scale, rasterized=True)
         axes.set_ylim(start, end)
-        cavs = episode.cav_columns
+        cavs = episode.controlled_columns
         positions = np.where(episode.lane_indices[:, cavs] == lane, episode.positions[:, cavs], np.nan)
         add_vehicle_lines(axes, episode.times, positions, np.inf, colors=figures.CAV_PLOT_COLOR, linewidths=0.35)
 

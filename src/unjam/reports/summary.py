@@ -8,13 +8,12 @@ import numpy as np
 import pandas as pd
 
 from unjam.errors import printable
-from unjam.measures.effect import Effect, effects_by_driver
-from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
+from unjam.measures.effect import POWER_FUEL_METRIC
 from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, estimate_cell
 from unjam.measures.metrics import METRICS
 from unjam.measures.notes import early_end_notes
 from unjam.measures.statistics import format_difference, gain_verdict, metric_estimate, pair_rows, paired_difference
-from unjam.measures.verdict import is_better
+from unjam.measures.verdict import Verdict, is_better, verdicts
 from unjam.reports.results import PlotEpisode, Results
 
 CLOSE_TIME_GAP = 1.0
@@ -25,7 +24,15 @@ MAX_LIMIT_RATIO = 1.01
 """ratio of mean speed to the limit above which the report has a note"""
 COMPARED_METRICS = (
     *("mean_speed", "mean_speed_steady", "outflow_veh_per_h", "travel_time", "delay", "insertion_backlog_veh"),
-    *("fuel_ml_per_km", "share_standing", "speed_std_fleet", "speed_std_fleet_steady", "time_to_dissolve", "min_ttc"),
+    *(
+        "fuel_ml_per_km",
+        POWER_FUEL_METRIC,
+        "share_standing",
+        "speed_std_fleet",
+        "speed_std_fleet_steady",
+        "time_to_dissolve",
+        "min_ttc",
+    ),
     *("human_max_braking", "human_braking_beyond_3_5", "human_braking_beyond_4_5", "human_braking_beyond_9"),
     "collisions",
 )
@@ -90,50 +97,36 @@ def report_title(results: Sequence[Results]) -> str:
     return f"{names}: a trained " + ("network" if expert == "none" else f"residual on {expert}")
 
 
+def driver_verdicts(columns: Sequence[ReportColumn]) -> list[Verdict]:
+    """Return the verdict on each driver that has a human baseline in its folder."""
+    compared = ({HUMAN_LABEL: each.human_rows, each.name: each.rows} for each in columns if each.human_rows is not None)
+    return [verdict for rows in compared for verdict in verdicts(rows)]
+
+
 def main_finding(result: Results) -> str:
-    """Return the main finding of a folder in a few sentences, positive or negative."""
+    """Return what a folder shows besides the verdicts on its drivers, in a few sentences; it may be empty."""
     if (trained := result.trained_label) is None:
-        return _drive_finding(result)
+        return "" if HUMAN_LABEL in result.rows and len(result.rows) > 1 else _drive_finding(result)
     rows = result.rows[trained]
-    if effect := effects_by_driver(result.rows).get(trained):
-        text = _effect_text(effect, feasibility_by_driver(result.rows)[trained])
-        road, count = result.metadata["scenario"], _pair_count(effect)
-        finding = f"Compared with the human baseline on {road}, {count} paired test seeds: {text}."
-    else:
-        mean = metric_estimate(rows, "return").mean
-        finding = f"On {len(rows)} test seeds the mean return of the trained controller is {mean:.0f}."
     experts = {label: other for label, other in result.rows.items() if label not in (trained, HUMAN_LABEL)}
     returns = {label: metric_estimate(other, "return").mean for label, other in experts.items()}
-    expert = result.metadata["expert"]
+    expert, sentences = result.metadata["expert"], list[str]()
     best = max(returns, key=lambda label: np.nan_to_num(returns[label], nan=-np.inf), default=expert)
     if expert in experts:
         gain = paired_difference(rows, experts[expert], "return")
-        finding += f" Return difference to its expert, {expert}: {format_difference(gain)}. {gain_verdict(gain)}"
+        sentences.append(
+            f"Return difference to its expert, {expert}, on {gain.count} test seeds: {format_difference(gain)}. "
+            f"{gain_verdict(gain)}"
+        )
     if best != expert:
         gain = paired_difference(rows, experts[best], "return")
-        finding += f" Return difference to {best}, the expert with the highest return: {format_difference(gain)}."
-    return finding
-
-
-def _pair_count(effect: Effect) -> int:
-    """Return the number of seeds on which both drivers ran."""
-    return max(effect.flow.count, effect.speed.count)
-
-
-def _effect_text(effect: Effect, verdict: str) -> str:
-    """Return the effect and the feasibility of the CAVs as text; `verdict` also takes human drivers into account."""
-    feasible = "; feasible" + ("" if verdict == FEASIBLE else f", but {verdict}")
-    texts = {"": "", FEASIBLE: feasible}
-    return effect.summary + texts.get(effect.feasibility, f"; infeasible: {effect.feasibility}")
+        sentences.append(f"Return difference to {best}, the expert with the highest return: {format_difference(gain)}.")
+    mean = metric_estimate(rows, "return").mean
+    return " ".join(sentences) or f"On {len(rows)} test seeds the mean return of the trained controller is {mean:.0f}."
 
 
 def _drive_finding(result: Results) -> str:
-    scenario, effects = result.metadata["scenario"], effects_by_driver(result.rows)
-    if effects:
-        count, verdicts = max(map(_pair_count, effects.values())), feasibility_by_driver(result.rows)
-        text = "; ".join(f"{label}: {_effect_text(effect, verdicts[label])}" for label, effect in effects.items())
-        seeds = f"{count} episodes on paired seeds" if count > 1 else "a single seed, which proves nothing"
-        return f"Compared with the human baseline on {scenario}, {seeds}: {text}."
+    scenario = result.metadata["scenario"]
     ratios = {label: metric_estimate(rows, "speed_limit_ratio_steady") for label, rows in result.rows.items()}
     percent = {label: f"{100 * ratio.mean:.0f}\u00a0%" for label, ratio in ratios.items()}
     if len(ratios) > 1:
@@ -181,31 +174,23 @@ def _driver_notes(result: Results, label: str) -> list[str]:
 
 
 def key_figures(result: Results) -> list[dict[str, str]]:
-    """Return the key figures of the trained controller or of the only driver of a folder; none for several drivers."""
-    if result.trained_label is None and len(result.rows) > 1:
+    """Return the key figures of the only driver of a folder; none for several drivers, which have verdicts."""
+    if len(result.rows) > 1:
         return []
-    label = result.trained_label or next(iter(result.rows))
-    rows = result.rows[label]
-    human = [] if label == HUMAN_LABEL else result.rows.get(HUMAN_LABEL, [])
+    [(label, rows)] = result.rows.items()
     is_closed = all(episode.is_closed for episode in result.plot_episodes.values())
     figures = (
         ("Mean speed / limit, steady", "speed_limit_ratio_steady", 0, "%", 100.0),
         ("Speed std across vehicles, steady", "speed_std_fleet_steady", 2, "m/s", 1.0)
         if is_closed
-        else ("Outflow", "outflow_veh_per_h", 0, "veh/h", 1.0),
+        else ("Flow", "outflow_veh_per_h", 0, "veh/h", 1.0),
         ("Fuel", "fuel_ml_per_km", 0, "ml/km", 1.0),
     )
     cards = []
     for title, name, digits, unit, scale in figures:
-        estimates = (metric_estimate(each, name) for each in (rows, human))
-        value, baseline = (f"{scale * each.mean:.{digits}f} {unit}" if each.count else "–" for each in estimates)
-        cards.append({"label": title, "value": value, "detail": f"human baseline: {baseline}" if human else label})
-    expert = result.rows.get(result.metadata.get("expert", ""))
-    if result.trained_label and expert is not None:
-        gain = paired_difference(rows, expert, "return")
-        cell = estimate_cell(gain, 0, sign="+")
-        detail = f"95 % CI {cell.interval}" if gain.low < gain.high else f"{gain.count} seeds"
-        cards.append({"label": "Return difference to expert", "value": cell.mean, "detail": detail})
+        found = metric_estimate(rows, name)
+        value = f"{scale * found.mean:.{digits}f} {unit}" if found.count else "–"
+        cards.append({"label": title, "value": value, "detail": label})
     return cards
 
 

@@ -5,11 +5,12 @@ ICRA; the drives on I-24 of that experiment are the usual recordings.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import field, replace
 from functools import cached_property
 from math import ceil, floor, nan
 from pathlib import Path
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -21,7 +22,7 @@ from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, paramet
 from unjam.physics.arrays import Floats
 from unjam.physics.idm import IDMParameters, equilibrium_gap
 from unjam.recordings.leaders import LeaderRecording, recording_files
-from unjam.scenarios.road import Edge, Entry, Node, RecordedRoad, RoadNetwork, Route
+from unjam.scenarios.road import Edge, Entry, Node, RecordedRoad, Road, RoadNetwork, Route
 from unjam.scenarios.scenario import MAX_HORIZON, VEHICLE_LENGTH, Scenario
 
 LEADER_ID = "leader"
@@ -57,6 +58,8 @@ class Recorded(Scenario):
     recordings: str = ""
     """a file with speeds, a folder of them, or a pattern like `drives/2021-03*`, see `unjam.recordings.leader_files`;
     empty: artificial waves"""
+    order: Literal["random", "name"] = "random"
+    """how episodes take files: at random, or ordered by name, one for each episode"""
     platoon: str = "cav human*5"
     """vehicles behind the recorded one, from front to back, like `human*2 cav human*20`"""
     begin: NonNegative = 0.0
@@ -153,21 +156,32 @@ class Recorded(Scenario):
         """What was read of the recordings, so that a wrong unit or a gap in time is seen."""
         from unjam.recordings.leader_files import read_leaders
 
-        path = Path(self.recordings)
-        if not path.is_file():
-            return f"recordings: {len(recording_files(path))} files of {path.name}, drawn at random"
-        found = read_leaders(path)
+        path, files = Path(self.recordings), recording_files(Path(self.recordings))
+        found = [each for file in files for each in read_leaders(file)]
         seconds, speeds = [each.seconds for each in found], np.concatenate([each.speed for each in found])
+        source = (
+            path.name if path.is_file() else f"{len(files)} {'file' if len(files) == 1 else 'files'} of {path.name}"
+        )
         parts = f"{len(found)} parts of {min(seconds):.0f} to" if len(found) > 1 else ""
         text = f"{parts} {max(seconds):.0f} s with speeds of {speeds.min():.1f} to {speeds.max():.1f} m/s"
         same = "; episodes differ in the noise of human drivers alone" if len(found) == 1 and not self.window else ""
-        return f"recordings: {path.name} has {text.strip()}{same}"
+        drawn = {"random": ", drawn at random", "name": ", in the order of their names"}[self.order]
+        return f"recordings: {source}: {text.strip()}{drawn if len(files) > 1 else same}"
 
     def stratum(self, index: int, count: int) -> Self:
         """Return this road with the recordings of one of `count` equal parts, if there are as many files."""
         if not self.recordings or len(files := recording_files(Path(self.recordings))) < count:
             return self
         return replace(self, recordings=str(files[index * len(files) // count]))
+
+    def draw_from_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
+        """Return the road of an episode's seed, the last number of which counts files if they are ordered by name."""
+        if self.order == "random" or not self.recordings:
+            return super().draw_from_seed(seed)
+        files = recording_files(Path(self.recordings))
+        number = seed[-1] % len(files)
+        road, others = replace(self, recordings=str(files[number]), order="random").draw_from_seed(seed)
+        return replace(road, drawn_values={**road.drawn_values, "file": float(number)}), others
 
     def draw(self, generator: np.random.Generator) -> RecordedRoad:
         """Return the road with the speeds of a random recording, or of a random part of it."""

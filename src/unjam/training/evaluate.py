@@ -28,7 +28,7 @@ from unjam.measures.metric_table import RowsByDriver, choose_baseline, metric_ta
 from unjam.measures.metrics import METRICS, measure
 from unjam.measures.notes import count_early_ends, episode_notes
 from unjam.measures.statistics import Estimate, paired_difference, summarize
-from unjam.measures.verdict import short_table_metrics, verdict_lines
+from unjam.measures.verdict import short_table_metrics, verdicts
 from unjam.parameters import check_integer
 from unjam.reports.results import (
     EPISODE_ENTRIES,
@@ -123,8 +123,8 @@ class DriveResult(Evaluation):
         """Return the verdicts, the metrics that matter, and the trajectories of all vehicles, for notebooks."""
         from unjam.reports.figures import data_uri
 
-        verdicts = "".join(f"<p>{escape(line)}</p>" for line in verdict_lines(self.rows))
-        table = verdicts + metric_frame(self.rows).to_html(index=False, border=0)
+        lines = ("<br>".join(map(escape, each.lines)) for each in verdicts(self.rows))
+        table = "".join(f"<p>{text}</p>" for text in lines) + metric_frame(self.rows).to_html(index=False, border=0)
         if not self.plot_episodes:
             return table
         attributes = 'style="max-width: 100%" alt="every vehicle over time, dark is slow"'
@@ -147,7 +147,7 @@ class DriveResult(Evaluation):
 
     def document(self) -> dict[str, Any]:
         """Return the result as `unjam drive --json` prints it, with a document for each driver, also for one."""
-        verdicts, effects = feasibility_by_driver(self.rows), effects_by_driver(self.rows)
+        feasible, effects = feasibility_by_driver(self.rows), effects_by_driver(self.rows)
         baseline, documents = choose_baseline(self.rows), list[dict[str, Any]]()
         for driver, rows in self.rows.items():
             summary, effect, differences = self.summary(driver), effects.get(driver), None
@@ -160,7 +160,7 @@ class DriveResult(Evaluation):
                     "scenario": self.scenario,
                     "backend": self.backend,
                     "driver": driver,
-                    "feasibility": verdicts[driver],
+                    "feasibility": feasible[driver],
                     "episodes": rows,
                     "mean": {name: summary[name].mean for name in METRICS},
                     "ci95": {name: [summary[name].low, summary[name].high] for name in METRICS},
