@@ -70,7 +70,7 @@ def outside_working_folder() -> Iterator[None]:
 
 
 class _MatplotlibFinder(MetaPathFinder):
-    """Finds matplotlib and loads it outside the working folder, whose `matplotlibrc` it would read first."""
+    """Finds matplotlib and loads it outside the working folder: it would read the `matplotlibrc` there first."""
 
     def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
         spec = PathFinder.find_spec(fullname) if fullname == "matplotlib" else None

@@ -214,7 +214,7 @@ def total_deviation(rows: Table) -> float:
 
 
 def facts_table(folder: Path) -> pd.DataFrame:
-    """Return each fact of the chosen human traffic beside its target and the source of the target."""
+    """Return each fact of the chosen human traffic, its target and the source of the target."""
     steps = {step: read_part(folder, BEST_PART)[f"{step:g} s"]["episodes"] for step in SIMULATION_STEPS}
     table: Table = []
     for name, target in TARGETS.items():

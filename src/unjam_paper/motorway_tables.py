@@ -29,7 +29,7 @@ COMPARISONS = {
     "ACC alone, against human": (ACC_ALONE, HUMAN_LABEL),
     "best opponent, against human": (OPPONENT, HUMAN_LABEL),
 }
-"""pairs of drivers whose delays are compared, by heading"""
+"""pairs of drivers with the delays that are compared, by heading"""
 BENCHMARK_RATES = (0.05, 0.1)
 """penetration rates with which methods are tuned and compared"""
 BREAKDOWN_SHARE = 0.5

@@ -104,7 +104,7 @@ def test_targets_and_packages_of_the_readme_exist() -> None:
 def test_python_snippets_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     snippets = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    assert len(snippets) == 2
+    assert len(snippets) == 1
     for snippet in snippets:
         exec(snippet.replace("episodes=5", "episodes=1, scenario_options={'horizon': 40}"), {})
     assert list((tmp_path / "runs" / "first").glob("report.html"))

@@ -126,7 +126,7 @@ def benchmark(
 
 
 def _check_roads(roads: Sequence[str], suite: Suite) -> Sequence[str]:
-    """Return the given roads of a suite, whose names may begin with `family/`, or all; `InputError` for others."""
+    """Return the given roads of a suite, or all; `family/` may precede their names. Raise `InputError` for others."""
     if isinstance(roads, str) or not isinstance(roads, Sequence):
         raise invalid_value("roads", roads, f"a list of names of roads of {suite.name}")
     names = [str(name).removeprefix(FAMILY_PREFIX) for name in roads]

@@ -128,7 +128,7 @@ def watch_command(
     if len(drivers) > 1:
         raise invalid_value("driver", ", ".join(drivers), "one")
     if video is None and backend != "sumo":
-        raise invalid_value("backend", backend, "sumo, whose window is shown; others with --video")
+        raise invalid_value("backend", backend, "sumo, which has a window; others with --video")
     (name,) = drivers
     road = make_scenario(scenario, opt.merge_settings(changes, opt.parse_settings(settings)))
     driver = make_driver(name, road.control_step)

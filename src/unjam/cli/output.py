@@ -211,7 +211,7 @@ def setting_options(
 
 
 def _arguments_without_out() -> list[str]:
-    """Return the arguments of the running command without --out, whose folder exists now."""
+    """Return the arguments of the running command without --out: its folder exists now."""
     words = list(sys.argv[1:])
     if "--out" in words:
         index = words.index("--out")

@@ -63,7 +63,7 @@ class PolicyOutput:
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class PolicyMemory:
-    """Recurrent state of an ONNX graph: an input and an output whose first axis is the row of the CAV."""
+    """Recurrent state of an ONNX graph: an input and an output; the first axis of both is the row of the CAV."""
 
     input: str
     output: str

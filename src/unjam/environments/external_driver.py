@@ -1,4 +1,4 @@
-"""An expert whose accelerations the user of an environment changes."""
+"""An expert with accelerations that the user of an environment changes."""
 
 from typing import Any
 

@@ -1,7 +1,7 @@
 """The road model of motorways: the batch's human drivers with known entry times, plus what networks learn.
 
-The base is the batch: each vehicle's own driver model and lane changes. Perception errors are noise, drawn anew. One
-ensemble learns the rest, where vehicles keep their lane, from samples of environment episodes: vehicles are stepped
+The base is the batch: each vehicle's own driver model and lane changes. Perception errors are noise. One ensemble
+learns the rest, where vehicles keep their lane, from samples of environment episodes: vehicles are stepped
 once as the base does, and the remaining difference in speed is the target.
 """
 
@@ -41,7 +41,7 @@ Index = NDArray[np.intp]
 MAX_SAMPLE_INTERVAL = 60
 """maximum number of control steps between samples"""
 MIN_ERROR_REDUCTION = 0.3
-"""share by which networks must reduce the base's mean squared error: a record lacks the lane-change memory of human
+"""share by which networks must reduce the base's mean squared error: a record has no lane-change memory of human
 drivers, which rollouts have, and its mean effect would be added twice. Networks that reduced it by a fifth made model
 episodes 10 s too long; others, by more than half, 20 s instead of 180 (docs/virtual.md)"""
 PERCEPTION_ERROR_STD = 0.5

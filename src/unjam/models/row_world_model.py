@@ -21,7 +21,7 @@ class RowWorldModel(WorldModel[RowModel, None]):
         return fit_row_model(self.ensemble, transitions, self.settings, self.scenario, self.task.reward, seed)
 
     def simulate(self, plan: RolloutPlan) -> RolloutBatch:
-        """Return the rollouts of a plan, whose starts are `StartIndices`."""
+        """Return the rollouts of a plan with `StartIndices` as starts."""
         device = self.settings.device
         noise, exploration = (torch_generator(seed, device) for seed in (plan.noise_seed, plan.exploration_seed))
         dynamics = ModelDynamics(self.ensemble, self.scenario, self.task.reward, noise, self.settings.add_noise)

@@ -113,7 +113,7 @@ class ClosedRoadModel(WholeRoadModel[RoadSamples]):
         return fit_road_model(self.ensemble, self.samples, self.settings, self.scenario, seed)
 
     def simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
-        """Yield the episodes of a plan, whose starts are `StartIndices`, in one batch."""
+        """Yield the episodes of a plan with `StartIndices` as starts, in one batch."""
         rows = self.cavs_per_start * len(plan.starts)
         memory = plan.driver.initial_memory(rows) | {EXPERT_KEY: self._expert_memory(plan.starts)}
         human_model = learned_human_model(self.ensemble, self.scenario, torch_generator(plan.noise_seed, "cpu"))
@@ -224,7 +224,7 @@ class MotorwayModel(WholeRoadModel[MotorwaySamples]):
         return [self.samples[index] for index in indices for _ in signs]
 
     def simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
-        """Yield the episodes of a plan, whose starts are samples."""
+        """Yield the episodes of a plan with samples as starts."""
         signs = self.exploration_signs
         size = required_batch_kind(self.scenario).max_roads
         for first in range(0, len(plan.starts), size):

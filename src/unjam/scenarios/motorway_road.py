@@ -21,7 +21,7 @@ RAMP_OFFSET = 60.0
 
 
 class RampGeometry(NamedTuple):
-    """An on-ramp, whose lane continues next to the main road and ends there."""
+    """An on-ramp: its lane continues next to the main road and ends there."""
 
     merge_start: float
     """position where its lane starts to run next to the main road [m]"""

@@ -296,7 +296,7 @@ def _start_folder(run: Path) -> Path:
 
 
 def _without_toml_file_of_task(values: Any) -> Any:
-    """Return a task with the content of its TOML file, whose name becomes that of the task."""
+    """Return a task with the content of its TOML file, and with the name of this file."""
     if not isinstance(values, dict) or (changed := without_toml_file(values)) is values:
         return values
     return {"name": re.sub(r"[^\w-]", "-", Path(values["scenario"]).stem), **changed}

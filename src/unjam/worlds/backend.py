@@ -93,7 +93,7 @@ def check_backend_name(name: str) -> str:
 
 
 def check_backend(backend: Backend, label: str) -> Backend:
-    """Return a backend; raise `InputError` if it lacks a method of the protocol."""
+    """Return a backend; raise `InputError` if it does not have a method of the protocol."""
     missing = [name for name in ("supports", "open") if not callable(getattr(backend, name, None))]
     if missing:
         raise InputError(f"backend: {label} has no {' and no '.join(f'{name}()' for name in missing)}")

@@ -58,7 +58,7 @@ def start_batch_drive(
 
 
 def initial_batch_memory(driver: Driver, roads: int, cavs: int) -> Memory:
-    """Return the initial memory of a driver of all CAVs of a batch, whose roads have equal numbers of CAVs."""
+    """Return the initial memory of a driver of all CAVs of a batch; its roads have equal numbers of CAVs."""
     return map_leaves(lambda values: np.repeat(values, roads, axis=0), driver.initial_memory(cavs // roads))
 
 

@@ -160,7 +160,7 @@ class MotorwayBatch:
         """Continue on some roads with those of another batch that has just been started, which are empty.
 
         `roads` and `source_roads` have equal lengths. Both batches keep no record, and have the same scenario. Roadside
-        information must not be that of detectors, whose intervals are those of the batch.
+        information must not be that of detectors: their intervals are those of the batch.
         """
         rows = np.flatnonzero(~np.isin(self.cav_roads, roads))
         self._cav_numbers, self.cav_count = self._cav_numbers[rows], len(rows)

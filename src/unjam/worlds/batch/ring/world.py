@@ -70,7 +70,7 @@ class RingBatch:
         *("_speed", "_position", "_gap", "_loop_lengths", "_cav_loop_lengths", "_crossing_starts", "_human_parameters"),
         *("_is_running", "crashed_roads", "control_step_counts", "_ends"),
     )
-    """attributes whose arrays have a column for each road"""
+    """attributes with arrays that have a column for each road"""
     measured_fields: Collection[str] = ()
     """optional fields of `LocalState` that the driver reads; others are not provided"""
     safe_accelerations: Sequence[Array] = ()
