@@ -89,7 +89,7 @@ def test_who_signed_is_told(tmp_path: Path) -> None:
 
 def test_a_file_without_a_signature_is_read_as_before(tmp_path: Path) -> None:
     path = written(tmp_path, content_of())
-    assert found(path).startswith("the maker of the controller is unknown: ")
+    assert found(path).startswith("its maker is unknown, ")
     assert read_controller(path).signed_by is None
     assert read_controller(packaged_file("ring-best")).signed_by is None
 

@@ -106,7 +106,7 @@ def _check_signer(actual: str | None, signer: Path | str | None) -> PartCheck:
     if signer is None:
         if actual is None:
             unknown = "its maker is unknown, and a change together with all hashes is not detected"
-            return PartCheck("signature", "absent", f"the maker of the controller is unknown: {unknown}")
+            return PartCheck("signature", "absent", unknown)
         owner = "the owner of the key was not checked: give the maker's public key (--signer)"
         return PartCheck("signature", "checked", f"{result}, by the key {actual}; {owner}")
     from unjam.controller.signature import read_public_key  # loads cryptography, which is rarely needed
