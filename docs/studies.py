@@ -109,6 +109,7 @@ COLUMNS = {
     "of the limit, steady": ("speed_limit_ratio_steady", 3),
     "std across vehicles [m/s]": ("speed_std_fleet", 2),
     "min time gap [s]": ("min_time_gap", 2),
+    "hardest braking [m/s²]": ("cav_max_braking", 1),
     "leave [veh/h]": ("outflow_veh_per_h", 0),
     "wait [veh]": ("insertion_backlog_veh", 0),
 }
@@ -143,6 +144,13 @@ def honest(study: str, road: str, columns: tuple[str, ...] = OF_THE_RING, names:
         )
         table.append(cells)
     return pd.DataFrame(table)
+
+
+def without_filter(study: str, road: str, columns: tuple[str, ...] = OF_THE_RING) -> pd.DataFrame:
+    """Return the table of `honest` without the safety filter: of the paper's expert and of all that learn."""
+    names = f"{study}-unfiltered", UNFILTERED_ROADS[road]
+    learned = tuple(row["name"] for row in rows_of(*names) if row["is_learned"])
+    return honest(*names, (*columns, "hardest braking [m/s²]"), ("PI (paper)", "tuned PI", *learned))
 
 
 def _feasibility(verdicts: str | list[str]) -> str:
