@@ -1,6 +1,7 @@
 """All commands with SUMO."""
 
 import json
+import shlex
 import signal
 import subprocess
 import time
@@ -425,6 +426,28 @@ def test_a_stopped_run_leaves_no_process_and_can_be_resumed(
     wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
     last = json.loads(progress.read_text().splitlines()[-1])["environment_steps"]
     assert unjam("train", "--resume", "run", "--steps", last + 1).returncode == 0
+
+
+@pytest.mark.slow
+def test_a_stopped_search_says_how_it_is_continued(unjam: Run, tmp_path: Path) -> None:
+    tiny = [part for setting in (*SETTINGS, "scenario_options.horizon=100") for part in ("--set", setting)]
+    command = [str(UNJAM), "search", "ring", *tiny, "--vary", "trpo.target_kl=0.01,0.02", "--trials", "1"]
+    progress = tmp_path / "runs/search-ring-001/trials/0000/progress.jsonl"
+    with subprocess.Popen([*command, "--steps", "1000000"], cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        wait_until(progress.exists)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=10)
+    assert process.returncode == 130
+    (plan,) = (line for line in errors.splitlines() if line.startswith("searching trpo.target_kl in 1 trainings"))
+    assert "1,000,000 environment steps each, into runs/search-ring-001" in plan
+    (resume,) = (line for line in errors.splitlines() if line.startswith("resume with: unjam search "))
+    words = shlex.split(resume.removeprefix("resume with: unjam "))
+    assert words[-2:] == ["--out", "runs/search-ring-001"]
+    before = progress.read_text().count("\n")
+    with subprocess.Popen([str(UNJAM), *words], cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        wait_until(lambda: progress.read_text().count("\n") > before)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=10)
 
 
 def children_of(pid: int) -> list[int]:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -109,10 +110,12 @@ class Trainings:
         self.done: list[Path] = []
         self.stop_at: int | None = None
         self.failing = False
+        self.seconds = 0.0
 
     def __call__(self, command: CommandLine) -> int:
         if len(self.done) == self.stop_at:
             raise KeyboardInterrupt
+        time.sleep(self.seconds)
         if self.failing:
             return 2
         config = load_config(Path(command.argv()[6]))
@@ -157,6 +160,16 @@ def test_values_are_within_their_ranges(tmp_path: Path, trainings: Trainings) ->
         assert trial.values["trpo.critic_batch_size"] in (8, 16)
         assert isinstance(trial.values["trpo.critic_epochs"], int)
         assert 1 <= trial.values["trpo.critic_epochs"] <= 9
+
+
+def test_a_search_shows_how_far_trainings_are(
+    tmp_path: Path, trainings: Trainings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("unjam.training.search.MESSAGE_INTERVAL", 0.01)
+    trainings.seconds, messages = 0.2, list[str]()
+    search(BASE, SPACE, 2, tmp_path, 2, on_message=messages.append)
+    assert f"steps of {BASE.steps:,}: trial 0 0, trial 1 0" in messages
+    assert sum(message.startswith("2 of 2: trial ") for message in messages) == 1
 
 
 @pytest.mark.parametrize("workers", [1, 2])

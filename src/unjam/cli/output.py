@@ -17,7 +17,6 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from unjam.cli.options import DEFAULT_WORKERS
 from unjam.controller import DEFAULT_DRIVER
 from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, MissingPartError, printable
@@ -183,9 +182,9 @@ def suggest_after_drive(
     """Suggest the next command on the same road: compare with others, train on an expert, or watch if possible."""
     controllers = [driver for driver in drivers if driver != "human"]
     if "human" not in drivers:
-        print_next_command("compare with human drivers", *_arguments_without_out(), "-d", "human")
+        print_next_command("compare with human drivers", *arguments_without_out(), "-d", "human")
     elif not controllers:
-        print_next_command("compare with a controller", *_arguments_without_out(), "-d", controller)
+        print_next_command("compare with a controller", *arguments_without_out(), "-d", controller)
     elif all(driver.partition(":")[0] in DRIVERS for driver in controllers):
         command = "train", scenario, "--expert", controllers[-1], "--preset", "demo"
         options = setting_options(changes, "scenario_options.", reward, backend)
@@ -210,7 +209,7 @@ def setting_options(
         yield from ("--set", f"{prefix}{key}={value if isinstance(value, str) else json.dumps(value)}")
 
 
-def _arguments_without_out() -> list[str]:
+def arguments_without_out() -> list[str]:
     """Return the arguments of the running command without --out: its folder exists now."""
     words = list(sys.argv[1:])
     if "--out" in words:
@@ -232,12 +231,11 @@ def suggest_after_training(folder: Path, gain: "Estimate | None", steps: int, ru
 
 
 @contextmanager
-def suggest_resume(folder: Path, workers: int) -> Iterator[None]:
-    """Print the command that resumes the training if the body raises an error."""
+def suggest_resume(folder: Path, *command: object) -> Iterator[None]:
+    """Print the command that resumes a training or a search if the body raises an error."""
     try:
         yield
     except BaseException as error:
         if not isinstance(error, InputError | MissingPartError) and (folder / "config.toml").is_file():
-            options = [] if workers == DEFAULT_WORKERS else ["--workers", workers]
-            print_next_command("resume with", "train", "--resume", folder, *options)
+            print_next_command("resume with", *command)
         raise

@@ -86,7 +86,8 @@ def train_command(
     err_console.print(f"training {_plan_text(config)}, into {folder}", soft_wrap=True)
     write_curves = tensorboard_writer(folder) if tensorboard else None
     progress = nullcontext() if json else _TrainingProgress(config, folder)
-    with output.suggest_resume(folder, workers), progress as display:
+    options = [] if workers == opt.DEFAULT_WORKERS else ["--workers", workers]
+    with output.suggest_resume(folder, "train", "--resume", folder, *options), progress as display:
 
         def on_row(row: dict[str, Any]) -> None:
             for callback in (write_curves, display and display.show_iteration):
@@ -216,7 +217,11 @@ def search_command(
     check_search_space(base, space)
     folder = opt.new_folder(out, f"search-{Path(base.scenario).stem}")
     on_message = (lambda line: None) if json else err_console.print
-    with lock_new_folder(folder, resumable_file=REQUEST_FILE):
+    if not json:
+        plan = f"{trials} trainings, {workers} at once: {_plan_text(base)} each, into {folder}"
+        err_console.print(f"searching {', '.join(space)} in {plan}", soft_wrap=True)
+    resume = output.suggest_resume(folder, *output.arguments_without_out(), "--out", folder)
+    with lock_new_folder(folder, resumable_file=REQUEST_FILE), resume:
         found = search(base, space, trials, folder, workers, executor, on_message)
     best = folder / BEST_CONFIG_FILE
     if json:
@@ -230,4 +235,7 @@ def search_command(
         console.print(describe_trial(trial))
     untrained = sum(trial.gain is not None and trial.gain <= 0 for trial in found)
     console.print(f"{untrained} of {len(found)} trainings kept the untrained network")
-    output.print_next_command("train with the best", "train", "--config", best)
+    if any(trial.gain is not None and trial.gain > 0 for trial in found):
+        output.print_next_command("train with the best", "train", "--config", best)
+    else:
+        err_console.print("no gain is shown with any of these settings: vary others, or train longer (--steps)")

@@ -5,7 +5,7 @@ a training; test seeds are not used.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import asdict, dataclass, replace
 from itertools import islice
@@ -29,6 +29,8 @@ from unjam.training.search_space import SearchSpace, boundary_values
 from unjam.training.trial_log import TRIALS_FILE, TrialLog
 
 SEARCH_FILE, BEST_CONFIG_FILE = "search.json", "best.toml"
+MESSAGE_INTERVAL = 30.0
+"""time without a message after which the progress of trainings is shown [s]"""
 
 
 def check_search_space(base: RunConfig, space: SearchSpace) -> None:
@@ -90,7 +92,10 @@ def search(
                 jobs[start(_trial_command(base, folder, number, values))] = number
             if not jobs:
                 break
-            for done in wait(jobs, return_when=FIRST_COMPLETED).done:
+            ended_jobs = wait(jobs, MESSAGE_INTERVAL, FIRST_COMPLETED).done
+            if not ended_jobs:
+                on_message(_running_line(folder, jobs.values(), base.steps))
+            for done in ended_jobs:
                 number = jobs.pop(done)
                 has_failed = done.result() != 0
                 objective = None if has_failed else _objective(_trial_folder(folder, number), space)
@@ -180,6 +185,13 @@ def describe_trial(trial: SearchTrial) -> str:
     untrained = "" if trial.gain > 0 else " (the controller is the untrained network)"
     last = f"last checkpoint {trial.last_gain:+.1f}"
     return f"trial {trial.number}: validation gain over expert {trial.gain:+.1f}, {last}{untrained}: {values}"
+
+
+def _running_line(folder: Path, numbers: Iterable[int], steps: int) -> str:
+    """Return how far trainings are."""
+    rows = {number: read_progress(_trial_folder(folder, number))[-1:] for number in numbers}
+    texts = (f"trial {number} {row[0]['environment_steps'] if row else 0:,}" for number, row in rows.items())
+    return f"steps of {steps:,}: {', '.join(texts)}"
 
 
 def _progress_line(study: Study, number: int, trials: int) -> str:
