@@ -71,7 +71,7 @@ def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: 
 
 def _without_folders(value: Any) -> str:
     """Return a JSON value as a text without the folders of files, which depend on the working folder."""
-    return re.sub(r'[^+"]*/', "", json.dumps(value))
+    return re.sub(r'(?<![^+"])[^+"]*/', "", json.dumps(value))
 
 
 def file_hashes(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:
