@@ -84,7 +84,7 @@ def check_trusted_values(context: str, values: Any) -> None:
 
 def resolve_code_path(name: str) -> Path:
     """Return the path of a file without links: the one that was checked if a configuration has named it."""
-    return Path(_checked_files.get(os.path.join(os.getcwd(), name)) or Path(name).resolve())
+    return Path(_checked_files.get(os.path.join(os.getcwd(), name)) or os.path.realpath(name))
 
 
 def check_code_unchanged(code: UserCode) -> None:
@@ -140,7 +140,7 @@ def _code_files(context: str, text: str) -> Iterator[tuple[str, Path]]:
     if len(starts) * len(ends) > MAX_NAMED_FILES:
         raise InputError(f"{context}: {one_line(text, 60)!r} has too many parts; allowed: fewer + and :")
     for name in dict.fromkeys(text[start:end] for start in starts for end in ends if start < end):
-        yield os.path.join(os.getcwd(), name), Path(name).resolve()
+        yield os.path.join(os.getcwd(), name), Path(os.path.realpath(name))
 
 
 def _trust_key(code: Path, sha256: str) -> str:

@@ -22,7 +22,7 @@ from unjam.drivers.user_driver import FileReference
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.files import PACKAGED_PREFIX, UNREADABLE_ERRORS, atomic_write, sha256_of, to_json
 from unjam.physics.arrays import Floats
-from unjam.trust import check_trusted
+from unjam.trust import check_trusted, resolve_code_path
 from unjam.worlds.drive import drive_world
 from unjam.worlds.world import RecordedWorld
 
@@ -180,7 +180,7 @@ def _check_signature(file: Path, parts: dict[str, bytes]) -> str:
 def _check_code(name: str, recipe: Any, is_in_folder: bool) -> None:
     """Raise `InputError` if a driver is Python code outside of a run folder, changed since, or not trusted."""
     for reference in user_code_recipes(recipe):
-        path = Path(reference["path"]).resolve()
+        path = resolve_code_path(reference["path"])
         if not is_in_folder:
             reason = "which a file by itself may not run; use the run folder"
             raise InputError(f"controller {name}: part of it is Python code ({path.name}), {reason}")

@@ -252,7 +252,7 @@ class FileDriver(FileReference, UserDriver):
     implementation: Any = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "path", self.path.resolve())
+        object.__setattr__(self, "path", resolve_code_path(str(self.path)))
         code = self.read_code()
         made = _make_implementation(self.load_object(code), self.time_step, str(self), self.parameters)
         object.__setattr__(self, "implementation", made)
