@@ -62,6 +62,10 @@ def test_a_road_of_extreme_settings_is_refused_or_drawn_at_once(road: str) -> No
         ("ring", {"vehicles": 10**8, "length": 10**7}, "vehicles of an episode|length: "),
         ("ring", {"warmup": 10**12}, "steps_per_control_step, warmup: 1.0"),
         ("ring", {"steps_per_control_step": 10**12}, "steps_per_control_step, warmup: 3e"),
+        *(
+            ("ring", {"simulation_step": 0.001, f"actuator.{name}": 60.0}, f"actuator.{name}: 60")
+            for name in ("delay", "lag")
+        ),
         ("ring", {"horizon": 10**7, "humans.desired_speed": 1e6}, "meters of an episode at top speed: 1e"),
         *((road, {"horizon": 10**9}, "horizon: 1000000000 is not allowed") for road in ROADS),
         *((road, {"simulation_step": 0.0014}, "simulation_step: 0.0014 is not allowed") for road in ROADS),

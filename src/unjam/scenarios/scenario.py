@@ -233,6 +233,7 @@ class Scenario(Subclassable):
         for name in ("acceleration", "deceleration"):
             if not self.has_vehicle_types and getattr(self.cruise, name) is None:
                 raise ValueError(f"cruise.{name}: None is not allowed on {self.title}; allowed: > 0")
+        self.actuator.check_step(self.simulation_step)
         for name in ("gap_error", "speed_error"):
             known, largest = getattr(self.safety, name), getattr(self.sensors, name)
             if self.safety.active and known < largest:
