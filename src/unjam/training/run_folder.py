@@ -34,7 +34,7 @@ from unjam.files import (
     sha256_of,
     to_json,
 )
-from unjam.folders import reject_special_files
+from unjam.folders import reject_unsafe_files
 from unjam.manifest import manifest, package_versions
 from unjam.parameters import build_dataclass, read_toml
 from unjam.processes import LOCK_FILE, lock_folder
@@ -191,7 +191,7 @@ def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {CONFIG_FILE}")
-    reject_special_files(folder)
+    reject_unsafe_files(folder)
     try:
         if check_trust:
             return load_config(path)
