@@ -36,7 +36,7 @@ from unjam.files import (
 )
 from unjam.folders import reject_unsafe_files
 from unjam.manifest import manifest, package_versions
-from unjam.parameters import build_dataclass, read_toml
+from unjam.parameters import build_dataclass, check_integer, read_toml
 from unjam.processes import LOCK_FILE, lock_folder
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
@@ -308,6 +308,7 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
             raise InputError(
                 f"checkpoint: {path} has format {found!r}, of another version of unjam; allowed: {CHECKPOINT_FORMAT}"
             )
+        check_integer("checkpoint: iteration", state.get("iteration"), 0)
         return state, tensors
     if paths := _checkpoint_files(folder):
         raise InputError(f"checkpoint: all {len(paths)} under {folder} are damaged")
