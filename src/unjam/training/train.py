@@ -221,7 +221,7 @@ class _RunState(NamedTuple):
 
     iteration: int
     environment_steps: int
-    algorithm: dict[str, Any]
+    algorithm: Any
     fingerprint: dict[str, Any]
     sampler: dict[str, list[float]]
     best_validation: float
