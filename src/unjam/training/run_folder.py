@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tomli_w
 
@@ -60,6 +60,18 @@ CHECKPOINT_NAME = re.compile(r"\d{6,}-[0-9a-f]{64}\.safetensors")
 """file name of a checkpoint: iteration and hash of the content"""
 ROW_MODEL_FIELDS = {"distance_to_crossing", "penetration_rate"}
 """optional inputs that the row model continues"""
+
+
+class CheckpointValues(NamedTuple):
+    """The values of a checkpoint, without its tensors."""
+
+    iteration: int
+    environment_steps: int
+    algorithm: Any
+    fingerprint: dict[str, Any]
+    sampler: dict[str, list[float]]
+    best_validation: float
+    expert_returns: list[float]
 
 
 def check_config(config: RunConfig) -> None:

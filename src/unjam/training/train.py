@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -216,18 +216,6 @@ def _report_task_progress(progress: EvaluationProgress, name: str, episode: tupl
     progress((f"{name} {driver}".strip(), number), steps)
 
 
-class _RunState(NamedTuple):
-    """The values of a checkpoint, without its tensors."""
-
-    iteration: int
-    environment_steps: int
-    algorithm: Any
-    fingerprint: dict[str, Any]
-    sampler: dict[str, list[float]]
-    best_validation: float
-    expert_returns: list[float]
-
-
 class Trainer:
     """Runs an algorithm with episodes from the workers, validation and the run's folder.
 
@@ -263,7 +251,7 @@ class Trainer:
 
     def _restore(self, values: dict[str, Any], tensors: Tensors) -> None:
         """Continue from a checkpoint; raise one of `UNREADABLE_ERRORS` if another program has written it."""
-        state = unpack(_RunState, values, {})
+        state = unpack(run_folder.CheckpointValues, values, {})
         if not 0 < state.iteration <= state.environment_steps or len(state.expert_returns) != len(self.tasks):
             raise ValueError("its numbers contradict each other")
         is_stopped = self.config.evaluation.should_stop_early(read_progress(self.folder))
@@ -368,7 +356,7 @@ class Trainer:
 
     def _save_checkpoint(self) -> None:
         values, tensors = check_state(self.config.agent, self.algorithm.state())
-        state = _RunState(
+        state = run_folder.CheckpointValues(
             **self._counters,
             algorithm=values,
             fingerprint=self._fingerprint,
