@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from unjam.drivers.registry import driver_from_name
-from unjam.errors import InputError, invalid_value, one_line
+from unjam.errors import InputError, invalid_value, one_line, printable
 from unjam.scenarios import make_scenario
 from unjam.training.config import load_config
 from unjam.worlds.reward import make_reward
@@ -42,3 +42,15 @@ def test_a_value_of_several_lines_is_shown_on_one() -> None:
 
 def test_a_long_text_is_cut_visibly() -> None:
     assert [one_line(f" a\n{'b' * count}", 6) for count in (4, 5)] == ["a bbbb", "a bbb…"]
+
+
+@pytest.mark.parametrize(
+    "hidden", ["\x1b", "\u202e", "\u200b", "\u2028", "\u3164", "\u034f", "\ufe0f", "\U000e0100", "\u2800"]
+)
+def test_what_cannot_be_seen_in_a_name_is_marked(hidden: str) -> None:
+    assert printable(f"ring{hidden}") == "ring?"
+
+
+def test_visible_letters_and_spaces_are_shown_as_they_are() -> None:
+    text = "Straße 環状\u00a0道 é e\u0301 \u2009– m/s²\n"
+    assert printable(text) == text

@@ -146,7 +146,7 @@ def test_huge_integers_and_nul_are_refused(values: dict[str, Any], words: str) -
     assert str(caught.value).startswith(words)
 
 
-@pytest.mark.parametrize("part", ["a", '"a b"', "'a'"])
+@pytest.mark.parametrize("part", ["a", '"a b"', "'a'", '"\\""', '"a\\\\"'])
 def test_a_key_of_many_parts_is_refused_before_it_takes_memory(part: str) -> None:
     deep = " . ".join([part] * 100_000)
     for text in (f"{deep} = 1", f"[{deep}]", f"a = {{{deep} = 1}}"):
@@ -154,6 +154,12 @@ def test_a_key_of_many_parts_is_refused_before_it_takes_memory(part: str) -> Non
             parse_toml(text)
     assert parse_toml(f"{'.'.join([part] * 50)} = 1")
     assert parse_toml(f"a = {[0.5] * 1000}\nb = '{'../' * 50}'")
+
+
+@pytest.mark.parametrize("text", ["a" * 10**6, "a " * 10**6, '\\"' * 10**6, "\\\\" * 10**6, "a." * 99 + " a" * 10**6])
+def test_a_long_text_is_read_in_time_proportional_to_its_length(text: str) -> None:
+    """A search that goes on from each letter would take hours."""
+    assert parse_toml(f'long = "{text}"')
 
 
 class UndecoratedRing(Ring):

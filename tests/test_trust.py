@@ -1,5 +1,6 @@
 """Which code is trusted, and how this is reported."""
 
+import itertools
 import os
 import subprocess
 from pathlib import Path
@@ -9,9 +10,10 @@ import pytest
 from unjam.child_processes import child_environment, python_command
 from unjam.controller import controller_bytes
 from unjam.controller import file as controller_file
-from unjam.controller.file import read_controller
+from unjam.controller.file import pack_parts, read_controller, unpack_parts
 from unjam.drivers.user_driver import FileDriver, FileReference
 from unjam.errors import InputError
+from unjam.files import sha256_of
 from unjam.training.config import RunConfig, load_config, to_toml
 from unjam.trust import (
     TRUSTED_VARIABLE,
@@ -22,6 +24,7 @@ from unjam.trust import (
     remember_trusted,
     trusting_code,
 )
+from unjam.user_code import UserCode, read_code
 
 
 @pytest.fixture
@@ -47,6 +50,59 @@ def test_a_code_file_is_found_wherever_a_text_names_it(text: str, deep: bool, co
     check_trusted_values("run", values if deep else named)
 
 
+@pytest.mark.parametrize(
+    "name", ["none/../{}", "none/deep/../../{}", "./{}", "{}/../{}", "folder/{}", "x.py:/../{}", "x.py:/../link.txt"]
+)
+def test_code_is_found_by_every_name_that_leads_to_it(name: str, code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(code.parent)
+    Path("link.txt").symlink_to(code)
+    Path("folder").symlink_to(code.parent)
+    text = f"{name.replace('{}', code.name)}:x"
+    assert FileReference.parse(text).load_object() == 1  # its user names it
+    code.write_text("x = 2\n")
+    with pytest.raises(InputError, match="it runs only with --trust-code"):
+        check_trusted_values("run", text)
+
+
+@pytest.mark.parametrize("name", ["later.py", "none/../later.py", "folder/later.py", "trusted.py/../later.py"])
+def test_code_that_appears_after_the_check_does_not_run(name: str, code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(code.parent)
+    check_trusted_values("run", f"{name}:x")
+    Path("folder").mkdir()
+    for path in ("later.py", "folder/later.py"):
+        Path(path).write_text("open('canary', 'w').close()\nx = 1\n")
+    with pytest.raises(InputError, match=r"later\.py: has changed since the configuration was checked"):
+        FileReference.parse(f"{name}:x").load_object()
+    assert not Path("canary").exists()
+
+
+@pytest.mark.parametrize("name", ["link.py", "link/code+1.py"])
+def test_a_link_that_changes_after_the_check_is_not_followed(
+    name: str, code: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(code.parent)
+    remember_trusted(code)
+    other = Path("other")
+    other.mkdir()
+    (other / code.name).write_text("x = 2\n")
+    link = Path(name.partition("/")[0])
+    link.symlink_to(code if link.suffix else code.parent)
+    check_trusted_values("run", f"{name}:x")
+    link.unlink()
+    link.symlink_to(other / code.name if link.suffix else other)
+    child = f"from unjam.drivers.user_driver import FileReference; print(FileReference.parse('{name}:x').load_object())"
+    done = subprocess.run(
+        python_command("-c", child), env=child_environment(), capture_output=True, text=True, check=False
+    )
+    assert (done.stdout, FileReference.parse(f"{name}:x").load_object()) == ("1\n", 1), done.stderr
+
+
+def test_a_text_with_many_separators_is_refused_at_once(code: Path) -> None:
+    text = f"{code}:x" + "+a:" * 5000
+    with pytest.raises(InputError, match=r"^run: .* has too many parts; allowed: fewer \+ and :$"):
+        check_trusted_values("run", text)
+
+
 def test_a_relative_name_is_found(code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(code.parent)
     with pytest.raises(InputError, match="it runs only with --trust-code"):
@@ -64,11 +120,11 @@ def test_trust_ends_with_the_block_and_its_code_is_remembered(code: Path) -> Non
     other = code.with_name("other.py")
     other.write_text("y = 2\n")
     with trusting_code():
-        check_trusted("run", code)
+        check_trusted("run", read_code(code))
         remember_trusted(code)
-    check_trusted("run", code)
+    check_trusted("run", read_code(code))
     with pytest.raises(InputError):
-        check_trusted("run", other)
+        check_trusted("run", read_code(other))
     assert TRUSTED_VARIABLE not in os.environ
 
 
@@ -88,15 +144,15 @@ def test_modules_that_code_imports_are_trusted_only_unchanged(code: Path) -> Non
     helper.write_text("value = 1\n")
     code.write_text("from helper_beside import value as x\n")
     assert file.load_object() == 1
-    check_trusted("run", code)
+    check_trusted("run", read_code(code))
     helper.write_text("value = 22\n")
     with pytest.raises(InputError, match="not run yourself in this version"):
-        check_trusted("run", code)
+        check_trusted("run", read_code(code))
     assert file.load_object() == 22  # naming it runs it
-    check_trusted("run", code)
+    check_trusted("run", read_code(code))
     helper.unlink()
     with pytest.raises(InputError):
-        check_trusted("run", code)
+        check_trusted("run", read_code(code))
 
 
 def test_trust_that_cannot_be_stored_is_kept_for_this_process_and_its_children(
@@ -104,11 +160,11 @@ def test_trust_that_cannot_be_stored_is_kept_for_this_process_and_its_children(
 ) -> None:
     monkeypatch.setenv("UNJAM_STATE", str(code / "no folder"))
     remember_trusted(code)
-    check_trusted("run", code)
+    check_trusted("run", read_code(code))
     assert len(os.environ[TRUSTED_VARIABLE].split()) == 1
     code.write_text("x = 2\n")
     with pytest.raises(InputError):
-        check_trusted("run", code)
+        check_trusted("run", read_code(code))
 
 
 def test_trust_is_stored_in_the_state_folder_of_the_system(
@@ -118,7 +174,7 @@ def test_trust_is_stored_in_the_state_folder_of_the_system(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "xdg"))
     monkeypatch.setenv("HOME", str(tmp_path))  # where the system does not ask XDG
     remember_trusted(code)
-    check_trusted("run", code)
+    check_trusted("run", read_code(code))
     assert [path.parent.name for path in tmp_path.rglob("trusted/*")] == ["trusted"]
 
 
@@ -138,7 +194,7 @@ def folder_with_code(code: Path) -> Path:
 
 
 def test_modules_that_code_imports_late_are_trusted_only_unchanged(code: Path, folder_with_code: Path) -> None:
-    check_trusted("run", code)
+    check_trusted("run", read_code(code))
     code.with_name("helper_later.py").write_text("value = 2\n")
     with pytest.raises(InputError, match="not run yourself in this version"):
         load_config(folder_with_code / "config.toml")
@@ -173,11 +229,44 @@ def test_code_that_changes_after_a_controller_was_checked_does_not_run(
     (run / "controller.unjam").write_bytes(controller_bytes(FileDriver(code, "gentle"), {}))
     read_controller(run)
 
-    def check(where: str, path: Path) -> None:
-        check_trusted(where, path)
+    def check(where: str, read: UserCode) -> None:
+        check_trusted(where, read)
         helper.write_text(f"open({str(canary)!r}, 'w').close()\nvalue = 0.0\n")
 
     monkeypatch.setattr(controller_file, "check_trusted", check)
     with pytest.raises(InputError, match=r"code\+1\.py:gentle: its file has changed since"):
+        read_controller(run)
+    assert not canary.exists()
+
+
+@pytest.mark.parametrize("at_first", ["nothing", "trusted code", "strange code"])
+def test_code_of_a_controller_is_read_once_for_hash_and_trust(
+    at_first: str, code: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file changes at every look, and the manifest has the hash of the strange code."""
+    canary, run = code.with_name("canary"), code.with_name("run")
+    trusted = b"def gentle(state):\n    return 0.0 * state.speed\n"
+    strange = trusted + f"open({str(canary)!r}, 'w').close()\n".encode()
+    code.write_bytes(trusted)
+    remember_trusted(code)
+    run.mkdir()
+    file = run / "controller.unjam"
+    file.write_bytes(controller_bytes(FileDriver(code, "gentle"), {}))
+    hashes = sha256_of(trusted).encode(), sha256_of(strange).encode()
+    file.write_bytes(pack_parts({name: part.replace(*hashes) for name, part in unpack_parts(file).items()}))
+    contents, isfile, read_bytes = itertools.cycle([trusted, strange]), os.path.isfile, Path.read_bytes
+    if at_first == "strange code":
+        next(contents)
+    elif at_first == "nothing":
+        code.unlink()
+
+    def is_file(path: str | Path) -> bool:
+        found = isfile(path)
+        code.touch()
+        return found
+
+    monkeypatch.setattr(os.path, "isfile", is_file)
+    monkeypatch.setattr(Path, "read_bytes", lambda path: next(contents) if path == code else read_bytes(path))
+    with pytest.raises(InputError, match=r"has changed since|is not a file|which you have not run yourself"):
         read_controller(run)
     assert not canary.exists()

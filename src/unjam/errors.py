@@ -100,6 +100,11 @@ class LostWorkerError(EpisodeError):
 
 MAX_LISTED_NAMES = 20
 """names that a message lists of a list from a file"""
+INVISIBLE_LETTERS = {
+    *"\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0",
+    *map(chr, (*range(0x180B, 0x1810), *range(0xFE00, 0xFE10), *range(0xE0100, 0xE01F0))),
+}
+"""letters and marks that are not shown, although Unicode does not count them as control characters"""
 DISK_ERRNOS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS),
     *(errno.EACCES, errno.EPERM, errno.EIO, errno.ENOTDIR),
@@ -128,13 +133,14 @@ def one_line(value: object, length: int = 200) -> str:
 
 
 def printable(text: str) -> str:
-    """Return a text for a terminal, with a question mark for each control character and bidirectional mark.
+    """Return a text for a terminal, with a question mark for each control, bidirectional or invisible character.
 
-    Otherwise file names, names in TOML files or messages of SUMO could move the cursor, or turn the direction of text.
+    Otherwise file names, names in TOML files or messages of SUMO could move the cursor, turn the direction of text, or
+    look like other names.
     """
-    hidden = {
-        letter for letter in set(text) if not letter.isprintable() and letter != "\n" and category(letter) != "Zs"
-    }
+    letters = set(text) - {"\n"}
+    hidden = {each for each in letters if not each.isprintable() and category(each) != "Zs"}
+    hidden |= letters & INVISIBLE_LETTERS
     return "".join("?" if letter in hidden else letter for letter in text) if hidden else text
 
 

@@ -5,17 +5,26 @@ import re
 from pathlib import Path
 from typing import Any
 
+from unjam.errors import InputError, one_line
+
 _SEPARATOR = re.compile(r"\+(?=[^\W\d]|[./~])")
 """+ between two names, but not that in 1e+5"""
 _MAX_LENGTH = 4096
 """letters of a path, the limit of Linux"""
+MAX_NAMES = 100
+"""maximum number of names that are joined"""
 _PATH_END = re.compile(rf":|$|{_SEPARATOR.pattern}")
 
 
 def split_names(text: str, folder: Path = Path()) -> list[str]:
-    """Return the names that are joined by +, which paths of existing files in `folder` may contain, too."""
+    """Return the names that are joined by +, which paths of existing files in `folder` may contain, too.
+
+    Raise `InputError` for more than `MAX_NAMES`.
+    """
     names = list[str]()
     while separator := _SEPARATOR.search(text, len(_existing_path(text, folder))):
+        if len(names) == MAX_NAMES - 1:
+            raise InputError(f"names: {one_line(text, 60)!r} and those before it; allowed: at most {MAX_NAMES} names")
         names.append(text[: separator.start()])
         text = text[separator.end() :]
     return [*names, text]

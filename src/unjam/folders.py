@@ -151,10 +151,17 @@ def protect_folder(folder: Path) -> Iterator[None]:
         _protected.remove(root)
 
 
-def reject_special_files(folder: Path) -> None:
-    """Raise `InputError` if a folder contains a pipe, a socket or a device: reading it could wait forever."""
-    for parent, _, names in os.walk(folder):
-        for path in (Path(parent) / name for name in names):
+def reject_unsafe_files(folder: Path) -> None:
+    """Raise `InputError` if a folder contains a file that must not be read.
+
+    Reading a pipe, a socket or a device could wait forever. A link that leads out of the folder could name a secret,
+    which a report would show.
+    """
+    root = os.path.realpath(folder)
+    for parent, subfolders, names in os.walk(folder):
+        for path in (Path(parent) / name for name in (*subfolders, *names)):
+            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
+                raise InputError(f"file: {_short_path(path)!r} is a link out of its folder; allowed: the file itself")
             with suppress(OSError):  # a broken link, or removed meanwhile
                 mode = path.stat().st_mode
                 if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):

@@ -3,14 +3,14 @@
 import json
 import os
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import platformdirs
 
-from unjam.errors import InputError, UnjamError
+from unjam.errors import InputError, UnjamError, one_line
 from unjam.files import atomic_write, make_folder, sha256_of
 from unjam.user_code import UserCode, read_code
 
@@ -19,11 +19,17 @@ TRUSTED_VARIABLE = "UNJAM_TRUSTED"
 TRUST_ALL = "all"
 TRUST_CODE_OPTION = "--trust-code"
 EXPECTED_CODE_VARIABLE = "UNJAM_EXPECTED_CODE"
-"""environment variable with the hashes of code, by path, at the check of the configuration of a child"""
+"""environment variable with the files and hashes of code at the check of the configuration of a child"""
+MAX_NAMED_FILES = 1000
+"""maximum number of files that a text can name, whatever its separators mean"""
 _lock = threading.Lock()
 _saved_values: list[str | None] = []
 """value of the variable before the first of the running blocks of `trusting_code`, for each of them"""
-_expected_hashes: dict[str, str] = json.loads(os.environ.get(EXPECTED_CODE_VARIABLE, "{}"))
+_checked_files: dict[str, str]
+"""resolved paths by the absolute names that a configuration was checked with: a link can change meanwhile"""
+_expected_hashes: dict[str, str]
+"""hashes by resolved path; empty: there was no file"""
+_checked_files, _expected_hashes = json.loads(os.environ.get(EXPECTED_CODE_VARIABLE, "[{}, {}]"))
 
 
 @contextmanager
@@ -52,31 +58,33 @@ def is_all_code_trusted() -> bool:
     return TRUST_ALL in _trusted_keys()
 
 
-def check_trusted(context: str, code: Path) -> str:
-    """Return the hash of code that `context` names; empty if it is not a file, or all code may run.
-
-    Raises:
-        InputError: this code, with its imports from its folder, is not trusted.
-    """
-    if not os.path.isfile(code) or is_all_code_trusted():
-        return ""
-    sha256 = read_code(code).sha256
-    if not _is_remembered(_trust_key(code, sha256)):
+def check_trusted(context: str, code: UserCode) -> None:
+    """Raise `InputError` if code that `context` names, with its imports from its folder, is not trusted."""
+    if not is_all_code_trusted() and not _is_remembered(_trust_key(code.path, code.sha256)):
         reason = "which you have not run yourself in this version"
-        message = f"{context} names Python code ({str(code)!r}), {reason}"
+        message = f"{context} names Python code ({str(code.path)!r}), {reason}"
         raise InputError(f"{message}: it runs only with {TRUST_CODE_OPTION}")
-    return sha256
 
 
 def check_trusted_values(context: str, values: Any) -> None:
-    """Check all files that texts in `values` can name, as `check_trusted`, and store their hashes."""
-    if isinstance(values, str):
-        for code in _code_files(values):
-            if sha256 := check_trusted(context, code):
-                _expected_hashes[str(code)] = sha256
+    """Check all files that texts in `values` can name, as `check_trusted`; other code is refused there until the end.
+
+    That is code of other files, if links change, and code of files that do not exist yet.
+    """
+    if isinstance(values, str) and not is_all_code_trusted():
+        for name, path in _code_files(context, values):
+            code = read_code(path) if os.path.isfile(path) else None
+            if code is not None:
+                check_trusted(context, code)
+            _checked_files[name], _expected_hashes[str(path)] = str(path), code.sha256 if code else ""
     elif isinstance(values, dict | list):
         for value in values.values() if isinstance(values, dict) else values:
             check_trusted_values(context, value)
+
+
+def resolve_code_path(name: str) -> Path:
+    """Return the path of a file without links: the one that was checked if a configuration has named it."""
+    return Path(_checked_files.get(os.path.join(os.getcwd(), name)) or os.path.realpath(name))
 
 
 def check_code_unchanged(code: UserCode) -> None:
@@ -87,8 +95,8 @@ def check_code_unchanged(code: UserCode) -> None:
 
 
 def expected_code_environment() -> dict[str, str]:
-    """Return the environment variable for a child with the hashes that code must have."""
-    return {EXPECTED_CODE_VARIABLE: json.dumps(_expected_hashes)}
+    """Return the environment variable for a child with the files and hashes that code must have."""
+    return {EXPECTED_CODE_VARIABLE: json.dumps([_checked_files, _expected_hashes])}
 
 
 @contextmanager
@@ -97,6 +105,7 @@ def expecting_code() -> Iterator[None]:
     try:
         yield
     finally:
+        _checked_files.clear()
         _expected_hashes.clear()
 
 
@@ -119,14 +128,19 @@ def remember_trusted(code: Path, sha256: str = "") -> None:
             os.environ[TRUSTED_VARIABLE] = " ".join([*_trusted_keys(), key])
 
 
-def _code_files(text: str) -> Iterable[Path]:
-    """Return all files that a text can name as `path.py:name`, whatever else it contains."""
-    if ".py:" not in text:
-        return set()
+def _code_files(context: str, text: str) -> Iterator[tuple[str, Path]]:
+    """Yield name and path of all files that a text can name as `path.py:name`, whatever else it contains.
+
+    Names are absolute, and keep links and `..`, which can lead through folders that do not exist.
+    """
+    if ".py:" not in text or "\0" in text:
+        return
     starts = [0, *(index + 1 for index, letter in enumerate(text) if letter == "+")]
     ends = [index for index, letter in enumerate(text) if letter == ":"]
-    names = {text[start:end] for start in starts for end in ends if start < end}
-    return {Path(name).resolve() for name in names if os.path.isfile(name)}
+    if len(starts) * len(ends) > MAX_NAMED_FILES:
+        raise InputError(f"{context}: {one_line(text, 60)!r} has too many parts; allowed: fewer + and :")
+    for name in dict.fromkeys(text[start:end] for start in starts for end in ends if start < end):
+        yield os.path.join(os.getcwd(), name), Path(os.path.realpath(name))
 
 
 def _trust_key(code: Path, sha256: str) -> str:

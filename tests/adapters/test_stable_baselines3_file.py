@@ -119,6 +119,16 @@ def test_keys_of_nested_tuples_are_refused_before_torch_hashes_them(tmp_path: Pa
         policy_driver(file)
 
 
+def test_a_pickle_of_millions_of_operations_is_refused_before_they_run(tmp_path: Path) -> None:
+    file, content = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path), io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", b"\x80\x02](" + b"N" * 50_000_000 + b"e.")
+    assert len(content.getvalue()) < 100_000
+    change(file, policy_pth=lambda _: content.getvalue())
+    with pytest.raises(InputError, match=r"driver model\.zip: ValueError: a pickle larger than 1,048,576 bytes"):
+        policy_driver(file)
+
+
 def test_serialized_parts_of_the_data_are_not_read(tmp_path: Path) -> None:
     file = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path)
 

@@ -206,7 +206,7 @@ def test_a_feature_whose_file_is_not_listed_is_never_run(
     hide(manifest["driver"]["drivers"][1])
     content = archive_of(manifest=json.dumps(manifest), weights=weights)
     (tmp_path / "controller.unjam").write_bytes(content)
-    reasons = "recipe lists with their hashes|may not run; use|, as in inputs|runs only with --trust-code"
+    reasons = "recipe lists with their hashes|may not run; use|is not a file|, as in inputs|runs only with --trust-code"
     with pytest.raises(InputError, match=reasons):
         load_controller(tmp_path if own else written(tmp_path, content))
     assert not (tmp_path / "sprung").exists()

@@ -13,8 +13,16 @@ from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_from_recipe, driver_recipe
 from unjam.drivers.residual import ResidualDriver
+from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.user_driver import as_driver
-from unjam.drivers.wrappers import DriverWrapper, HistoryDriver, ImpairedDriver, MixedDriver, RoadTypeSwitch
+from unjam.drivers.wrappers import (
+    DriverWrapper,
+    FilteredDriver,
+    HistoryDriver,
+    ImpairedDriver,
+    MixedDriver,
+    RoadTypeSwitch,
+)
 from unjam.errors import InputError
 from unjam.scenarios import Merge, Ring
 from unjam.tree import map_leaves
@@ -184,3 +192,11 @@ def test_an_impaired_driver_travels_to_another_process() -> None:
     late = ImpairedDriver(make_driver("pi:window=10+idm", 0.1), delay=0.3, gap_noise=0.5)
     assert late.describe() == "pi:window=10.0+idm (delay 0.3 s, gap noise 0.5 m)"
     assert driver_from_recipe(*driver_recipe(late)) == late
+
+
+@pytest.mark.parametrize("actuator", [Actuator(delay=60.0), Actuator(lag=60.0)])
+@pytest.mark.parametrize("step", [1e-3, 1e-9])
+def test_a_filter_with_a_response_of_very_many_steps_is_refused(actuator: Actuator, step: float) -> None:
+    """Each step of the response takes time and memory in each control step."""
+    with pytest.raises(InputError, match=r"actuator.(delay|lag): 60 is not allowed; allowed: at most 1,000 steps of"):
+        FilteredDriver(PI, 2.0, SafetyFilter(), step, actuator)

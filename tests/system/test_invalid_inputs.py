@@ -180,6 +180,10 @@ INVALID: dict[str, tuple[str, list[str]]] = {
     "verifying a missing file": ("does not exist", ["verify none.unjam"]),
     "verifying a file that is not a controller": ("not a controller", ["verify torn.unjam"]),
     "driver of a long name": ("is not a file", [f"drive ring --driver {'a' * 300}.py:x"]),
+    "driver file that is a link to itself": ("loop.py' is not a file", ["drive ring --driver loop.py:x"]),
+    "network that is a link to itself": ("there is no such file", ["drive loop.sumocfg --driver pi"]),
+    "trajectories that are a link to themselves": ("does not exist", ["fit-drivers loop.csv"]),
+    "run that began in a link to itself": ("steps: 'many'", ["train --resume loop"]),
     "deeply nested configuration": ("not TOML", ["train ring --config nested.toml"]),
     "configuration with a number too long": ("not TOML", ["train ring --config number.toml"]),
     "number too long": ("steps: '999", [f"train ring --set steps={'9' * 5000}"]),
@@ -224,6 +228,11 @@ def files(tmp_path: Path, my_drivers: Path) -> None:
     (tmp_path / "nul.toml").write_text('expert = "a\\u0000.py:x"')
     for name, kind in {"complex": np.complex64, "boolean": np.bool_}.items():
         (tmp_path / f"{name}.unjam").write_bytes(with_weights_of(kind))
+    for name in ("loop.py", "loop.sumocfg", "loop.csv", "self"):
+        (tmp_path / name).symlink_to(name)
+    (tmp_path / "loop").mkdir()
+    (tmp_path / "loop" / "config.toml").write_text('steps = "many"')
+    (tmp_path / "loop" / "manifest.json").write_text('{"start_folder": "../self"}')
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "precious.txt").write_text("keep me")
     (tmp_path / "model-free").mkdir()

@@ -26,3 +26,17 @@ def test_commands_print_in_an_encoding_without_their_letters(unjam: Run, argumen
     assert ran.returncode == 0
     assert ran.stdout.isascii()
     assert ran.stderr == ""
+
+
+def test_messages_about_hostile_names_and_columns_are_plain_lines(unjam: Run, tmp_path: Path) -> None:
+    """Those that the logs and the warnings of libraries show, too."""
+    name = "run\x1b[31m\u202e\nunjam: done"
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "config.toml").write_text("ghost = 1")
+    (tmp_path / name / "manifest.json").write_text("{}")
+    rows = "1,2,3,4,5\n" * 300_000
+    (tmp_path / "mixed.csv").write_text(f"pair,time,speed,leader_speed,gap\x1b[31m\n{rows}x,x,x,x,x\n")
+    for arguments in (("runs", "--folder", "."), ("fit-drivers", "mixed.csv")):
+        ran = unjam(*arguments)
+        assert ran.stderr.replace("\n", "").isprintable(), ran.stderr
+        assert not any(line == "unjam: done" for line in ran.stderr.splitlines())

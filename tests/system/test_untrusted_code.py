@@ -30,6 +30,7 @@ COMMANDS = {
     "train with its configuration": ("train", "--config", "run/config.toml", "--out", "new"),
     "train with its best configuration": ("train", "--config", "run/best.toml", "--out", "new"),
     "train with it as agent": ("train", "--config", "run/agent.toml", "--out", "new"),
+    "train with a name that leads through a missing folder": ("train", "--config", "run/indirect.toml", "--out", "new"),
     "resume": ("train", "--resume", "run"),
     "search": ("search", "ring", "--expert", "run", "--vary", VARY, "--out", "new"),
     "search with its configuration": ("search", "--config", "run/config.toml", "--vary", VARY, "--out", "new"),
@@ -49,6 +50,7 @@ def ran(tmp_path: Path) -> Path:
     create_run_folder(run, small_config(expert=f"{code}:gentle", scenario_options__horizon=20))
     (run / "best.toml").write_text((run / "config.toml").read_text())
     (run / "agent.toml").write_text(to_toml(small_config(agent=f"{code}:Agent")))
+    (run / "indirect.toml").write_text(to_toml(small_config(expert=f"{run / 'none' / '..' / 'code.py'}:gentle")))
     code.write_text(DRIVER)
     driver = residual(strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n"))
     (run / "controller.unjam").write_bytes(controller_bytes(driver, {}))

@@ -60,6 +60,13 @@ def test_steps_and_workers_do_not_change_the_fingerprint(tmp_path: Path) -> None
     assert restore_newest_checkpoint(tmp_path, {tmp_path}, fingerprint(small_config(steps=9000, workers=2))) is not None
 
 
+def test_a_long_text_in_a_checkpoint_is_compared_in_time_proportional_to_its_length() -> None:
+    now = fingerprint(small_config())
+    stored = {**now, "settings": {**now["settings"], "expert": "pi" * 10**6}}
+    with pytest.raises(InputError, match=r"^resume: expert: 'pi' is not allowed"):
+        check_fingerprint(stored, now)
+
+
 def of_expert(folder: Path) -> RunConfig:
     (folder / "mine.py").write_text(EXPERT)
     return small_config(expert=f"{folder}/mine.py:gentle")

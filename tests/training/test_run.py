@@ -10,17 +10,25 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save
 
 from unjam.controller import load_controller
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.network import Network
 from unjam.errors import InputError
+from unjam.files import sha256_of
 from unjam.learners.algorithm import TaskEpisodes
 from unjam.learners.settings import unused_tables
 from unjam.reports.results import read_progress
 from unjam.seeds import TEST_SEED, VALIDATION_SEED
 from unjam.training.config import RunConfig, load_config
-from unjam.training.run_folder import create_run_folder, load_checkpoint, resume_run_folder, save_checkpoint
+from unjam.training.run_folder import (
+    CHECKPOINT_FORMAT,
+    create_run_folder,
+    load_checkpoint,
+    resume_run_folder,
+    save_checkpoint,
+)
 from unjam.training.train import IterationCallback, Trainer
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import WorkerPool
@@ -388,3 +396,40 @@ def test_invalid_expert_is_reported(tmp_path: Path, my_drivers: Path, learn: Lea
 def test_invalid_reward_is_reported(tmp_path: Path, my_drivers: Path, learn: Learn) -> None:
     with pytest.raises(InputError, match=r"reward mine\.py:wrong_reward: step 0: term 'speed' is nan"):
         learn(tmp_path / "run", small_config(reward=f"{my_drivers}:wrong_reward"))
+
+
+@pytest.fixture(scope="module")
+def stored_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stored") / "run"
+    with WorkerPool(1) as workers, pytest.raises(Stop):
+        learn_with(workers, folder, small_config(), stop_after(1))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *({name: value} for name in ("iteration", "environment_steps") for value in ("x", None, -1, 1e30, 0.5, [])),
+        *({name: value} for name in ("algorithm", "sampler", "fingerprint") for value in ("x", None, {}, [1])),
+        {"sampler": {"best_returns": "x", "shares": [1.0]}},
+        {"fingerprint": {"settings": {}, "files": {"a": []}, "packages": {}, "kernels": {}}},
+        *({"expert_returns": value} for value in ("x", ["x"], [], [1.0, 2.0])),
+        {"best_validation": "x"},
+        {"ghost": 1},
+    ],
+    ids=str,
+)
+def test_a_checkpoint_with_values_that_unjam_does_not_write_is_refused(
+    change: dict[str, Any], stored_run: Path, learn: Learn, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(stored_run, folder)
+    checkpoint = load_checkpoint(folder / "checkpoint")
+    assert checkpoint is not None
+    shutil.rmtree(folder / "checkpoint")
+    state, tensors = checkpoint
+    content = save(tensors, {"state": json.dumps({**state, "format": CHECKPOINT_FORMAT, **change})})
+    (folder / "checkpoint").mkdir()
+    (folder / "checkpoint" / f"000001-{sha256_of(content)}.safetensors").write_bytes(content)
+    with pytest.raises(InputError, match=r"^(checkpoint|resume): "):
+        learn(folder, small_config(steps=4 * STEPS), resume=True)

@@ -24,6 +24,8 @@ from unjam.physics.arrays import Floats
 DATA_PART, POLICY_PART, PICKLE_SUFFIX = "data", "policy.pth", ".pkl"
 MAX_ARCHIVE_BYTES = 64 * 2**20
 """maximum size of an archive, decompressed"""
+MAX_PICKLE_BYTES = 2**20
+"""maximum size of a pickle, decompressed; that of the usual weights has some kilobytes, and each byte takes 2 us"""
 SAFE_TORCH = (2, 6)
 """version of torch from which on reading weights cannot run code (CVE-2025-32434)"""
 ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {"Tanh": np.tanh, "ReLU": lambda units: np.maximum(units, 0.0)}
@@ -120,12 +122,14 @@ def _read_parts(content: bytes, names: Sequence[str] | None = None) -> dict[str,
 
 
 def _check_pickles(parts: dict[str, bytes]) -> None:
-    """Raise `ValueError` if a pickle has a tuple more than once.
+    """Raise `ValueError` if a pickle is too large, or has a tuple more than once.
 
     Tuples of tuples of the same one are as small in a file as they are large to hash: torch would never end. Shapes of
     weights are tuples that occur once.
     """
     for content in (part for name, part in parts.items() if name.endswith(PICKLE_SUFFIX)):
+        if len(content) > MAX_PICKLE_BYTES:
+            raise ValueError(f"a pickle larger than {MAX_PICKLE_BYTES:,} bytes")
         tuples, previous, count = set[str](), "", 0
         for code, argument, _ in pickletools.genops(content):
             if code.name in ("BINPUT", "LONG_BINPUT", "PUT", "MEMOIZE"):

@@ -1,8 +1,10 @@
 """The command line: `unjam COMMAND`. Commands on the same subject share a module of this package."""
 
+import logging
 import os
 import signal
 import sys
+import warnings
 from importlib import import_module
 from io import TextIOWrapper
 from itertools import pairwise
@@ -116,6 +118,18 @@ def _terminate(signum: int, frame: FrameType | None) -> None:
     raise _Terminated(signum)
 
 
+class _LineFormatter(logging.Formatter):
+    """Formats a log message as one line without control characters, which names in files can have."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(" ".join(super().format(record).split()))
+
+
+def _format_warning(message: Warning | str, category: type[Warning], *place: Any) -> str:
+    """Return a warning without control characters; where in the code it arose is of no use to users."""
+    return printable(f"{category.__name__}: {' '.join(str(message).split())}\n")
+
+
 def main() -> None:
     """Run the command line; print every error that a user can correct as one line, and exit with its code."""
     for stream, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
@@ -124,6 +138,9 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # letters outside of an encoding must not end a command
             stream.reconfigure(errors="replace")
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_LineFormatter())
+    warnings.formatwarning = _format_warning
     mark_as_command_line()
     for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and nohup ignores it
         signum = getattr(signal, name, None)

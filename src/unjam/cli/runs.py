@@ -22,7 +22,7 @@ from unjam.cli.options import (
 )
 from unjam.cli.output import console, err_console, print_json
 from unjam.drivers.registry import DRIVERS
-from unjam.errors import InputError, resume_hint
+from unjam.errors import InputError, printable, resume_hint
 from unjam.measures.statistics import format_difference
 from unjam.processes import check_not_locked, continue_in_limited_child, lock_folder
 from unjam.reports.results import read_progress, read_results
@@ -301,7 +301,8 @@ def remove_command(
         raise InputError("remove: confirmation requires a terminal; allowed: --yes")
     for run in runs:
         size = sum(path.stat().st_size for path in run.folder.rglob("*") if path.is_file()) / 1e6
-        if yes or typer.confirm(f"Remove {run.folder} ({run.state}, {run.steps:,} steps, {size:.0f} MB)?"):
+        question = f"Remove {run.folder} ({run.state}, {run.steps:,} steps, {size:.0f} MB)?"
+        if yes or typer.confirm(printable(question)):
             remove_run(run.folder)
             err_console.print(f"removed {run.folder}")
     if json:

@@ -18,11 +18,11 @@ from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import COMMON_FIELDS, FIELD_SIZES, LocalState
 from unjam.drivers.registry import driver_from_recipe, driver_recipe, user_code_recipes
+from unjam.drivers.user_driver import FileReference
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.files import PACKAGED_PREFIX, UNREADABLE_ERRORS, atomic_write, sha256_of, to_json
 from unjam.physics.arrays import Floats
-from unjam.trust import check_trusted
-from unjam.user_code import read_code
+from unjam.trust import check_trusted, resolve_code_path
 from unjam.worlds.drive import drive_world
 from unjam.worlds.world import RecordedWorld
 
@@ -180,13 +180,14 @@ def _check_signature(file: Path, parts: dict[str, bytes]) -> str:
 def _check_code(name: str, recipe: Any, is_in_folder: bool) -> None:
     """Raise `InputError` if a driver is Python code outside of a run folder, changed since, or not trusted."""
     for reference in user_code_recipes(recipe):
-        code = Path(reference["path"]).resolve()
+        path = resolve_code_path(reference["path"])
         if not is_in_folder:
             reason = "which a file by itself may not run; use the run folder"
-            raise InputError(f"controller {name}: part of it is Python code ({code.name}), {reason}")
-        if code.is_file() and read_code(code).sha256 != reference["sha256"]:
+            raise InputError(f"controller {name}: part of it is Python code ({path.name}), {reason}")
+        code = FileReference(path, reference["name"]).read_code()
+        if code.sha256 != reference["sha256"]:
             allowed = "allowed: as it was when it was trained, or train again"
-            raise InputError(f"controller {name}: its code {str(code)!r} has changed since; {allowed}")
+            raise InputError(f"controller {name}: its code {str(path)!r} has changed since; {allowed}")
         check_trusted(f"controller {name}", code)
 
 

@@ -25,7 +25,7 @@ class RoadsideSettings(Subclassable):
     vehicles that pass detectors in each lane, as means of the last `averaging_time` but one; or none"""
     averaging_time: Positive = 60.0
     """time over which the speeds of CAVs, or those at detectors, are averaged [s]"""
-    detector_spacing: Positive = 500.0
+    detector_spacing: Annotated[float, Field(ge=1)] = 500.0
     """distance between two detectors; the first one is half of it downstream of the entrance [m]"""
     latency: NonNegative = 0.0
     """time from measurement to arrival [s]"""

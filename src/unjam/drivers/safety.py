@@ -28,6 +28,8 @@ class ActuatorState(NamedTuple):
 
 Latency = Annotated[float, Field(ge=0, le=60)]
 """delay or time constant of an actuator; a pending command needs memory in each step [s]"""
+MAX_RESPONSE_STEPS = 1000
+"""most steps that a command can take to arrive, or that the time constant of a lag can last"""
 MIN_TIME_GAP_BRAKING = 0.5
 """smallest braking with which a filter can keep a time gap: it follows the plan to standstill step by step [m/s2]"""
 
@@ -52,6 +54,13 @@ class Actuator(Subclassable):
     def initial_state(self, like: Array, step: float) -> ActuatorState:
         """Return the state without acceleration and commands, for vehicles in the shape of `like`."""
         return ActuatorState(0.0 * like, (0.0 * like,) * self.delay_steps(step))
+
+    def check_step(self, step: float) -> None:
+        """Raise `ValueError` if the response takes more than `MAX_RESPONSE_STEPS`, each of which takes time."""
+        for name, value in (("delay", self.delay), ("lag", self.lag)):
+            if value > MAX_RESPONSE_STEPS * step:
+                allowed = f"at most {MAX_RESPONSE_STEPS:,} steps of {step:g} s"
+                raise ValueError(f"actuator.{name}: {value:g} is not allowed; allowed: {allowed}")
 
     def delay_steps(self, step: float) -> int:
         """Return the number of simulation steps until a command arrives."""

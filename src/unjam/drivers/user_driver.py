@@ -24,7 +24,7 @@ from unjam.errors import InputError, invalid_value
 from unjam.physics.arrays import Array
 from unjam.processes import ending_forks, redirect_user_output
 from unjam.tree import map_leaves
-from unjam.trust import check_code_unchanged, remember_trusted
+from unjam.trust import check_code_unchanged, remember_trusted, resolve_code_path
 from unjam.user_code import UserCode, read_code
 
 _module_lock = RLock()
@@ -130,7 +130,7 @@ class FileReference:
         if "\0" in text:
             raise InputError(f"Python file: {text!r} is not allowed; allowed: path.py:name")
         path, _, name = text.rpartition(":")
-        return cls(Path(path).resolve(), name)
+        return cls(resolve_code_path(path), name)
 
     def __str__(self) -> str:
         return f"{self.path.name}:{self.name}"
@@ -252,7 +252,7 @@ class FileDriver(FileReference, UserDriver):
     implementation: Any = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "path", self.path.resolve())
+        object.__setattr__(self, "path", resolve_code_path(str(self.path)))
         code = self.read_code()
         made = _make_implementation(self.load_object(code), self.time_step, str(self), self.parameters)
         object.__setattr__(self, "implementation", made)

@@ -199,6 +199,7 @@ class FilteredDriver(DriverWrapper):
     @model_validator(mode="after")
     def _check_delay(self) -> "FilteredDriver":
         delay, step = self.actuator.delay, self.time_step
+        self.actuator.check_step(step)
         if abs(delay - step * self.actuator.delay_steps(step)) > MAX_DELAY_ERROR:
             raise ValueError(f"actuator.delay: {delay:g} is not allowed; allowed: whole control steps of {step:g} s")
         return self

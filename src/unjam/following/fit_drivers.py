@@ -1,5 +1,6 @@
 """Calibration of a population of human drivers to recorded trajectories (`unjam fit-drivers`)."""
 
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, field, replace
 from dataclasses import dataclass as plain_dataclass
@@ -157,7 +158,7 @@ def fit_drivers_from_files(
 def _name_prefixes(files: Sequence[Path]) -> list[str]:
     """Return a prefix for the names of drivers in each file, because drivers in different files are different."""
     for number, file in enumerate(files):
-        if file.resolve() in [other.resolve() for other in files[:number]]:
+        if os.path.realpath(file) in map(os.path.realpath, files[:number]):
             raise invalid_value("data", str(file), "each file once")
     stems = [file.stem for file in files]
     if len(set(stems)) < len(stems):

@@ -14,7 +14,7 @@ from safetensors.numpy import load
 
 from unjam.errors import InputError, resume_hint
 from unjam.files import INVALID_DATA_ERRORS, read_json_lines, sha256_of
-from unjam.folders import reject_special_files
+from unjam.folders import reject_unsafe_files
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import METRICS
 from unjam.worlds.record import Episode, Floats
@@ -155,7 +155,7 @@ def read_results(folder: Path) -> Results:
         if not (folder / name).is_file():
             hint = resume_hint(folder) if (folder / "config.toml").exists() else ""
             raise InputError(f"report: {str(folder)!r} has no {name}{hint}")
-    reject_special_files(folder)
+    reject_unsafe_files(folder)
     metadata, rows = read_evaluation(folder)
     try:
         packed = (folder / PLOT_EPISODES_FILE).read_bytes()

@@ -12,8 +12,10 @@ from unjam.physics.arrays import Array
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.ring import EdgeSpan, LoopScenario
 from unjam.scenarios.road import ClosedRoad, Connection, Edge, Node, Polyline, RoadNetwork, as_polyline
-from unjam.scenarios.scenario import VEHICLE_LENGTH, HumanControl
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Horizon, HumanControl
 
+Radius = Annotated[int, Field(ge=15, le=10_000_000)]
+"""[m]"""
 CROSSING_RADIUS = 3.1
 """radius of the node at the crossing [m], as in Flow"""
 CROSSING_LINK = 9.4
@@ -64,14 +66,14 @@ class FigureEight(LoopScenario):
         "the speed at which the queue of all vehicles just clears the crossing in half a lap"
     )
 
-    radius: Annotated[tuple[Annotated[int, Field(ge=15)], Annotated[int, Field(ge=15)]], NumberOrRange] = (32, 35)
+    radius: Annotated[tuple[Radius, Radius], NumberOrRange] = (32, 35)
     """range of the radius, drawn uniformly among its integers; or a single radius [m]"""
     vehicles: Annotated[int, Field(ge=2)] = 14
     cavs: PositiveInt = 1
     """number of CAVs, evenly spread; the first leads the queue"""
     free_length: NonNegative = 50.0
     """free road ahead of the first vehicle at the start [m]; Flow's `bunching`"""
-    horizon: PositiveInt = 1500
+    horizon: Horizon = 1500
     """control steps in an episode"""
     human_control: HumanControl = "commanded"
     impatience: Annotated[float, Field(ge=0, le=1)] = 0.5

@@ -10,12 +10,13 @@ from pydantic import Field, model_validator
 
 from unjam.drivers.car_following import MIN_IDM_GAP
 from unjam.drivers.safety import SafetyFilter
+from unjam.errors import invalid_value
 from unjam.parameters import STRICT, NonNegative, NonNegativeInt, Positive, PositiveInt, parameter_dataclass
 from unjam.physics.arrays import clamp_min
 from unjam.physics.idm import IDMParameters, idm_acceleration
 from unjam.physics.kinematics import next_position, next_speed
 from unjam.scenarios.road import Edge, Entry, MergeRoad, Node, Origin, RoadNetwork, Route
-from unjam.scenarios.scenario import VEHICLE_LENGTH, HumanControl, Scenario
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Horizon, HumanControl, Scenario, SimulationStep
 
 MERGE_INFLOW_LENGTH, MERGE_HIGHWAY_LENGTH, MERGE_EXIT_LENGTH, MERGE_RAMP_LENGTH = 100.0, 500.0, 100.0, 100.0
 """lengths of the edges on which vehicles enter, of the highway upstream and downstream of the ramp, of the ramp [m]"""
@@ -29,6 +30,8 @@ HIGHWAY_ENTRY_SPEED, MERGE_RAMP_ENTRY_SPEED = 10.0, 7.5
 """speed of vehicles that enter [m/s]"""
 RAMP_ANGLE = pi / 4
 """between ramp and highway [rad]"""
+MAX_FREE_FLOW_SECONDS = 3600.0
+"""longest time in which a vehicle passes the highway in free flow [s]"""
 PLATOON_SIZE = 30
 """number of vehicles after which each one drives like the one before it"""
 HIGHWAY_BRANCH, RAMP_BRANCH = 0, 1
@@ -61,9 +64,9 @@ class Merge(Scenario):
     """exact number of CAVs instead of a share, among the vehicles of the first half"""
     standing_vehicles: NonNegativeInt = 5
     """human-driven vehicles that stand on the highway at the start, evenly spread"""
-    simulation_step: Positive = 0.2
+    simulation_step: SimulationStep = 0.2
     steps_per_control_step: PositiveInt = 5
-    horizon: PositiveInt = 600
+    horizon: Horizon = 600
     """control steps in an episode"""
     human_control: HumanControl = "commanded"
     right_of_way: bool = False
@@ -83,6 +86,11 @@ class Merge(Scenario):
         if self.human_control == "native":
             raise ValueError("human_control: 'native' is not allowed on the merge; allowed: 'commanded'")
         return self
+
+    @property
+    def max_vehicles(self) -> float:
+        """Vehicles of both flows."""
+        return self.max_duration * (self.inflow + self.ramp_flow) / 3600.0
 
     def draw(self, generator: np.random.Generator) -> MergeRoad:
         """Return the road with all vehicles that can enter; the choice of CAVs is random."""
@@ -155,6 +163,9 @@ def _free_flow_speed(flow: float, length: float, humans: IDMParameters, step: fl
     for _ in range(PLATOON_SIZE):
         own = [(0.0, HIGHWAY_ENTRY_SPEED)]
         while own[-1][0] < length:
+            if len(own) * step > MAX_FREE_FLOW_SECONDS:
+                allowed = f"human drivers that need at most {MAX_FREE_FLOW_SECONDS:g} s for {length:g} m"
+                raise invalid_value("humans", humans, allowed)
             position, speed = own[-1]
             index = len(own) - 1 + delay
             leader_position, leader_speed = leader[index] if index < len(leader) else (inf, speed)

@@ -22,7 +22,7 @@ from unjam.scenarios.motorway_vehicles import (
 )
 from unjam.scenarios.road import Entry, VehicleType
 from unjam.scenarios.road_control import RampMeter, SpeedLimitControl
-from unjam.scenarios.scenario import Actuation, Scenario
+from unjam.scenarios.scenario import Actuation, Horizon, Scenario, SimulationStep
 
 MAX_LANES = 5
 MIN_RAMP_HEADWAY = 2.0
@@ -36,7 +36,7 @@ DEMAND_STEP = 60.0
 HUMAN_TYPE_COUNT = 200
 """number of different human drivers"""
 Arrival = tuple[float, str, int, float | Literal["last"]]
-Section = Annotated[float, Field(ge=50)]
+Section = Annotated[float, Field(ge=50, le=1_000_000)]
 """length of a part of the road [m]"""
 
 
@@ -94,7 +94,7 @@ class Motorway(Scenario):
     """demand at the entrance before and after the peak [veh/h]"""
     peak: Interval = (300.0, 1500.0)
     """its begin and end [s]"""
-    peak_rise: NonNegative = 0.0
+    peak_rise: Annotated[float, Field(ge=0, le=86_400)] = 0.0
     """time in which demand rises before the peak, and falls after it, in steps of a minute [s]"""
     min_entry_headway: NonNegative = 1.1
     """smallest time between two vehicles that want to enter a lane of the motorway [s]"""
@@ -127,9 +127,9 @@ class Motorway(Scenario):
     """meters at all ramps"""
     roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
     """latency and smoothing of the speeds ahead that CAVs receive"""
-    simulation_step: Positive = 0.5
+    simulation_step: SimulationStep = 0.5
     steps_per_control_step: PositiveInt = 2
-    horizon: PositiveInt = 2400
+    horizon: Horizon = 2400
     """control steps in an episode"""
     action_limit: Positive = 2.5
     actuation: Actuation = "cruise"
@@ -179,6 +179,15 @@ class Motorway(Scenario):
                 allowed = f"<= {most:g}, the speed of the slowest drivers"
                 raise ValueError(f"{name}.entry_speed: {ramp.entry_speed:g} is not allowed; allowed: {allowed}")
             upstream_end, upstream_part = geometry.merge_end, f"the merging section of {name}"
+
+    @property
+    def max_vehicles(self) -> float:
+        """Twice as many as the largest demand has: headways are random."""
+        return self.max_duration / 3600.0 * 2.0 * sum(max(each.inflow, each.off_peak_inflow) for each in self._sources)
+
+    @property
+    def _sources(self) -> tuple["Motorway | Ramp", ...]:
+        return self, *self.ramps
 
     def draw(self, generator: np.random.Generator) -> MotorwayRoad:
         """Return the road with its demand; random are the human drivers, their entry times and the choice of CAVs."""
@@ -329,16 +338,13 @@ class Motorway(Scenario):
 
     def possible_cav_ids(self) -> tuple[str, ...]:
         """Return the ids of all vehicles: each can be a CAV."""
-        flow = sum(max(each.inflow, each.off_peak_inflow) for each in (self, *self.ramps))
-        most = int(self.max_duration / 3600.0 * 2.0 * flow)
-        return tuple(f"vehicle_{number}" for number in range(most))
+        return tuple(f"vehicle_{number}" for number in range(int(self.max_vehicles)))
 
     def _fact_values(self) -> tuple[str, str, str, str]:
         lanes = "one lane" if self.lanes == 1 else f"{self.lanes} lanes"
         ramps = {0: "without ramps", 1: "with a ramp"}.get(len(self.ramps), f"with {len(self.ramps)} ramps")
         peak, off_peak = (
-            " + ".join(f"{getattr(each, name):g}" for each in (self, *self.ramps))
-            for name in ("inflow", "off_peak_inflow")
+            " + ".join(f"{getattr(each, name):g}" for each in self._sources) for name in ("inflow", "off_peak_inflow")
         )
         peak = f"{peak} veh/h from {self.peak[0]:g} to {self.peak[1]:g} s"
         vehicles = f"{peak}, else {off_peak} ({100 * self.penetration_rate:g} % CAV)"

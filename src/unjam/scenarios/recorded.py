@@ -10,20 +10,20 @@ from dataclasses import field, replace
 from functools import cached_property
 from math import ceil, floor, nan
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from unjam.drivers.command import Limits
 from unjam.drivers.safety import Actuator
 from unjam.errors import InputError
-from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, parameter_dataclass
+from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
 from unjam.physics.arrays import Floats
 from unjam.physics.idm import IDMParameters, equilibrium_gap
 from unjam.recordings.leaders import LeaderRecording, recording_files
 from unjam.scenarios.road import Edge, Entry, Node, RecordedRoad, Road, RoadNetwork, Route
-from unjam.scenarios.scenario import MAX_HORIZON, VEHICLE_LENGTH, Scenario
+from unjam.scenarios.scenario import VEHICLE_LENGTH, Horizon, Scenario
 
 LEADER_ID = "leader"
 EDGE_NAME = "road"
@@ -66,7 +66,7 @@ class Recorded(Scenario):
     """time in the recording at which an episode begins [s]"""
     window: NonNegative = 0.0
     """duration of the random part of a recording that each episode has [s]; 0: all of it"""
-    horizon: Annotated[PositiveInt, Field(le=MAX_HORIZON)] = 20_000
+    horizon: Horizon = 20_000
     """most control steps in an episode, which ends with its recording"""
     action_limit: Positive = 3.0
     """hardest braking that a CAV can command [m/s2]"""

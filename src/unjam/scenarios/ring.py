@@ -16,6 +16,8 @@ from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
 RING_EDGES = 4
 """number of edges of a ring"""
+LoopSize = Annotated[int, Field(ge=10, le=10_000_000)]
+"""length or radius of a closed road [m]"""
 MAX_CACHED_ROADS = 256
 """roads that are kept for later episodes: as many sizes as the default ranges have, and more"""
 
@@ -65,6 +67,11 @@ class LoopScenario(Scenario):
                 "does not know; allowed: commanded"
             )
         return self
+
+    @property
+    def max_vehicles(self) -> float:
+        """All on the road."""
+        return self.vehicles
 
     def build(self, size: float) -> ClosedRoad:
         """Return the road of a given size [m] with its vehicles."""
@@ -168,7 +175,7 @@ class Ring(LoopScenario):
     description: ClassVar[str] = "ring of {} m"
     limit_description: ClassVar[str] = "the IDM's equilibrium speed, which all vehicles could keep forever"
 
-    length: Annotated[tuple[Annotated[int, Field(ge=10)], Annotated[int, Field(ge=10)]], NumberOrRange] = (220, 270)
+    length: Annotated[tuple[LoopSize, LoopSize], NumberOrRange] = (220, 270)
     """range of the length, drawn uniformly among its integers; or a single length [m]"""
 
     @model_validator(mode="after")

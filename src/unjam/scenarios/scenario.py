@@ -48,6 +48,10 @@ IDM_SUBSTEP = 0.25
 """approximate length of the steps into which SUMO's IDM divides a simulation step [s]"""
 MAX_HORIZON = 10_000_000
 """control steps of the longest episode: twelve days of 0.1 s; more would fill the memory"""
+MAX_EPISODE_STEPS = 10 * MAX_HORIZON
+"""simulation steps of the longest episode"""
+MAX_EPISODE_VEHICLES, MAX_EPISODE_DISTANCE = 1_000_000, 1_000_000_000
+"""most vehicles that want to drive in an episode, and longest distance that the fastest could drive [m]"""
 
 Actuation = Literal["shielded", "raw", "flow", "cruise"]
 HumanControl = Literal["native", "commanded"]
@@ -118,6 +122,12 @@ def whole_milliseconds(step: float) -> float:
     return step
 
 
+SimulationStep = Annotated[float, Field(ge=0.001, le=10), AfterValidator(whole_milliseconds)]
+"""a time step of SUMO [s]"""
+Horizon = Annotated[PositiveInt, Field(le=MAX_HORIZON)]
+"""control steps in an episode"""
+
+
 def sumo_seed(seed: Sequence[int]) -> int:
     """Return the value of SUMO's option `--seed` in the episode of a seed."""
     return int(_spawn_seeds(seed)[3].generate_state(1)[0]) % 2**31
@@ -150,11 +160,11 @@ class Scenario(Subclassable):
     sumo_human_gap: ClassVar[float] = 0.0
     """gap that SUMO keeps for commanded human drivers [m]"""
 
-    simulation_step: Annotated[Positive, AfterValidator(whole_milliseconds)] = 0.1
+    simulation_step: SimulationStep = 0.1
     """time step of SUMO [s]"""
     steps_per_control_step: PositiveInt = 1
     """simulation steps for which one command is applied"""
-    horizon: Annotated[PositiveInt, Field(le=MAX_HORIZON)] = 3000
+    horizon: Horizon = 3000
     """control steps in an episode"""
     warmup: NonNegativeInt = 0
     """simulation steps with human drivers alone, before the CAVs take over"""
@@ -206,10 +216,24 @@ class Scenario(Subclassable):
         return self
 
     @model_validator(mode="after")
+    def _check_extent(self) -> Self:
+        """Refuse episodes that would take years, or more vehicles than fit into memory."""
+        steps = self.warmup + self.horizon * self.steps_per_control_step
+        for name, value, largest in (
+            ("steps_per_control_step, warmup", steps, MAX_EPISODE_STEPS),
+            ("vehicles of an episode", self.max_vehicles, MAX_EPISODE_VEHICLES),
+            ("meters of an episode at top speed", self.max_duration * self.top_speed, MAX_EPISODE_DISTANCE),
+        ):
+            if not value <= largest:
+                raise ValueError(f"{name}: {value:.10g} is not allowed; allowed: <= {largest:,}")
+        return self
+
+    @model_validator(mode="after")
     def _check_filter_and_acc(self) -> Self:
         for name in ("acceleration", "deceleration"):
             if not self.has_vehicle_types and getattr(self.cruise, name) is None:
                 raise ValueError(f"cruise.{name}: None is not allowed on {self.title}; allowed: > 0")
+        self.actuator.check_step(self.simulation_step)
         for name in ("gap_error", "speed_error"):
             known, largest = getattr(self.safety, name), getattr(self.sensors, name)
             if self.safety.active and known < largest:
@@ -256,6 +280,11 @@ class Scenario(Subclassable):
     def max_duration(self) -> float:
         """Longest duration of an episode, warm-up included [s]."""
         return self.simulation_step * (self.warmup + self.horizon * self.steps_per_control_step)
+
+    @property
+    def max_vehicles(self) -> float:
+        """Number of vehicles that want to drive in an episode, as far as the settings alone say; 0: unknown."""
+        return 0.0
 
     @property
     def max_episode_steps(self) -> int:

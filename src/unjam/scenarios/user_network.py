@@ -1,6 +1,7 @@
 """The user network: any SUMO network with its traffic, in which some vehicles become CAVs."""
 
 import logging
+import os
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import field, replace
@@ -216,7 +217,7 @@ def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
 
     Raise `InputError` with one line about what is missing or broken, before SUMO starts.
     """
-    files = read_sumo_files(Path(file).resolve())
+    files = read_sumo_files(Path(os.path.realpath(file)))
     _log_once(*notes_on_files(files, MAX_LOGGED_NAMES))
     if isinstance(cruise := changes.get("cruise", {}), dict):
         changes = {**changes, "cruise": {"acceleration": None, "deceleration": None, **cruise}}

@@ -53,13 +53,16 @@ def class_recipe(kind: type[Scenario]) -> dict[str, Any]:
     raise InputError(f"scenario: the class {object_label(kind)} {reason}; allowed: path.py:name{hint}")
 
 
-def load_class(code: dict[str, Any]) -> type[Scenario]:
+def class_reference(code: Any) -> FileReference:
+    """Return the reference to the class of a recipe, with its hash; raise `InputError` if it is none."""
+    if not isinstance(code, dict) or not all(code.get(key) for key in ("path", "name", "sha256")):
+        raise invalid_value("scenario.code", code, "a table with path, name and sha256")
+    return FileReference(Path(str(code["path"])), str(code["name"]), sha256=str(code["sha256"]))
+
+
+def load_class(code: Any) -> type[Scenario]:
     """Return the class of a recipe; raise `InputError` if its file has changed."""
-    try:
-        reference = FileReference(Path(code["path"]), code["name"], sha256=code["sha256"])
-    except (KeyError, TypeError):
-        raise invalid_value("scenario.code", code, "a table with path, name and sha256") from None
-    found = _load_object(reference)
+    found = _load_object(class_reference(code))
     return found if isinstance(found, type) else type(found)
 
 

@@ -1,5 +1,6 @@
 """The validated configuration of a training run, from TOML, command-line options and Python."""
 
+import os
 import re
 from collections.abc import Sequence
 from contextlib import suppress
@@ -291,7 +292,8 @@ def _start_folder(run: Path) -> Path:
     for folder in (run, run.parent):
         with suppress(OSError, ValueError, LookupError, TypeError):
             if (folder / MANIFEST_FILE).is_file():
-                return (folder / parse_json((folder / MANIFEST_FILE).read_bytes())["start_folder"]).resolve()
+                start = parse_json((folder / MANIFEST_FILE).read_bytes())["start_folder"]
+                return Path(os.path.realpath(folder / start))
     return Path.cwd()
 
 

@@ -23,7 +23,7 @@ from unjam.processes import PrivateFolder
 from unjam.reports.results import EVALUATION_FILE, read_evaluation
 from unjam.scenarios import example_scenario, scenario_from_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.scenarios.user_scenario import CODE_ENTRY
+from unjam.scenarios.user_scenario import CODE_ENTRY, class_reference
 from unjam.seeds import held_out_seeds
 from unjam.training.evaluate import TRAINED_LABEL, raise_failure
 from unjam.training.run_folder import check_run_files, controller_origin, read_config
@@ -220,7 +220,7 @@ def _read_scenario(file: Path, recipe: dict[str, Any] | None) -> Scenario:
     if recipe is None:
         return example_scenario("ring")
     if code := recipe.get(CODE_ENTRY):
-        check_trusted(f"controller {file.name}", Path(str(code.get("path"))))
+        check_trusted(f"controller {file.name}", class_reference(code).read_code())
     return scenario_from_recipe(recipe)
 
 

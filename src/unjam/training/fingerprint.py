@@ -42,6 +42,7 @@ def fingerprint(config: RunConfig) -> dict[str, Any]:
 
 def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
     """Raise `InputError` if a setting, the expert or a user file has changed; warn of other packages and kernels."""
+    _check_form(stored, "resume")
     for name, value in current["settings"].items():
         if name in stored["settings"] and _without_folders(stored["settings"][name]) != _without_folders(value):
             raise invalid_value(f"resume: {name}", value, f"{stored['settings'][name]!r}, as in the checkpoint")
@@ -60,6 +61,7 @@ def code_hashes(config: RunConfig) -> dict[str, str]:
 
 def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: str) -> None:
     """Raise `InputError` if the expert or a file of the user has changed."""
+    _check_form(stored, command)
     before, now = (
         {(_without_folders(name.removeprefix("expert ")), sha256): name for name, sha256 in each["files"].items()}
         for each in (stored, current)
@@ -69,9 +71,17 @@ def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: 
         raise InputError(f"{command}: {name} has changed since the checkpoint; allowed: as it was then")
 
 
+def _check_form(stored: Any, command: str) -> None:
+    """Raise `InputError` unless a stored fingerprint has the tables of one."""
+    tables = ("settings", "files", "packages", "kernels")
+    has_tables = isinstance(stored, dict) and all(isinstance(stored.get(name), dict) for name in tables)
+    if not has_tables or not all(isinstance(each, str) for each in stored["files"].values()):
+        raise InputError(f"{command}: the checkpoint has no fingerprint of a run; allowed: a checkpoint of unjam")
+
+
 def _without_folders(value: Any) -> str:
     """Return a JSON value as a text without the folders of files, which depend on the working folder."""
-    return re.sub(r'[^+"]*/', "", json.dumps(value))
+    return re.sub(r'(?<![^+"])[^+"]*/', "", json.dumps(value))
 
 
 def file_hashes(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:

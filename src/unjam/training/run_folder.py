@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tomli_w
 
@@ -34,9 +34,9 @@ from unjam.files import (
     sha256_of,
     to_json,
 )
-from unjam.folders import reject_special_files
+from unjam.folders import reject_unsafe_files
 from unjam.manifest import manifest, package_versions
-from unjam.parameters import build_dataclass, read_toml
+from unjam.parameters import build_dataclass, check_integer, read_toml
 from unjam.processes import LOCK_FILE, lock_folder
 from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
@@ -60,6 +60,18 @@ CHECKPOINT_NAME = re.compile(r"\d{6,}-[0-9a-f]{64}\.safetensors")
 """file name of a checkpoint: iteration and hash of the content"""
 ROW_MODEL_FIELDS = {"distance_to_crossing", "penetration_rate"}
 """optional inputs that the row model continues"""
+
+
+class CheckpointValues(NamedTuple):
+    """The values of a checkpoint, without its tensors."""
+
+    iteration: int
+    environment_steps: int
+    algorithm: Any
+    fingerprint: dict[str, Any]
+    sampler: dict[str, list[float]]
+    best_validation: float
+    expert_returns: list[float]
 
 
 def check_config(config: RunConfig) -> None:
@@ -191,7 +203,7 @@ def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {CONFIG_FILE}")
-    reject_special_files(folder)
+    reject_unsafe_files(folder)
     try:
         if check_trust:
             return load_config(path)
@@ -308,6 +320,7 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
             raise InputError(
                 f"checkpoint: {path} has format {found!r}, of another version of unjam; allowed: {CHECKPOINT_FORMAT}"
             )
+        check_integer("checkpoint: iteration", state.get("iteration"), 0)
         return state, tensors
     if paths := _checkpoint_files(folder):
         raise InputError(f"checkpoint: all {len(paths)} under {folder} are damaged")

@@ -17,14 +17,15 @@ from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.user_driver import is_file_reference
-from unjam.errors import UnjamError, invalid_value
-from unjam.files import append_line, atomic_write, make_folder, to_json
+from unjam.errors import InputError, UnjamError, invalid_value, one_line
+from unjam.files import UNREADABLE_ERRORS, append_line, atomic_write, make_folder, to_json
 from unjam.kernels import needs_new_process
 from unjam.learners.agent import AgentSpec, check_network, check_state, learner_class, reporting_user_errors
 from unjam.learners.algorithm import (
     Collector,
     IterationLog,
     TaskEpisodes,
+    Tensors,
     run_iterations,
     seed_iteration,
     tensors_with_prefix,
@@ -53,6 +54,7 @@ from unjam.training.fingerprint import check_file_hashes, code_hashes, fingerpri
 from unjam.training.model_facts import no_facts_reason, write_model_facts
 from unjam.training.string_limit import find_operating_points
 from unjam.training.task_sampling import TaskSampler, make_episodes, warm_up_iterations
+from unjam.tree import unpack
 from unjam.trust import expecting_code
 from unjam.worlds.batch.run import run_batched_if_supported
 from unjam.worlds.worker_pool import WorkerPool
@@ -240,18 +242,25 @@ class Trainer:
         self._controllers = ControllerStore(self.folders)
         self._fingerprint = fingerprint(config)
         if checkpoint := run_folder.restore_newest_checkpoint(folder, {folder, *self.folders}, self._fingerprint):
-            state, tensors = checkpoint
-            is_stopped = config.evaluation.should_stop_early(read_progress(folder))
-            is_finished = is_stopped or state["environment_steps"] >= config.steps
-            self._controllers.restore(tensors, is_finished)
-            self.collector.iteration = state["iteration"]
-            self.collector.environment_steps = state["environment_steps"]
-            with reporting_user_errors(config.agent):
-                self.algorithm.restore(state["algorithm"], tensors_with_prefix(ALGORITHM_PREFIX, tensors))
-            self._best_validation = state["best_validation"]
-            self._expert_returns = state["expert_returns"]
-            self._sampler.restore(state["sampler"])
-            run_folder.append_lineage(folder, state["iteration"])
+            try:
+                self._restore(*checkpoint)
+            except UNREADABLE_ERRORS as error:
+                reason = f"is none of this run: {type(error).__name__}: {one_line(error)}"
+                raise InputError(f"checkpoint: that of {str(folder)!r} {reason}; allowed: remove it") from None
+            run_folder.append_lineage(folder, self.collector.iteration)
+
+    def _restore(self, values: dict[str, Any], tensors: Tensors) -> None:
+        """Continue from a checkpoint; raise one of `UNREADABLE_ERRORS` if another program has written it."""
+        state = unpack(run_folder.CheckpointValues, values, {})
+        if not 0 < state.iteration <= state.environment_steps or len(state.expert_returns) != len(self.tasks):
+            raise ValueError("its numbers contradict each other")
+        is_stopped = self.config.evaluation.should_stop_early(read_progress(self.folder))
+        self._controllers.restore(tensors, is_stopped or state.environment_steps >= self.config.steps)
+        self.collector.iteration, self.collector.environment_steps = state.iteration, state.environment_steps
+        with reporting_user_errors(self.config.agent):
+            self.algorithm.restore(state.algorithm, tensors_with_prefix(ALGORITHM_PREFIX, tensors))
+        self._best_validation, self._expert_returns = state.best_validation, state.expert_returns
+        self._sampler.restore(state.sampler)
 
     def _string_gain_function(self) -> Callable[[Network], float]:
         """Return the function that measures the largest string gain of the policy on all closed roads."""
@@ -347,14 +356,14 @@ class Trainer:
 
     def _save_checkpoint(self) -> None:
         values, tensors = check_state(self.config.agent, self.algorithm.state())
-        state = {
+        state = run_folder.CheckpointValues(
             **self._counters,
-            "algorithm": values,
-            "fingerprint": self._fingerprint,
-            "sampler": self._sampler.state(),
-            "best_validation": self._best_validation,
-            "expert_returns": self._expert_returns,
-        }
+            algorithm=values,
+            fingerprint=self._fingerprint,
+            sampler=self._sampler.state(),
+            best_validation=self._best_validation,
+            expert_returns=self._expert_returns,
+        )._asdict()
         own = {f"{ALGORITHM_PREFIX}{name}": tensor for name, tensor in tensors.items()}
         run_folder.save_checkpoint(self.folder / "checkpoint", state, own | self._controllers.tensors())
 

@@ -42,6 +42,18 @@ def test_the_totals_that_sumo_writes_at_the_end_are_counts_of_examples(tmp_path:
     assert {each.example: each.count for each in read_warnings(log)} == {stop(1): 900_000, other: 1}
 
 
+def test_names_of_strangers_cannot_make_a_log_endless_to_read(tmp_path: Path) -> None:
+    log = tmp_path / "error.log"
+    form, digits = "%a" * 40, "9" * 5000
+    totals = [f"Warning: {number} total messages of type: {form}b" for number in (7, digits)]
+    log.write_text(
+        "\n".join([f"Warning: {'a' * 5000}", "Warning: x[1]*y", *totals, "Warning: 3 total messages of type: x[%]*y\n"])
+    )
+    counts = {each.example: each.count for each in read_warnings(log)}
+    assert counts["a" * MAX_EXAMPLE_LENGTH] == 1
+    assert counts["x[1]*y"] == 3
+
+
 def test_the_size_of_a_log_that_is_read_is_limited(tmp_path: Path) -> None:
     log = tmp_path / "error.log"
     log.write_text(f"Warning: {'long ' * 200}\n" + "".join(f"Warning: {stop(n)}\n" for n in range(40_000)))

@@ -1,7 +1,9 @@
 """SUMO's output: trip records (`tripinfo-output`, which take no measurable time), and warnings in its error log."""
 
+import glob
 import re
 from collections import Counter
+from fnmatch import fnmatchcase
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,7 +21,7 @@ MAX_LOG_BYTES = 2**20
 MAX_EXAMPLE_LENGTH = 300
 MAX_EXAMPLES_OPTION = "1"
 """value of SUMO's option aggregate-warnings: further messages of a kind are only counted"""
-_TOTAL_PATTERN = re.compile(rf"(\d+) {MESSAGE_TOTAL_MARKER} (.*)")
+_TOTAL_PATTERN = re.compile(rf"(\d{{1,12}}) {MESSAGE_TOTAL_MARKER} (.*)")
 _VARIABLE_PATTERN = re.compile(r"'[^']*'|(?<==)[^\s,;]*[^\s,;.!]|[-+]?\b\d+(?:\.\d+)?\b")
 """variable parts of the messages of a kind: quoted names, values after =, and numbers"""
 SEPARATELY_COUNTED = re.compile(
@@ -83,8 +85,8 @@ def read_warnings(log_path: Path) -> tuple[SumoWarning, ...]:
             examples.setdefault(kind, message)
             counts[kind] += 1
     for count, form in totals:  # includes the example
-        pattern = re.compile(".*".join(map(re.escape, form.split("%"))))
-        for kind in [kind for kind, message in examples.items() if pattern.fullmatch(message)][:1]:
+        pattern = "*".join(map(glob.escape, form.split("%")))  # matched without backtracking
+        for kind in [kind for kind, message in examples.items() if fnmatchcase(message, pattern)][:1]:
             counts[kind] += count - 1
     return tuple(SumoWarning(kind, message[:MAX_EXAMPLE_LENGTH], counts[kind]) for kind, message in examples.items())
 
