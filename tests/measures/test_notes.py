@@ -34,6 +34,18 @@ def test_note_has_driver_count_and_reasons_of_early_ends() -> None:
     ]
 
 
+def test_note_counts_drives_that_episodes_repeat() -> None:
+    def drives(*files: int, begin: float = 0.0) -> list[dict[str, Any]]:
+        return [{**row, "file": file, "part": 0, "begin": begin} for row, file in zip(rows_of(9), files, strict=False)]
+
+    alike = "those of the same drive differ in the noise of human drivers alone, and intervals are too narrow"
+    assert episode_notes({"human": drives(0, 1, 0), "pi": drives(0, 1)}) == [
+        f"3 episodes of 2 recorded drives: {alike}"
+    ]
+    assert episode_notes({"pi": drives(2, 2)}) == [f"2 episodes of 1 recorded drive: {alike}"]
+    assert episode_notes({"pi": [*drives(0, 1), *drives(0, begin=9.0)]}) == []
+
+
 def test_warnings_are_grouped_and_missing_demand_comes_first() -> None:
     stops = [warning("stop %", f"stop {number}", 3) for number in range(3)]
     lost = warning("Route file should be sorted by departure time, ignoring '%'!", "ignoring 'c'!")

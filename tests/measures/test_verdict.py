@@ -29,7 +29,7 @@ def test_each_kind_of_road_has_its_metrics() -> None:
     for road in ROADS:
         names = short_table_metrics({"human": episodes(road)})
         assert set(names) <= set(METRICS)
-        assert len(names) == len(set(names)) <= 9
+        assert len(names) == len(set(names)) <= 10
 
 
 @pytest.mark.parametrize(
@@ -56,10 +56,18 @@ def test_a_verdict_names_feasibility_the_first_metric_and_lost_flow(changes: dic
 def test_differences_have_signs_intervals_and_units() -> None:
     assert lines_of(human=episodes("recorded"), pi=episodes("recorded", fuel_by_power=58.0)) == [
         "pi: feasible; fuel by power better than that of human drivers, 4 paired seeds",
-        "  fuel by power   -2.0 [-2.0, -2.0] ml/km (-3.3 %)",
-        "  flow            0 veh/h",
-        "  CAV's mean gap  0.0 m",
+        "  fuel by power           -2.0 [-2.0, -2.0] ml/km (-3.3 %)",
+        "  fuel by emission model  0.0 ml/km",
+        "  flow                    0 veh/h",
+        "  CAV's mean gap          0.0 m",
     ]
+
+
+def test_a_verdict_on_fuel_names_the_other_model_if_it_disagrees() -> None:
+    more = ROW["fuel_ml_per_km"] + 1.0
+    verdict = lines_of(human=episodes("recorded"), pi=episodes("recorded", fuel_by_power=58.0, fuel_ml_per_km=more))[0]
+    price = "but more fuel by emission model"
+    assert verdict == f"pi: feasible; fuel by power better than that of human drivers, {price}, 4 paired seeds"
 
 
 def test_few_seeds_decide_nothing() -> None:

@@ -13,6 +13,7 @@ from unjam.scenarios import Recorded, make_scenario, scenario_from_recipe, scena
 from unjam.worlds.episode import run_episode
 
 TIMES = 0.1 * np.arange(900)
+SEED_GROUPS = (), (5,), (7, 3), (7, 4), (8, 1)
 
 
 def write_drive(path: Path, mean: float = 15.0) -> Path:
@@ -94,6 +95,19 @@ def test_files_in_the_order_of_their_names_are_driven_once_each(tmp_path: Path) 
         write_drive(tmp_path / f"{name}.csv")
     roads = [Recorded(recordings=str(tmp_path), order="name").draw_from_seed((5, seed))[0] for seed in range(4)]
     assert [road.drawn_values["file"] for road in roads] == [0, 1, 2, 0]
+    random = Recorded(recordings=str(tmp_path))
+    orders = [[random.draw_from_seed((*first, k))[0].drawn_values["file"] for k in range(3)] for first in SEED_GROUPS]
+    assert all(sorted(order) == [0, 1, 2] for order in orders)
+    assert len(set(map(tuple, orders))) > 1
+
+
+def test_all_files_that_cannot_be_read_are_named_together(tmp_path: Path) -> None:
+    write_drive(tmp_path / "a.csv")
+    (tmp_path / "README.txt").write_text("recorded in May\n")
+    (tmp_path / "b.csv").write_text("time_s,v\n0,1\n")
+    with pytest.raises(InputError, match=r"README.txt: .*; b.csv: .*; a pattern like 'drives/\*.csv' leaves files out"):
+        _ = Recorded(recordings=str(tmp_path)).max_episode_steps
+    assert Recorded(recordings=str(tmp_path / "a*")).max_episode_steps > 0
 
 
 def test_a_begin_after_the_end_is_refused(tmp_path: Path) -> None:

@@ -156,7 +156,8 @@ def _packaged_summary(name: str, is_brief: bool) -> str:
 
     A brief one is without the parameters of its expert.
     """
-    manifest = read_controller(packaged_file(name)).manifest
+    controller = read_controller(packaged_file(name))
+    manifest = controller.manifest
     described = manifest.get("expert", "")
     expert = described.partition(":")[0] if is_brief else described
     if tuning := manifest.get("tuning"):
@@ -164,7 +165,7 @@ def _packaged_summary(name: str, is_brief: bool) -> str:
         score = tuning["reward"] if tuning["reward"] == MEAN_GAIN else "return"
         return f"{expert}, tuned: {score} {best} on tuning seeds, default parameters {default}"
     if summary := manifest.get("summary"):
-        return summary
+        return summary if is_brief else f"{summary}\n\n{controller.driver.describe()}"
     metrics, scenario = manifest["metrics"], manifest["run"]["scenario"]
     speed, expert_speed = (metrics[label]["mean_speed"]["mean"] for label in ("trained", described))
     return (

@@ -86,8 +86,8 @@ def train_command(
     err_console.print(f"training {_plan_text(config)}, into {folder}", soft_wrap=True)
     write_curves = tensorboard_writer(folder) if tensorboard else None
     progress = nullcontext() if json else _TrainingProgress(config, folder)
-    options = [] if workers == opt.DEFAULT_WORKERS else ["--workers", workers]
-    with output.suggest_resume(folder, "train", "--resume", folder, *options), progress as display:
+    same_workers = [] if workers == opt.DEFAULT_WORKERS else ["--workers", workers]
+    with output.suggest_resume(folder, "train", "--resume", folder, *same_workers), progress as display:
 
         def on_row(row: dict[str, Any]) -> None:
             for callback in (write_curves, display and display.show_iteration):

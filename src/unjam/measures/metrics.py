@@ -404,7 +404,7 @@ METRICS: dict[str, Metric] = {
     "collisions": Metric(collisions, "vehicles in collisions", "", 0),
     "shield_override_share": Metric(shield_override_share, "commands overridden by the simulator", "", 4, SHARE_BOUNDS),
     "shield_max_braking": Metric(shield_max_braking, "maximum braking added by SUMO", "m/s2"),
-    "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel", "ml/km", 1),
+    "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel by emission model", "ml/km", 1),
     "fuel_by_power": Metric(fuel_by_power, "fuel by power", "ml/km", 1),
     "cav_fuel_by_power": Metric(cav_fuel_by_power, "CAV's fuel by power", "ml/km", 1),
     "human_fuel_by_power": Metric(human_fuel_by_power, "human drivers' fuel by power", "ml/km", 1),

@@ -24,7 +24,7 @@ LOST_DEMAND_PATTERN = re.compile(
 def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return all notes on the episodes of several drivers, the most serious first."""
     lost, others = warning_notes(rows_by_driver)
-    notes = (note(rows_by_driver) for note in (early_end_notes, _backlog_notes, teleport_notes))
+    notes = (note(rows_by_driver) for note in (early_end_notes, _backlog_notes, teleport_notes, _repeated_drive_notes))
     return [*lost, *(each for group in notes for each in group), *others]
 
 
@@ -69,6 +69,16 @@ def teleport_notes(rows_by_driver: RowsByDriver) -> list[str]:
         for label, count in counts.items()
         if count
     ]
+
+
+def _repeated_drive_notes(rows_by_driver: RowsByDriver) -> list[str]:
+    """Return a note if several episodes repeat the same part of a recording."""
+    rows = max(rows_by_driver.values(), key=len, default=[])
+    drives = {tuple(row[name] for name in ("file", "part", "begin")) for row in rows if "part" in row}
+    if not drives or len(drives) == len(rows):
+        return []
+    alike = "those of the same drive differ in the noise of human drivers alone, and intervals are too narrow"
+    return [f"{len(rows)} episodes of {len(drives)} recorded drive{'' if len(drives) == 1 else 's'}: {alike}"]
 
 
 def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:

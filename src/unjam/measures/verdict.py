@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
-from unjam.measures.effect import FLOW_METRIC, LAG_METRIC, POWER_FUEL_METRIC, TIME_METRIC, is_measured
+from unjam.measures.effect import FLOW_METRIC, FUEL_METRIC, LAG_METRIC, POWER_FUEL_METRIC, TIME_METRIC, is_measured
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import HUMAN_LABEL, RowsByDriver, estimate_cell
 from unjam.measures.metrics import METRICS
@@ -30,7 +30,7 @@ class RoadMetrics:
 CLOSED_ROAD = RoadMetrics(("mean_speed", FLOW_METRIC, "speed_std_fleet_steady"), ("time_to_dissolve",))
 OPEN_ROAD = RoadMetrics((TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC), ("mean_speed",))
 RECORDED_ROAD = RoadMetrics(
-    (POWER_FUEL_METRIC, FLOW_METRIC, "cav_mean_gap"), ("amplification_long", "amplification_medium")
+    (POWER_FUEL_METRIC, FUEL_METRIC, FLOW_METRIC, "cav_mean_gap"), (LAG_METRIC, "amplification_medium")
 )
 COMMON_METRICS = ("min_time_gap", "cav_max_braking", "human_max_braking", "collisions")
 
@@ -125,7 +125,8 @@ def _comparison(differences: dict[str, Estimate], pairs: int) -> str:
         reason = "" if isfinite(differences[first].low) else ", which are too few"
         return f"{label} undecided compared with human drivers, {seeds}{reason}"
     word = "better" if changes[first] else "worse"
-    price = ", but less flow" if changes[first] and changes[FLOW_METRIC] is False else ""
+    prices = {FLOW_METRIC: "less flow", FUEL_METRIC: "more fuel by emission model"}
+    price = "".join(f", but {text}" for name, text in prices.items() if changes[first] and changes.get(name) is False)
     return f"{label} {word} than that of human drivers{price}, {seeds}"
 
 

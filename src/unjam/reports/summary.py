@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from unjam.errors import printable
-from unjam.measures.effect import POWER_FUEL_METRIC
+from unjam.measures.effect import LAG_METRIC, POWER_FUEL_METRIC
 from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, estimate_cell
 from unjam.measures.metrics import METRICS
 from unjam.measures.notes import early_end_notes
@@ -34,7 +34,7 @@ COMPARED_METRICS = (
         "min_ttc",
     ),
     *("human_max_braking", "human_braking_beyond_3_5", "human_braking_beyond_4_5", "human_braking_beyond_9"),
-    "collisions",
+    *("cav_mean_gap", LAG_METRIC, "amplification_long", "amplification_medium", "amplification_short", "collisions"),
 )
 """metrics with the same meaning in the human baseline and with CAVs, in the order of the table"""
 

@@ -59,7 +59,7 @@ class Recorded(Scenario):
     """a file with speeds, a folder of them, or a pattern like `drives/2021-03*`, see `unjam.recordings.leader_files`;
     empty: artificial waves"""
     order: Literal["random", "name"] = "random"
-    """how episodes take files: at random, or ordered by name, one for each episode"""
+    """how episodes with consecutive seeds take files, each once before any again: at random, or ordered by name"""
     platoon: str = "cav human*5"
     """vehicles behind the recorded one, from front to back, like `human*2 cav human*20`"""
     begin: NonNegative = 0.0
@@ -122,9 +122,23 @@ class Recorded(Scenario):
         """Duration of the longest recording [s]."""
         if not self.recordings:
             return ARTIFICIAL_SECONDS
+        return max(each.seconds for each in self._leaders)
+
+    @cached_property
+    def _leaders(self) -> list[LeaderRecording]:
+        """All recordings of all files."""
         from unjam.recordings.leader_files import read_leaders
 
-        return max(each.seconds for path in recording_files(Path(self.recordings)) for each in read_leaders(path))
+        files, found, problems = recording_files(Path(self.recordings)), list[LeaderRecording](), list[str]()
+        for path in files:
+            try:
+                found += read_leaders(path)
+            except InputError as error:
+                problems.append(str(error))
+        if problems:
+            hint = "" if len(files) == 1 else "; a pattern like 'drives/*.csv' leaves files out"
+            raise InputError(f"{'; '.join(problems)}{hint}")
+        return found
 
     @property
     def acceleration_limits(self) -> Limits:
@@ -154,19 +168,22 @@ class Recorded(Scenario):
 
     def _recordings_note(self) -> str:
         """What was read of the recordings, so that a wrong unit or a gap in time is seen."""
-        from unjam.recordings.leader_files import read_leaders
-
-        path, files = Path(self.recordings), recording_files(Path(self.recordings))
-        found = [each for file in files for each in read_leaders(file)]
+        path, files, found = Path(self.recordings), recording_files(Path(self.recordings)), self._leaders
         seconds, speeds = [each.seconds for each in found], np.concatenate([each.speed for each in found])
         source = (
             path.name if path.is_file() else f"{len(files)} {'file' if len(files) == 1 else 'files'} of {path.name}"
         )
         parts = f"{len(found)} parts of {min(seconds):.0f} to" if len(found) > 1 else ""
         text = f"{parts} {max(seconds):.0f} s with speeds of {speeds.min():.1f} to {speeds.max():.1f} m/s"
-        same = "; episodes differ in the noise of human drivers alone" if len(found) == 1 and not self.window else ""
         drawn = {"random": ", drawn at random", "name": ", in the order of their names"}[self.order]
-        return f"recordings: {source}: {text.strip()}{drawn if len(files) > 1 else same}"
+        return f"recordings: {source}: {text.strip()}{drawn if len(files) > 1 else ''}"
+
+    @property
+    def training_notes(self) -> list[str]:
+        """What a user must know about results on test seeds."""
+        if not self.recordings:
+            return []
+        return ["test seeds take the same recordings as the training; drive others: unjam drive recorded --recordings"]
 
     def stratum(self, index: int, count: int) -> Self:
         """Return this road with the recordings of one of `count` equal parts, if there are as many files."""
@@ -175,12 +192,14 @@ class Recorded(Scenario):
         return replace(self, recordings=str(files[index * len(files) // count]))
 
     def draw_from_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
-        """Return the road of an episode's seed, the last number of which counts files if they are ordered by name."""
-        if self.order == "random" or not self.recordings:
+        """Return the road of an episode's seed, the last number of which counts the files."""
+        files = recording_files(Path(self.recordings)) if self.recordings else []
+        if len(files) < 2:
             return super().draw_from_seed(seed)
-        files = recording_files(Path(self.recordings))
         number = seed[-1] % len(files)
-        road, others = replace(self, recordings=str(files[number]), order="random").draw_from_seed(seed)
+        if self.order == "random":
+            number = int(np.random.default_rng([len(files), *seed[:-1]]).permutation(len(files))[number])
+        road, others = replace(self, recordings=str(files[number])).draw_from_seed(seed)
         return replace(road, drawn_values={**road.drawn_values, "file": float(number)}), others
 
     def draw(self, generator: np.random.Generator) -> RecordedRoad:

@@ -262,6 +262,11 @@ class Scenario(Subclassable):
         return []
 
     @property
+    def training_notes(self) -> list[str]:
+        """What a user must know about the results of a training on this road."""
+        return []
+
+    @property
     def control_step(self) -> float:
         """Time between two commands [s]."""
         return self.simulation_step * self.steps_per_control_step

@@ -328,7 +328,12 @@ def evaluate_run(
         "trained": TRAINED_LABEL,
         "expert": config.make_expert().describe() if config.expert != "none" else "none",
         "controllers": _controller_hashes({TRAINED_LABEL: str(folder)}),
-        "notes": [*episode_notes(evaluation.rows), *backend_notes(config.episode_backend, scenario)],
+        "notes": [
+            *episode_notes(evaluation.rows),
+            *backend_notes(config.episode_backend, scenario),
+            *scenario.notes,
+            *scenario.training_notes,
+        ],
         "manifest": manifest(),
     }
     target = out or folder
