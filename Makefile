@@ -56,7 +56,7 @@ pages: $(VENV)/.installed-dev
 	$(BIN)/python docs/pages.py
 	$(BIN)/python docs/claims.py
 
-# SPHINXOPTS="-D nb_execution_mode=off" does not run the notebook
+# SPHINXOPTS="-D nb_execution_mode=off" does not run the notebooks
 docs: $(VENV)/.installed-dev
 	$(BIN)/python -m sphinx -q -E -W -b html $(SPHINXOPTS) docs docs/_build/html
 	@echo docs/_build/html/index.html

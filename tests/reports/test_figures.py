@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from IPython.core.formatters import DisplayFormatter
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.colors import to_hex
@@ -239,6 +240,19 @@ def test_learning_curve_starts_at_step_zero_with_the_expert() -> None:
     assert np.asarray(training.get_xydata()).tolist() == [[12.0, 91.0], [24.0, 92.0], [36.0, 93.0], [48.0, 94.0]]
     assert expert.get_label() == "pi"
     assert set(np.asarray(expert.get_ydata())) == {100.0}
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda: learning_curve_figure({"ring-001": RUN}, {}),
+        lambda: time_series_figure([make_episode()]),
+        lambda: trajectory_figure([make_episode()]),
+    ],
+)
+def test_notebooks_display_figures(draw: Callable[[], Figure]) -> None:
+    formats, _ = DisplayFormatter().format(draw())  # pyright: ignore[reportGeneralTypeIssues]
+    assert formats["image/png"].startswith(b"\x89PNG")
 
 
 def test_learning_curve_without_validation_shows_training() -> None:

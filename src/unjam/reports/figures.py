@@ -58,9 +58,16 @@ def short_label(label: str) -> str:
     return one_line(label, MAX_LABEL_LENGTH)
 
 
+class NotebookFigure(Figure):
+    """A figure that notebooks display, also if `matplotlib.pyplot` is not imported."""
+
+    def _repr_png_(self) -> bytes:
+        return png_bytes(self)
+
+
 def new_figure(height: float, width: float = FIGURE_WIDTH) -> Figure:
     """Return an empty figure [inch], by default as wide as the page."""
-    return Figure(figsize=(width, height), layout="constrained", dpi=DPI)
+    return NotebookFigure(figsize=(width, height), layout="constrained", dpi=DPI)
 
 
 def data_uri(figure: Figure) -> str:
