@@ -79,7 +79,8 @@ def test_progress_names_the_road_with_the_smallest_difference(
     row = {"iteration": 1, "environment_steps": 10, "return_mean": 5.0, "return_expert": 4.0}
     roads = {"ring": {"return_validation": 9.0, "return_expert": 3.0}, "eight": {"return_validation": 1.0}}
     roads["eight"]["return_expert"] = 4.4
-    with _TrainingProgress(RunConfig(steps=30), Path("run")) as progress:
+    monkeypatch.setattr(sys.modules[_TrainingProgress.__module__], "planned_steps", lambda config: 30)
+    with _TrainingProgress(RunConfig(steps=25), Path("run")) as progress:
         progress.show_iteration({**row, "return_validation": 6.0, "tasks": roads})
         progress.show_iteration(
             {**row, "iteration": 11, "environment_steps": 30, "return_validation": None, "tasks": {}}
@@ -87,6 +88,7 @@ def test_progress_names_the_road_with_the_smallest_difference(
     text = "return 5, validation 6 (expert 4; smallest difference on eight: -3)"
     lines = [line.partition("steps, ")[2] for line in messages.getvalue().splitlines()]
     assert lines == [f"{text}, 0 s left", text]
+    assert "30 of 30 steps" in messages.getvalue(), "the steps that will be trained, not those of the configuration"
 
 
 @pytest.mark.parametrize(("first", "expected"), [(1, ["3 min", "20 s"]), (21, ["", "10 s"])])
@@ -98,6 +100,7 @@ def test_progress_has_the_time_that_is_left(
     clock = iter([0.0, 50.0, 80.0])
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     row = {"return_mean": 5.0, "return_expert": 4.0, "return_validation": None}
+    monkeypatch.setattr(module, "planned_steps", lambda config: config.steps)
     progress = _TrainingProgress(RunConfig(steps=50), Path("run"))
     for iteration, steps in ((first, 10), (first + 5, 40)):
         progress.show_iteration({**row, "iteration": iteration, "environment_steps": steps})

@@ -22,14 +22,14 @@ def test_lower_fuel_is_better_and_lower_speed_is_worse() -> None:
     found = baseline_differences([HUMAN, column("pi", [90.0, 191.0, 289.0], HUMAN, mean_speed=4.0)])
     cells = {row["label"]: row["cells"][0] for row in found["rows"]}
     assert found["names"] == ["pi"]
-    assert cells["fuel"] == {"text": "-10.0 [-12.5, -7.5]", "mark": "better", "count": 3}
+    assert cells["fuel by emission model"] == {"text": "-10.0 [-12.5, -7.5]", "mark": "better", "count": 3}
     assert cells["mean speed"]["mark"] == "worse"
     assert list(cells) == [METRICS[name].label for name in COMPARED_METRICS if METRICS[name].label in cells]
 
 
 def test_insignificant_differences_have_no_mark_and_unknown_metrics_no_row() -> None:
     found = baseline_differences([HUMAN, column("pi", [90.0, 210.0, 301.0], HUMAN)])
-    assert [(row["label"], row["cells"][0]["mark"]) for row in found["rows"]] == [("fuel", "")]
+    assert [(row["label"], row["cells"][0]["mark"]) for row in found["rows"]] == [("fuel by emission model", "")]
 
 
 def test_a_difference_of_some_pairs_has_their_number_and_no_mark() -> None:
