@@ -34,8 +34,8 @@ INTRODUCTION = """# Claims of the paper
 They have the values of its Tables B2 to B6 (`--preset paper`) and 300,000 environment steps each, instead of the
 4,000,000 of its authors' code; [all that differs](#what-differs-from-the-paper) is in the last table. Returns "on
 test seeds" are of the deterministic controller that validation chose, on 20 seeds that played no part in training or
-selection; other numbers of trainings are of training episodes, exploration included. Verdicts are about the three to ten
-trainings that they name, with these settings.
+selection; other numbers of trainings are of training episodes, exploration included. Verdicts are about the three to
+ten trainings that they name, with these settings.
 
 **The paper has no safety filter; unjam has one by default** (a time gap of 1 s, no contact behind leaders that brake
 with at most 6 m/s²). Verdicts are about trainings without it; where these are not yet measured, only the numbers

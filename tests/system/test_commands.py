@@ -83,7 +83,8 @@ def test_train_on_several_roads_prints_a_table_for_each(unjam: Run, tmp_path: Pa
     ran = unjam(*command, pictures=False)
     assert ran.returncode == 0, ran.stderr
     assert [line for line in ran.stdout.splitlines() if line in ("ring:", "short:")] == ["ring:", "short:"]
-    assert ran.stdout.count("Compared with the human") == ran.stdout.count("Return difference to its expert") == 2
+    assert ran.stdout.count("Return difference to its expert") == 2
+    assert ran.stdout.count("2 paired seeds") == 2 * len(("pi", "trained"))
     assert {"ring", "short", "report.html"} <= {path.name for path in (tmp_path / "run").iterdir()}
 
 
@@ -131,7 +132,8 @@ def test_drive_prints_a_table_and_the_path_of_a_report(unjam: Run, tmp_path: Pat
 def test_drive_prints_all_metrics_on_demand(unjam: Run) -> None:
     ran = unjam("drive", "ring", "-d", "human", "-d", "pi:window=10", *SMALL, "--no-report", "--all")
     assert ran.returncode == 0, ran.stderr
-    header, *lines = ran.stdout.splitlines()[2:]
+    lines = ran.stdout.splitlines()
+    header = next(line for line in lines if line.startswith("metric "))
     assert header.split() == ["metric", "unit", "human", "pi:window=10", "pi:window=10", "−", "human"]
     assert len(lines) >= len(REQUIRED_METRICS)
 

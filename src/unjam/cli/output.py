@@ -71,9 +71,11 @@ def print_results(rows_by_driver: RowsByDriver, shows_all: bool) -> None:
     """Print the verdicts on drivers and the metrics that matter on their road, or all metrics with differences."""
     for verdict in verdicts(rows_by_driver):
         for line in verdict.lines:
-            hanging = " " * (2 + len(line) - len(line.lstrip()))
-            wrapping = {"subsequent_indent": hanging, "break_long_words": False, "break_on_hyphens": False}
-            console.print(fill(line, console.width, **wrapping), soft_wrap=True)
+            if console.is_terminal:  # elsewhere a line stays one, so that it can be searched
+                hanging = " " * (2 + len(line) - len(line.lstrip()))
+                wrapping = {"subsequent_indent": hanging, "break_long_words": False, "break_on_hyphens": False}
+                line = fill(line, console.width, **wrapping)
+            console.print(line, soft_wrap=True)
     if shows_all:
         print_metrics(rows_by_driver, choose_baseline(rows_by_driver))
     else:

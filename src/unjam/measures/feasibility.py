@@ -43,7 +43,7 @@ def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tup
     time_gap, human_braking = row["min_time_gap"], row[HARD_BRAKING_METRIC]
     min_time_gap = MIN_TIME_GAP_WITH_LANES if has_lanes else MIN_TIME_GAP_FRACTION * required
     short, cut_in = (row[name] if has_lanes else 0.0 for name in ("share_short_time_gap", "cut_in_max_braking"))
-    baseline = "not compared" if baseline_braking is None else f"{baseline_braking:.3g}"
+    baseline = "not compared" if baseline_braking is None else _rate_text(baseline_braking)
     collided, contacts, braking = row["status"] == "collision", float(row.get("contacts", 0)), row["cav_max_braking"]
     checks = (  # value, largest allowed value, reason
         (collided * (1.0 + row["collisions"]), 0.0, f"{row['collisions']:.0f} vehicles in contact"),
@@ -57,11 +57,16 @@ def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tup
         (
             human_braking,
             baseline_braking or 0.0,
-            f"human drivers brake beyond 4.5 m/s2 {human_braking:.3g} times in a million vehicle-steps "
+            f"human drivers brake beyond 4.5 m/s2 {_rate_text(human_braking)} times in a million vehicle-steps "
             f"(without CAVs: {baseline})",
         ),
     )
     return [(number, value, reason) for number, (value, limit, reason) in enumerate(checks) if value > limit]
+
+
+def _rate_text(rate: float) -> str:
+    """Return a rate with digits enough to compare it, without an exponent."""
+    return f"{rate:,.0f}" if rate >= 100.0 else f"{rate:.3g}"
 
 
 def feasibility_by_driver(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, str]:
