@@ -80,7 +80,7 @@ class DriveResults:
         return next(label for label in self.groups() if label.partition(":")[0] == method)
 
 
-def short_name(label: str) -> str:
+def _short_name(label: str) -> str:
     """Return the name of a driver without its parameters, and whether they were tuned."""
     method, _, parameters = label.partition(":")
     return f"{method}, tuned" if parameters and method in TUNED_METHODS else method
@@ -97,7 +97,7 @@ def _driver_row(results: DriveResults, label: str, own: Table, tuned: str) -> di
     reasons = [row["feasibility"] for row in own if row["feasibility"] and row["feasibility"] != FEASIBLE]
     gap, gap_95, largest = (results.values(label, f"cav_{name}") for name in ("mean_gap", "gap_95", "max_gap"))
     return {
-        "driver": short_name(label),
+        "driver": _short_name(label),
         "fuel of the platoon [%]": results.change_text(label, "fuel_by_power"),
         f"difference to {TUNED_METHOD} [points]": results.change_text(label, "fuel_by_power", baseline=tuned),
         "fuel of the CAV [%]": results.change_text(label, "cav_fuel_by_power"),
@@ -114,7 +114,7 @@ def waves_table(folder: Path) -> pd.DataFrame:
     results = DriveResults(read_part(folder, TEST_DRIVES_PART))
     return pd.DataFrame(
         {
-            "driver": short_name(label),
+            "driver": _short_name(label),
             **{METRICS[name].label: f"{results.values(label, name).mean():.2f}" for name in WAVE_METRICS},
             "hardest braking [m/s²]": NO_VALUE_TEXT
             if label == HUMAN_LABEL
@@ -131,7 +131,7 @@ def assumptions_table(folder: Path) -> pd.DataFrame:
     labels = [label for label in in_sumo.groups() if label != HUMAN_LABEL]
 
     def table_row(setting: str, results: DriveResults, metric: str = "fuel_by_power") -> dict[str, str]:
-        cells = {short_name(label): results.change_text(label, metric) for label in labels}
+        cells = {_short_name(label): results.change_text(label, metric) for label in labels}
         return {"assumption": setting, **cells}
 
     changed = (setting for setting in DRIVE_SETTINGS if setting != STANDARD_SETTING)

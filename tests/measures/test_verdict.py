@@ -68,6 +68,9 @@ def test_a_verdict_on_fuel_names_the_other_model_if_it_disagrees() -> None:
     verdict = lines_of(human=episodes("recorded"), pi=episodes("recorded", fuel_by_power=58.0, fuel_ml_per_km=more))[0]
     price = "but more fuel by emission model"
     assert verdict == f"pi: feasible; fuel by power better than that of human drivers, {price}, 4 paired seeds"
+    worse = {"fuel_by_power": 58.0, "fuel_ml_per_km": more, "outflow_veh_per_h": 1900.0}
+    verdict = lines_of(human=episodes("recorded"), pi=episodes("recorded", **worse))[0]
+    assert ", but less flow and more fuel by emission model, " in verdict
 
 
 def test_few_seeds_decide_nothing() -> None:

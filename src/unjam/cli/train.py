@@ -127,7 +127,7 @@ class _TrainingProgress(output.ProgressReporter):
     """Progress of training: a bar with the latest returns on a terminal, plain lines elsewhere."""
 
     def __init__(self, config: "RunConfig", folder: Path) -> None:
-        self._config, self._folder, self._steps = config, folder, max(config.steps, planned_steps(config))
+        self._config, self._folder, self._steps = config, folder, planned_steps(config)
         super().__init__(f"training into {folder}", "steps", self._steps)
         self._validation_text, self._worst_road = "-", ""
         self._start = time.monotonic()

@@ -102,32 +102,31 @@ def _verdict(label: str, rows: Rows, human: Rows, feasible: str, names: Sequence
     pairs = max(each.count for each in differences.values())
     if not pairs:
         return Verdict(label, "", "no episode can be compared with human drivers", None)
+    changes = {name: is_better(name, difference) for name, difference in differences.items()}
     texts = (
         DifferenceText(
             METRICS[name].label.partition(",")[0],
             _difference_text(name, difference, relative_difference(rows, human, name).mean),
-            is_better(name, difference),
+            changes[name],
         )
         for name, difference in differences.items()
         if difference.count
     )
-    return Verdict(
-        label, feasible, _comparison(differences, pairs), is_better(names[0], differences[names[0]]), (*texts,)
-    )
+    return Verdict(label, feasible, _comparison(differences, changes, pairs), changes[names[0]], (*texts,))
 
 
-def _comparison(differences: dict[str, Estimate], pairs: int) -> str:
-    """Return whether the first metric is shown to be better or worse, and whether flow is shown to be lower."""
+def _comparison(differences: dict[str, Estimate], changes: dict[str, bool | None], pairs: int) -> str:
+    """Return whether the first metric is shown to be better or worse, and what is shown to be worse then."""
     first = next(iter(differences))
     label, seeds = METRICS[first].label.partition(",")[0], f"{pairs} paired seed{'' if pairs == 1 else 's'}"
-    changes = {name: is_better(name, difference) for name, difference in differences.items()}
     if changes[first] is None:
         reason = "" if isfinite(differences[first].low) else ", which are too few"
         return f"{label} undecided compared with human drivers, {seeds}{reason}"
-    word = "better" if changes[first] else "worse"
+    if not changes[first]:
+        return f"{label} worse than that of human drivers, {seeds}"
     prices = {FLOW_METRIC: "less flow", FUEL_METRIC: "more fuel by emission model"}
-    price = "".join(f", but {text}" for name, text in prices.items() if changes[first] and changes.get(name) is False)
-    return f"{label} {word} than that of human drivers{price}, {seeds}"
+    price = " and ".join(text for name, text in prices.items() if changes.get(name) is False)
+    return f"{label} better than that of human drivers{price and f', but {price}'}, {seeds}"
 
 
 def _difference_text(name: str, difference: Estimate, relative: float) -> str:

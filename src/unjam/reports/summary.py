@@ -24,15 +24,8 @@ MAX_LIMIT_RATIO = 1.01
 """ratio of mean speed to the limit above which the report has a note"""
 COMPARED_METRICS = (
     *("mean_speed", "mean_speed_steady", "outflow_veh_per_h", "travel_time", "delay", "insertion_backlog_veh"),
-    *(
-        "fuel_ml_per_km",
-        POWER_FUEL_METRIC,
-        "share_standing",
-        "speed_std_fleet",
-        "speed_std_fleet_steady",
-        "time_to_dissolve",
-        "min_ttc",
-    ),
+    *("fuel_ml_per_km", POWER_FUEL_METRIC, "share_standing", "speed_std_fleet", "speed_std_fleet_steady"),
+    *("time_to_dissolve", "min_ttc"),
     *("human_max_braking", "human_braking_beyond_3_5", "human_braking_beyond_4_5", "human_braking_beyond_9"),
     *("cav_mean_gap", LAG_METRIC, "amplification_long", "amplification_medium", "amplification_short", "collisions"),
 )

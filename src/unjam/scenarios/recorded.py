@@ -183,7 +183,7 @@ class Recorded(Scenario):
         """What a user must know about results on test seeds."""
         if not self.recordings:
             return []
-        return ["test seeds take the same recordings as the training; drive others: unjam drive recorded --recordings"]
+        return ["test seeds take the recordings of the training; others: drive recorded --recordings FOLDER -d RUN"]
 
     def stratum(self, index: int, count: int) -> Self:
         """Return this road with the recordings of one of `count` equal parts, if there are as many files."""
