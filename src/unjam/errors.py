@@ -57,14 +57,16 @@ EXTRAS = {
 
 
 def missing_package_error(error: ImportError, name: str | None = None) -> MissingPartError:
-    """Return the error for a package of an extra that cannot be imported; raise the given error for any other package.
+    """Return the error for a package of an extra, or a shared library, that cannot be imported; raise any other error.
 
     `name` is the package that was imported; None: the one that the error names.
     """
     package = (name or error.name or "").partition(".")[0]
-    if package not in EXTRAS:
-        raise error
     reason = f"cannot be imported ({' '.join(str(error).split())})"
+    if package not in EXTRAS:
+        if "shared object" not in reason:
+            raise error
+        return MissingPartError(f"a package {reason}; allowed: enough memory, and its files as pip installed them")
     if isinstance(error, ModuleNotFoundError):
         reason = "is not installed"
     return MissingPartError(f"{package} {reason}; install it: pip install 'unjam[{EXTRAS[package]}]'")

@@ -3,6 +3,7 @@
 from tests.faults.commands import jumping_clocks, killed_commands, many_drivers, packed_tables
 from tests.faults.files import checkpoints, configurations, controllers, full_disks, results, signatures
 from tests.faults.inputs import inputs
+from tests.faults.limits import large_networks, little_memory, long_environments, other_users
 from tests.faults.links import links
 from tests.faults.outcome import Fault
 from tests.faults.processes import hostile, killed_runs, lost_workers, networks, resets
@@ -101,4 +102,12 @@ FAULTS: dict[str, Fault] = {
         long_count=40,
     ),
     "many drivers": Fault("drivers compared in one command", many_drivers, quick_count=20, long_count=500),
+    "large networks": Fault("vehicles at once on a user network", large_networks, quick_count=300, long_count=5000),
+    "long environments": Fault(
+        "steps of one environment in one process", long_environments, quick_count=2000, long_count=1_000_000
+    ),
+    "little memory": Fault(
+        "command that may take less memory than it needs", little_memory, quick_count=2, long_count=20, is_slow=True
+    ),
+    "other users": Fault("command of a user without a home", other_users, quick_count=2, long_count=10, is_slow=True),
 }

@@ -6,12 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.faults.limits import can_run_as_others
 from tests.faults.registry import FAULTS
 from tests.test_sandbox import kept
 from unjam_paper.results_file import read_part
 
 MARKS = {True: [pytest.mark.slow], False: []}
-REQUIREMENTS = {"sandbox": kept}
+REQUIREMENTS = {
+    "sandbox": kept,
+    "other users": pytest.mark.skipif(not can_run_as_others(), reason="needs root, and Python outside its home"),
+}
 """condition under which the kernel supports a fault"""
 SOAK = Path(__file__).parents[2] / "results" / "soak.json"
 
