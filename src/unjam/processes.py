@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from weakref import finalize
 
-from unjam.errors import DiskError, InputError
+from unjam.errors import DiskError, InputError, LostWorkerError
 from unjam.files import open_in_place, remove
 from unjam.folders import PROTECTED_FOLDERS_VARIABLE, protect_folder, protected_folders
 from unjam.sandbox import confine_process, limit_resources
@@ -225,6 +225,12 @@ def _check_other_machine(path: Path, descriptor: int, target: str) -> None:
     if owner and owner[0] != platform.node() and abs(age) < max_age:
         message = f"{target} is being written on {owner[0]}"
         raise InputError(f"{message}; allowed: one at a time, or {max_age:g} s after its end")
+
+
+def check_owner(owner: int, name: str) -> None:
+    """Raise `LostWorkerError` in a fork of the process `owner`: both would read each other's answers."""
+    if os.getpid() != owner:
+        raise LostWorkerError(f"{name} belongs to another process (os.fork); allowed: to open one after the fork")
 
 
 class PrivateFolder(AbstractContextManager[str]):

@@ -36,6 +36,7 @@ from unjam.controller.file import (
     SAMPLE_PART,
     SIGNATURE_PART,
     WEIGHTS_PART,
+    Controller,
     add_certificate,
     add_signature,
     pack_parts,
@@ -76,6 +77,21 @@ def public_file(folder: Path, key: Ed25519PrivateKey = KEY) -> Path:
 
 def found(path: Path, signer: Path | None = None) -> str:
     return next(each.detail for each in verify_controller_file(path, signer) if each.part == "signature")
+
+
+@pytest.mark.parametrize(
+    "write", [lambda path, old: add_certificate(path, old, {}), lambda path, old: add_signature(path, old, KEY)]
+)
+def test_a_file_that_another_process_replaced_meanwhile_is_not_overwritten(
+    write: Callable[[Path, Controller], None], tmp_path: Path
+) -> None:
+    path = written(tmp_path, content_of(parts={}))
+    old = read_controller(path)
+    add_signature(path, old, OTHER)
+    newer = path.read_bytes()
+    with pytest.raises(InputError, match="has changed meanwhile"):
+        write(path, old)
+    assert path.read_bytes() == newer
 
 
 def test_who_signed_is_told(tmp_path: Path) -> None:

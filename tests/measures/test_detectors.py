@@ -36,7 +36,7 @@ measurements = st.builds(
         place, position, begin, begin + length, flow, speed
     ),
     st.from_regex(r"[A-Za-z0-9_:#.-]{1,9}", fullmatch=True),
-    *(number, number, st.floats(1, 3600), number, number | st.just(nan)),
+    *(number, number, st.floats(1, 3600), st.floats(1, 1e6), number | st.just(nan)),
 )
 
 
@@ -59,6 +59,11 @@ def test_additional_columns_any_order_and_a_byte_order_mark_are_accepted(tmp_pat
     assert read_detectors(path) == ("lane", [Measurement("e_0", 5.0, 0.0, 60.0, 900.0, 20.0)])
 
 
+def test_an_interval_without_vehicles_has_no_speed_whatever_the_detector_writes(tmp_path: Path) -> None:
+    _, rows = read_detectors(file_of(tmp_path, HEAD, "a,1,0,60,0,0", "a,1,60,90,0,30,", "a,1,90,120,60,0"))
+    assert [row.speed for row in rows] == pytest.approx([nan, nan, 0.0], nan_ok=True)
+
+
 @pytest.mark.parametrize(
     ("lines", "words"),
     [
@@ -69,7 +74,11 @@ def test_additional_columns_any_order_and_a_byte_order_mark_are_accepted(tmp_pat
         ([HEAD, "a,1,0,60,-5,20"], "line 2: flow_veh_per_h: '-5' is not allowed; allowed: a number >= 0"),
         ([HEAD, "a,1,0,60,5,20", "a,1,0,60,many,20"], "line 3: flow_veh_per_h: 'many'"),
         ([HEAD, "a,1,0,60,,20"], "flow_veh_per_h: ''"),
-        ([HEAD, "a,1,0,60"], "flow_veh_per_h: ''"),
+        ([HEAD, "a,1,0,60"], "line 2: has fewer cells than the header; allowed: as many"),
+        ([HEAD, "a,1,0,60,1000"], "line 2: has fewer cells than the header"),
+        ([HEAD, "a,1,0,60,1,000,30"], "line 2: has more cells than the header"),
+        ([f"{HEAD},speed", "a,1,0,60,1000,30,108"], "columns named speed: 2 is not allowed; allowed: one"),
+        ([f"{HEAD},edge", "a,1,0,60,1000,30,b"], "columns named edge: 2"),
         ([HEAD, "a,1,0,60,5,nan"], "speed: 'nan'"),
         ([HEAD, "a,inf,0,60,5,20"], "position: 'inf'"),
         ([HEAD, "a,1,60,60,5,20"], "end: 60.0 is not allowed; allowed: after begin, 60 s"),

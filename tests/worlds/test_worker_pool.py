@@ -585,7 +585,10 @@ class Noisy:
         return {}
 
     def act(self, state, memory):
-        return 0.0 * state.speed + self.offset + np.random.normal(0.0, 0.3) + random.gauss(0.0, 0.3), memory
+        import torch  # workers do not import it themselves
+
+        noise = np.random.normal(0.0, 0.3) + random.gauss(0.0, 0.3) + float(torch.randn(()))
+        return 0.0 * state.speed + self.offset + noise, memory
 """
 
 

@@ -175,7 +175,9 @@ def _run_app() -> int:
         return _print_error("input: it is nested too deeply", InputError.exit_code)
     except OverflowError as error:
         return _print_error(f"input: a number is too large: {error}", InputError.exit_code)
-    except MemoryError:
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and "start new thread" not in str(error):
+            raise
         return _print_error("memory: there is not enough for this command", InputError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return _print_error("interrupted", INTERRUPTED_EXIT_CODE)

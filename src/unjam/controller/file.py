@@ -76,8 +76,12 @@ def _pack_with_hashes(manifest: dict[str, Any], parts: dict[str, bytes]) -> byte
 
 
 def add_certificate(file: Path, controller: Controller, certificate: dict[str, Any]) -> None:
-    """Write the file of a controller again, with its certificate; raise `InputError` if it is signed."""
+    """Write the file of a controller again, with its certificate.
+
+    Raise `InputError` if it is signed, or if the file has changed since it was read.
+    """
     check_unsigned(controller)
+    _check_unchanged(file, controller)
     parts = {**controller.parts, CERTIFICATE_PART: to_json(certificate, indent=1).encode()}
     del parts[MANIFEST_PART]
     atomic_write(file, _pack_with_hashes(controller.manifest, parts))
@@ -91,11 +95,21 @@ def check_unsigned(controller: Controller) -> None:
 
 
 def add_signature(file: Path, controller: Controller, key: "Ed25519PrivateKey") -> None:
-    """Write the file of a controller again, with the signature of `key` as its only one."""
+    """Write the file of a controller again, with the signature of `key` as its only one.
+
+    Raise `InputError` if the file has changed since it was read.
+    """
     from unjam.controller.signature import signature_of
 
+    _check_unchanged(file, controller)
     parts = _ordered_parts({name: part for name, part in controller.parts.items() if name != SIGNATURE_PART})
     atomic_write(file, pack_parts({**parts, SIGNATURE_PART: signature_of(parts, key)}))
+
+
+def _check_unchanged(file: Path, controller: Controller) -> None:
+    """Raise `InputError` if another process has replaced or signed the file of a controller since it was read."""
+    if unpack_parts(file) != controller.parts:
+        raise InputError(f"controller: {str(file)!r} has changed meanwhile, and is not replaced; repeat the command")
 
 
 def _ordered_parts(parts: dict[str, bytes]) -> dict[str, bytes]:

@@ -3,9 +3,10 @@
 import csv
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite, isnan, nan
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -58,9 +59,9 @@ class Agreement:
 def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
     """Return whether a CSV file names places by `edge` or by `lane`, and its measurements.
 
-    It needs that column and `DETECTOR_COLUMNS`; an empty speed is unknown, and other columns are ignored. Raise
-    `InputError` if a value is wrong or a row is there twice, with its line, and if the file, a column or all rows are
-    missing.
+    It needs that column and `DETECTOR_COLUMNS`; an empty speed is unknown, as is one of an interval without vehicles,
+    and other columns are ignored. Raise `InputError` if a value is wrong, a row is there twice or has other cells than
+    the header, with its line, and if the file, a column or all rows are missing or a column is there twice.
     """
     if not path.is_file():  # reading a device would never end
         raise InputError(f"detectors: {str(path)!r} is not a file; allowed: a CSV file")
@@ -72,6 +73,9 @@ def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
             if len(kinds) != 1 or not set(DETECTOR_COLUMNS) <= set(columns):
                 allowed = f"edge or lane, {', '.join(DETECTOR_COLUMNS)}"
                 raise invalid_value(f"{path.name}: columns", ", ".join(columns), allowed)
+            for name in (kinds[0], *DETECTOR_COLUMNS):
+                if columns.count(name) > 1:
+                    raise invalid_value(f"{path.name}: columns named {name}", columns.count(name), "one")
             lines = [(reader.line_num, _parse_measurement(path.name, reader.line_num, kinds[0], row)) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
@@ -88,6 +92,11 @@ def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
 
 def _parse_measurement(file: str, line: int, kind: str, row: dict[str, str | None]) -> Measurement:
     context = f"{file}: line {line}"
+    surplus: Any = row.get(None) or ()  # pyright: ignore[reportArgumentType]  (the key of cells without a column)
+    if any(surplus) or None in row.values():
+        raise InputError(
+            f"{context}: has {'more' if any(surplus) else 'fewer'} cells than the header; allowed: as many"
+        )
     place = (row[kind] or "").strip()
     if not place:
         raise invalid_value(f"{context}: {kind}", place, f"the id of one {kind}")
@@ -102,6 +111,8 @@ def _parse_measurement(file: str, line: int, kind: str, row: dict[str, str | Non
             raise invalid_value(f"{context}: {name}", text, "a number >= 0")
         values.append(value)
     measurement = Measurement(place, *values)
+    if measurement.flow == 0:  # detectors write 0, or the limit, where no vehicle has passed
+        measurement = replace(measurement, speed=nan)
     if measurement.end <= measurement.begin:
         raise invalid_value(f"{context}: end", measurement.end, f"after begin, {measurement.begin:g} s")
     return measurement

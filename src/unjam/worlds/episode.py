@@ -1,11 +1,14 @@
 """Episodes as a pure function: `run_episode(scenario, driver, seed) -> Episode`."""
 
+import importlib.util
 import random
 import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib.abc import MetaPathFinder
+from types import ModuleType
 from typing import Any, SupportsIndex
 
 import numpy as np
@@ -99,11 +102,13 @@ def run_episode(
 
 @contextmanager
 def seeded_generators(seed: Sequence[int]) -> Iterator[None]:
-    """Seed the global generators of Python, NumPy and torch (on the CPU, if it is loaded) for code of the user.
+    """Seed the global generators of Python, NumPy and torch (on the CPU) for code of the user.
 
+    torch is not imported for that: if the code imports it, it is seeded then.
     They are restored when the last of several blocks ends; other threads must not draw from them meanwhile.
     """
     numbers, torch = np.random.SeedSequence(seed).generate_state(4), sys.modules.get("torch")
+    torch_seeder = _TorchSeeder(int(numbers[0]))
     with _generators_lock:
         now = random.getstate(), np.random.get_state(), torch and torch.get_rng_state()
         _generator_states.append(_generator_states[0] if _generator_states else now)
@@ -111,16 +116,50 @@ def seeded_generators(seed: Sequence[int]) -> Iterator[None]:
         np.random.seed(numbers)
         if torch:
             torch.default_generator.manual_seed(int(numbers[0]))
+        else:
+            sys.meta_path.insert(0, torch_seeder)
     try:
         yield
     finally:
         with _generators_lock:
             python_state, numpy_state, torch_state = _generator_states.pop()
+            torch_seeder.remove()
             if not _generator_states:
                 random.setstate(python_state)
                 np.random.set_state(numpy_state)
                 if torch and torch_state is not None:
                     torch.set_rng_state(torch_state)
+                elif "torch" in sys.modules:  # imported in the block
+                    sys.modules["torch"].seed()
+
+
+class _TorchSeeder(MetaPathFinder):
+    """Seeds torch's generator right after its first import."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
+        """Return the specification of torch with a loader that seeds, and None for other modules."""
+        if fullname != "torch":
+            return None
+        self.remove()
+        specification = importlib.util.find_spec("torch")
+        if specification is None or specification.loader is None:
+            return specification
+        execute = specification.loader.exec_module
+
+        def execute_and_seed(module: ModuleType) -> None:
+            execute(module)
+            module.default_generator.manual_seed(self._seed)
+
+        specification.loader.exec_module = execute_and_seed  # pyright: ignore[reportAttributeAccessIssue]
+        return specification
+
+    def remove(self) -> None:
+        """Leave the list of finders."""
+        if self in sys.meta_path:
+            sys.meta_path.remove(self)
 
 
 def as_seed(seed: SupportsIndex | Sequence[int]) -> tuple[int, ...]:

@@ -1,5 +1,6 @@
 """Parallel episodes in worker processes; the results do not depend on what happens to a worker."""
 
+import os
 import queue
 import subprocess
 import tempfile
@@ -13,7 +14,7 @@ from typing import Any, TypeVar
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable
 from unjam.errors import EpisodeError, SumoInputError
-from unjam.processes import PrivateFolder, remove_stale_private_folders
+from unjam.processes import PrivateFolder, check_owner, remove_stale_private_folders
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.sumo_files import MAX_READER_TIME, answer_of
@@ -71,7 +72,7 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
     def __init__(
         self, count: int = 1, timeout: float = WORKER_TIMEOUT, max_attempts: int = MAX_EPISODE_ATTEMPTS
     ) -> None:
-        self.count, self._max_attempts, self._is_first = count, max_attempts, True
+        self.count, self._max_attempts, self._is_first, self._owner = count, max_attempts, True, os.getpid()
         remove_stale_private_folders()
         self._temporary_folder = PrivateFolder()  # of all workers, so that a killed one leaves no files
         self._idle_workers: queue.LifoQueue[_Worker] = queue.LifoQueue()
@@ -98,6 +99,7 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
         `transform` is called when an episode ends, from several threads. If SUMO refuses the files of the very first
         task, and so would refuse those of others, raise `SumoInputError`.
         """
+        check_owner(self._owner, "worker pool: it")
         is_first, self._is_first = self._is_first, False
 
         def run_one(index: int, task: EpisodeTask) -> ResultT:

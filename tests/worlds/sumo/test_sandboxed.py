@@ -106,6 +106,48 @@ def test_a_fork_that_ends_in_a_driver_leaves_the_episode_to_its_parent(road: Sce
     assert [row["status"] for rows in in_worker.rows.values() for row in rows] == ["completed"]
 
 
+FORKED = """
+import os, sys
+from unjam.drivers import IDM
+from unjam.errors import LostWorkerError
+from unjam.scenarios import make_scenario
+from unjam.worlds.episode import run_episode
+from unjam.worlds.sumo.backend import SumoBackend
+from unjam.worlds.sumo.sandboxed import SandboxedSimulation
+from unjam.worlds.sumo.simulation import Simulation
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+if __name__ == "__main__":
+    road = make_scenario(sys.argv[1], {"penetration_rate": 0.5, "horizon": 5})
+    with SandboxedSimulation() as sandboxed, Simulation("traci") as connected, WorkerPool(1) as workers:
+        calls = [
+            lambda: run_episode(road, IDM(), 0, backend=SumoBackend(sandboxed)).speeds.sum(),
+            lambda: run_episode(road, IDM(), 0, backend=SumoBackend(connected)).speeds.sum(),
+            lambda: workers.run([EpisodeTask(road, IDM(), (0,))])[0].speeds.sum(),
+        ]
+        before = [call() for call in calls]
+        for call in calls:
+            child = os.fork()
+            if child == 0:
+                try:
+                    call()
+                except LostWorkerError as error:
+                    os._exit(7 if "os.fork" in str(error) else 8)
+                os._exit(9)
+            print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), end=" ")
+        print([call() for call in calls] == before, flush=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork")
+def test_a_fork_may_not_use_processes_of_its_parent(road: Scenario, tmp_path: Path) -> None:
+    program = tmp_path / "forked.py"
+    program.write_text(FORKED)
+    done = subprocess.run(
+        [sys.executable, program, tmp_path / "straight.sumocfg"], capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout == "7 7 7 True\n", done.stderr
+
+
 @pytest.mark.long
 @kept
 @pytest.mark.parametrize("option", WRITING)

@@ -16,7 +16,7 @@ from threading import Lock
 from typing import IO, Any, get_type_hints
 
 from unjam.errors import LostWorkerError, as_unjam_error, error_from_name
-from unjam.processes import PrivateFolder, remove_stale_private_folders
+from unjam.processes import PrivateFolder, check_owner, remove_stale_private_folders
 from unjam.sandbox import confine_process, limit_resources
 from unjam.tree import Arrays, pack, unpack
 from unjam.worlds.messages import answer_requests, open_answer_pipe, read_message, start_child, write_message
@@ -98,6 +98,7 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
         self._call("load", {**inputs._asdict(), "existing_files": existing, "copied_files": copied}, step, seed)
 
     def _call(self, name: str, *arguments: Any) -> Any:
+        check_owner(self._owner, "simulation: it")
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         # Names and numbers come in many kinds of sequences.

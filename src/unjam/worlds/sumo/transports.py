@@ -5,6 +5,7 @@ or replaces it, and the user's TraCI connection stays the active one.
 """
 
 import importlib
+import os
 import socket
 import subprocess
 import threading
@@ -19,6 +20,7 @@ from types import ModuleType
 from typing import Any, Literal, NamedTuple
 
 from unjam.errors import LostWorkerError, MissingPartError, UnjamError
+from unjam.processes import check_owner
 from unjam.sandbox import restrict_writing
 
 Transport = Literal["libsumo", "traci", "gui"]
@@ -127,7 +129,7 @@ class Traci:
     is_lost = has_refused = False
 
     def __init__(self) -> None:
-        self._traci = import_library("traci")
+        self._traci, self._owner = import_library("traci"), os.getpid()
         self.functions: Any = None
 
     @property
@@ -136,7 +138,8 @@ class Traci:
         return self.functions is not None
 
     def check(self) -> None:
-        """Do nothing: no other code can change the simulation."""
+        """Raise `LostWorkerError` in a fork of the process that opened the connection; no other code can change it."""
+        check_owner(self._owner, "simulation: it")
 
     def start(self, command: Sequence[str], log_path: Path) -> None:
         """Start SUMO, which may only write into the folder of its log, and connect to it."""
