@@ -15,7 +15,7 @@ def card(name: str) -> str:
     certified = (
         ", ".join(f"{key.replace('_', ' ')} {low:.1f} to {high:.1f}" for key, (low, high) in domain.items())
         if domain
-        else "not certified"
+        else "none: the file has no certificate (unjam certify), nothing is proven of it"
     )
     rows = {
         "compared with the human baseline": f"{found['compared with the human baseline']}; {found['seeds']} seeds",

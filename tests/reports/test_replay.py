@@ -125,5 +125,15 @@ def test_a_replay_of_many_vehicles_has_fewer_frames(episode: PlotEpisode) -> Non
     assert len(json.dumps(data)) < 5e6
 
 
+def test_a_replay_marks_the_places_where_ramps_join() -> None:
+    merge = plot_episode_of(merge_episode(), "human")
+    (place,) = replay_data([merge])["drivers"][0]["merges"]
+    assert merge.merge_positions == (0.0,)
+    at_merge = np.nanargmin(np.abs(merge.positions))
+    assert place == pytest.approx(merge.poses.reshape(-1, 3)[at_merge, :2].tolist(), abs=0.1)
+    far = replace(merge, merge_positions=(5000.0,))
+    assert replay_data([far])["drivers"][0]["merges"] == []
+
+
 def test_a_replay_without_episodes_is_empty() -> None:
     assert replay_data([]) == {"drivers": []}

@@ -1,5 +1,6 @@
 import json
 import math
+import random
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -225,17 +226,47 @@ def test_gain_uses_the_expert_with_its_parameters() -> None:
 
 
 def test_training_restores_generators_and_threads() -> None:
-    torch.manual_seed(3)
-    np.random.seed(3)
-    threads, expected = torch.get_num_threads(), (torch.rand(2).tolist(), np.random.rand(2).tolist())
-    torch.manual_seed(3)
-    np.random.seed(3)
+    def seed_all(seed: int) -> None:
+        torch.manual_seed(seed)
+        np.random.seed(seed)
+        random.seed(seed)
+
+    def draw() -> list[float]:
+        return [*torch.rand(2).tolist(), *np.random.rand(2), random.random()]
+
+    seed_all(3)
+    threads, expected = torch.get_num_threads(), draw()
+    seed_all(3)
     with exclusive_random_state():
-        torch.manual_seed(8)
-        np.random.seed(8)
+        seed_all(8)
         torch.set_num_threads(threads + 1)
-    assert (torch.rand(2).tolist(), np.random.rand(2).tolist()) == expected
+    assert draw() == expected
     assert torch.get_num_threads() == threads
+
+
+def test_training_is_the_same_whatever_defaults_of_torch_the_program_has_set() -> None:
+    def make_gradient() -> torch.Tensor:
+        with exclusive_random_state():
+            weights = torch.ones(2, requires_grad=True)
+            loss = (weights @ torch.tensor([[0.1], [0.2]])).sum()
+            loss.backward()
+            assert weights.grad is not None
+            return torch.stack([loss.detach(), *weights.grad])
+
+    expected = make_gradient()
+    torch.set_default_dtype(torch.float64)
+    torch.set_default_device("meta")
+    try:
+        with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16):
+            found = make_gradient()
+            assert torch.is_inference_mode_enabled()
+        assert torch.get_default_dtype() == torch.float64
+        assert torch.get_default_device() == torch.device("meta")
+    finally:
+        torch.set_default_dtype(torch.float32)
+        torch.set_default_device(None)
+    assert found.dtype == expected.dtype
+    assert torch.equal(found, expected)
 
 
 def test_second_training_in_a_process_is_refused() -> None:

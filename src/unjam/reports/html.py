@@ -32,6 +32,8 @@ MAX_REPLAY_FRAMES = 600
 """maximum number of frames of a replay, which interpolates between them"""
 MAX_REPLAY_VALUES = 600_000
 """vehicles times frames of all drivers of a replay: about three megabytes"""
+MAX_MERGE_DISTANCE = 50.0
+"""largest distance of a vehicle from a merge whose place in the plane it gives [m]"""
 REPLAY_NAN = 65535
 """code of NaN in the arrays of a replay"""
 WORST_SHARE = 0.9
@@ -235,7 +237,19 @@ def _replay_track(episode: PlotEpisode, step: float, frames: int, longest_platoo
         "speeds": [_encode_array(packed[..., 3])],
         "poses": [_encode_array(packed[..., axis]) for axis in range(3)],
         "lines": [np.column_stack([np.zeros(len(line)), line]).round(1).tolist() for line in lines],
+        "merges": _merge_places(episode),
     }
+
+
+def _merge_places(episode: PlotEpisode) -> list[list[float]]:
+    """Return the places (x, y) where ramps join [m]: those of the vehicles that were nearest to each."""
+    places = []
+    for position in episode.merge_positions:
+        distance = np.abs(episode.positions - position)
+        if np.isfinite(distance).any() and np.nanmin(distance) <= MAX_MERGE_DISTANCE:
+            nearest = np.unravel_index(np.nanargmin(distance), distance.shape)
+            places.append(episode.poses[nearest][:2].round(1).tolist())
+    return places
 
 
 def _encode_array(array: np.ndarray) -> dict[str, Any]:

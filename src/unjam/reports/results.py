@@ -38,7 +38,7 @@ FULL_RATE_ARRAYS = ("speeds", "backlog")
 NO_LANE = -1
 """lanes are stored as small integers, which have no NaN"""
 EPISODE_ENTRIES = (
-    *("control_step", "seed", "drawn_values", "loop_length", "crossings", "branches", "limit_speed"),
+    *("control_step", "seed", "drawn_values", "loop_length", "crossings", "branches", "limit_speed", "merge_positions"),
     *("vehicle_ids", "cav_ids", "vehicle_columns", "lane_names"),
 )
 """fields of an episode that figures need, without the arrays"""

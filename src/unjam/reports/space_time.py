@@ -123,6 +123,8 @@ def _branch_row(episodes: Sequence[PlotEpisode], branch: str, is_main: bool) -> 
         if episode.is_closed:
             loop_length, max_step, width = episode.loop_length, episode.loop_length / 2, 1.0  # no line over the seam
             positions, grid = positions % loop_length, np.linspace(0.0, loop_length, SPEED_FIELD_POSITIONS)
+        if is_main:
+            _mark_merges(axes, episode, extent)
         field = speed_field(positions, speeds, grid, loop_length, episode.has_recorded_leader)
         axes.pcolormesh(times, grid, field, cmap=figures.SPEED_COLORMAP, norm=scale, rasterized=True)
         is_cav = np.isin(np.arange(speeds.shape[1]), episode.controlled_columns)
@@ -186,6 +188,15 @@ def speed_field(
     return field
 
 
+def _mark_merges(axes: Axes, episode: PlotEpisode, extent: tuple[float, float]) -> None:
+    """Draw a dashed line where a ramp joins the road, within the first and last position of a panel [m]."""
+    for position in episode.merge_positions:
+        if extent[0] < position < extent[1]:
+            axes.axhline(position, color=figures.TEXT_COLOR, lw=0.8, ls=(0, (4, 3)), zorder=1.6, rasterized=True)
+            label = {"ha": "left", "va": "bottom", "fontsize": 7, "color": figures.TEXT_COLOR, "zorder": 3}
+            axes.text(0.01, position, "ramp joins", transform=axes.get_yaxis_transform(), **label)
+
+
 def has_lane_maps(episodes: Sequence[PlotEpisode]) -> bool:
     """Return whether episodes are drawn lane by lane: whether all are on the same road with lanes."""
     return bool(episodes) and len({tuple(each.lane_names) for each in episodes}) == 1 and bool(episodes[0].lane_names)
@@ -201,7 +212,7 @@ def lane_map_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     """Draw the mean speed in cells of time and road, a row per lane from left to right, a column per driver.
 
     Speeds are Edie's: total distance over total time in a cell. Cells without vehicles are white; red lines are
-    CAVs.
+    CAVs, dashed lines show where ramps join.
     """
     lanes = _busiest_lanes(episodes)
     extents = [_lane_range(episodes, lane) for lane in lanes]
@@ -260,6 +271,7 @@ def _lane_row(first: PlotEpisode, lane: int, extent: tuple[float, float, float],
         edges = np.linspace(0.0, longest + episode.control_step, columns + 1), np.linspace(start, end, rows + 1)
         axes.pcolormesh(*edges, speeds, cmap=figures.SPEED_COLORMAP, norm=scale, rasterized=True)
         axes.set_ylim(start, end)
+        _mark_merges(axes, episode, (start, end))
         cavs = episode.controlled_columns
         positions = np.where(episode.lane_indices[:, cavs] == lane, episode.positions[:, cavs], np.nan)
         add_vehicle_lines(axes, episode.times, positions, np.inf, colors=figures.CAV_PLOT_COLOR, linewidths=0.35)

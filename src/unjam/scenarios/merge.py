@@ -118,6 +118,7 @@ class Merge(Scenario):
             routes=_ROUTES,
             entries=tuple(sorted((entry for entry, _ in entering), key=lambda entry: entry.time)),
             limit_speed=self.limit_speed(),
+            merge_positions=(0.0,),
             origins=origins,
             cav_ids=frozenset(name for name in origins if name.startswith("cav")),
             junction_lengths=JUNCTION_LENGTHS,

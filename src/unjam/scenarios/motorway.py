@@ -204,6 +204,7 @@ class Motorway(Scenario):
             routes=geometry.routes,
             entries=tuple(entries),
             limit_speed=self.speed_limit,
+            merge_positions=tuple(ramp.merge_start - geometry.origin for ramp in geometry.ramps),
             vehicle_types=types,
             cav_ids=self._select_cavs({each.name: draws[each.name] for each in entries if _is_car(types, each)}),
             peak=self.peak,

@@ -113,6 +113,8 @@ class Road:
     """speed that the traffic cannot exceed in the long run [m/s], as the scenario defines it; NaN: unknown"""
     drawn_values: dict[str, float] = field(default_factory=dict)
     """values drawn from the episode's seed, by name"""
+    merge_positions: tuple[float, ...] = ()
+    """positions along the road where ramps join [m]"""
     human_parameters: dict[str, IDMParameters] = field(default_factory=dict)
     """parameters of each vehicle's human driver, by vehicle; empty: all as the scenario says"""
 

@@ -167,6 +167,8 @@ class Episode:
     """length of a closed road [m]; NaN of a road with ends"""
     crossings: tuple[tuple[float, float], ...] = ()
     """ranges along the road where it crosses itself [m]"""
+    merge_positions: tuple[float, ...] = ()
+    """positions along the road where ramps join [m]"""
     limit_speed: float = float("nan")
     """the scenario's own limit of speed [m/s]"""
     vehicle_ids: tuple[str, ...] = ()
@@ -284,6 +286,7 @@ def common_fields(
         "warmup": scenario.warmup,
         "drawn_values": road.drawn_values,
         "limit_speed": road.limit_speed,
+        "merge_positions": road.merge_positions,
     }
 
 

@@ -110,22 +110,33 @@
     const width = Math.round(road.canvas.clientWidth * (window.devicePixelRatio || 1));
     const meter = width / (right - left + 12);
     const factor = Number(zoom.value), across = high - low + 12;
-    const height = Math.round(Math.max(Math.min(1.2 * width, meter * across), Math.min(0.15 * width, factor * meter * across)));
+    const top = (road.merges || []).length ? 32 * (window.devicePixelRatio || 1) : 0;  // of the labels of ramps
+    const height = top + Math.round(Math.max(Math.min(1.2 * width, meter * across), Math.min(0.15 * width, factor * meter * across)));
     if (road.canvas.width !== width || road.canvas.height !== height) {
       road.canvas.width = width; road.canvas.height = height;
     }
-    const scale = factor * Math.min(meter, height / across);
+    const scale = factor * Math.min(meter, (height - top) / across);
     const middle = [left + view.x * (right - left), low + view.y * (high - low)];
     road.meter = scale / (window.devicePixelRatio || 1);
     const enlargement = Math.max(1, 6 * (window.devicePixelRatio || 1) / (scale * data.vehicle_length));
     const pen = road.canvas.getContext("2d");
     pen.setTransform(1, 0, 0, 1, 0, 0);
     pen.clearRect(0, 0, width, height);
-    pen.setTransform(scale, 0, 0, -scale, width / 2 - scale * middle[0], height / 2 + scale * middle[1]);
+    pen.setTransform(scale, 0, 0, -scale, width / 2 - scale * middle[0], (height + top) / 2 + scale * middle[1]);
 
     pen.beginPath();
     road.lines.forEach((line) => line.forEach(([, x, y], index) => index ? pen.lineTo(x, y) : pen.moveTo(x, y)));
     pen.lineWidth = Math.max(4, 1.5 / scale); pen.strokeStyle = "#dfe3e8"; pen.stroke();
+
+    (road.merges || []).forEach(([x, y]) => {
+      pen.save();
+      pen.translate(x, y);
+      pen.scale(1 / road.meter, -1 / road.meter);  // in pixels of the page
+      pen.fillStyle = "#495057"; pen.font = "11px sans-serif"; pen.textAlign = "center";
+      pen.beginPath(); pen.moveTo(0, -6); pen.lineTo(-5, -14); pen.lineTo(5, -14); pen.fill();
+      pen.fillText("ramp", 0, -17);
+      pen.restore();
+    });
 
     const frame = Math.min(time / data.step, data.frames - 1);
     const first = Math.floor(frame), second = Math.min(first + 1, data.frames - 1), part = frame - first;
