@@ -7,14 +7,15 @@ import pytest
 
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, estimate
+from unjam.measures.verdict import Verdict
 from unjam.reports.results import Results
 from unjam.reports.summary import (
     common_baseline,
     csv_text,
-    driver_verdicts,
     format_difference,
     key_figures,
     main_finding,
+    name_baselines,
     report_columns,
     report_notes,
     report_title,
@@ -88,11 +89,32 @@ def test_finding_without_an_expert_has_the_return() -> None:
     assert finding == "On 2 test seeds the mean return of the trained controller is 15."
 
 
+def column_verdicts(results: list[Results]) -> list[Verdict]:
+    return [column.verdict for column in report_columns(results) if column.verdict is not None]
+
+
+def test_drivers_are_compared_with_the_baseline_of_their_folder() -> None:
+    times = {"human": 90.0, "pi": 80.0, "mine": 85.0}
+    rows = {
+        name: [row | {"travel_time": time + number} for number, row in enumerate(rows_of([1.0] * 4))]
+        for name, time in times.items()
+    }
+    result = drive_results(human=rows["human"], pi=rows["pi"], mine=rows["mine"])
+    requested = replace(result, metadata={**result.metadata, "baseline": "pi"})
+    found = column_verdicts([requested])
+    assert [(each.driver, each.is_better) for each in found] == [("human", False), ("mine", False)]
+    assert found[1].comparison == "travel time worse than that of pi, 4 paired seeds"
+    assert common_baseline([requested]) == name_baselines([requested]) == "pi"
+    assert name_baselines([result]) == "the human baseline"
+    unknown = replace(result, metadata={**result.metadata, "baseline": "gone"})
+    assert [each.driver for each in column_verdicts([unknown])] == ["pi", "mine"]
+
+
 def test_drivers_that_are_compared_with_human_drivers_have_verdicts_and_no_finding() -> None:
     human = rows_of([1.0] * 3, travel_time=100.0)
     result = drive_results(human=human, pi=[*rows_of([2.0, 2.0], travel_time=90.0), {**failed_rows(1)[0], "seed": 2}])
     assert main_finding(result) == ""
-    (verdict,) = driver_verdicts(report_columns([result]))
+    (verdict,) = column_verdicts([result])
     assert (verdict.driver, verdict.is_better) == ("pi", None)
     assert "2 paired seeds" in verdict.comparison
 
@@ -105,7 +127,7 @@ def test_each_folder_is_compared_with_its_own_human_drivers() -> None:
         varied = [{**row, "mean_speed": human + 0.01 * number} for number, row in enumerate(others)]
         return drive_results(folder, human=varied, pi=others)
 
-    found = driver_verdicts(report_columns([result("runs/slow", 1.0), result("runs/fast", 9.0)]))
+    found = column_verdicts([result("runs/slow", 1.0), result("runs/fast", 9.0)])
     assert [(each.driver, each.is_better) for each in found] == [("slow: pi", True), ("fast: pi", False)]
 
 

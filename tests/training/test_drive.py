@@ -90,6 +90,21 @@ def test_document_has_a_list_of_drivers(drive_result: DriveResult) -> None:
         assert (entry["difference_to_baseline"] is None) == (entry["driver"] == expert)
 
 
+def test_a_requested_baseline_is_compared_with_in_results_and_report(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    result = drive("ring", ["human", "pi", "idm"], 2, 0, ROAD, workers=1, out=out, baseline="idm")
+    documents = {entry["driver"]: entry for entry in result.document()["drivers"]}
+    assert {entry["baseline"] for entry in documents.values()} == {"idm"}
+    assert documents["idm"]["difference_to_baseline"] is None
+    expected = result.summary("pi")["mean_speed"].mean - result.summary("idm")["mean_speed"].mean
+    assert documents["pi"]["difference_to_baseline"]["mean_speed"][0] == pytest.approx(expected)
+    assert "that of idm" in result._repr_html_() or "compared with idm" in result._repr_html_()
+    assert result.report is not None
+    assert "Differences to idm" in result.report.read_text()
+    with pytest.raises(InputError, match="baseline: 'nobody' is not allowed; allowed: human, pi"):
+        drive("ring", ["human", "pi"], baseline="nobody")
+
+
 def test_document_is_strict_json_with_null_for_nan() -> None:
     result = drive("ring", "pi", episodes=1, scenario_options=ROAD, workers=1)
     document = json.loads(to_json(result.document()), parse_constant=lambda name: pytest.fail(name))

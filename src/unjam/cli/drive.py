@@ -58,6 +58,9 @@ def drive_command(
     workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
     out: opt.OutOption = None,
     report: Annotated[bool, Option(help="Write the results and a report.html into a folder.")] = True,
+    baseline: Annotated[
+        str, Option(help="Driver that the others are compared with, one of --driver.", show_default="human")
+    ] = "",
     show_all: opt.AllMetricsOption = False,
     json: opt.JsonOption = False,
 ) -> None:
@@ -83,12 +86,12 @@ def drive_command(
     total = road.max_episode_steps * episodes * len(driver)
     folder = opt.new_folder(out, f"drive-{Path(scenario).stem}") if report else None
     with output.ProgressReporter(f"driving {Path(scenario).name}", "steps", total) as progress:
-        options = workers, folder, progress.update, test_seeds, backend
+        options = workers, folder, progress.update, test_seeds, backend, baseline
         result = drive(scenario, driver, episodes, seed, changes, reward, *options)
     if json:
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
-        output.print_results(result.rows, show_all)
+        output.print_results(result.rows, show_all, result.baseline)
         output.print_notes(result.notes)
         if scenario.endswith(".sumocfg"):
             first = next(iter(result.rows.values()))[0]

@@ -67,9 +67,9 @@ def new_table(text_columns: Sequence[str] = (), number_columns: Sequence[str] = 
     return table
 
 
-def print_results(rows_by_driver: RowsByDriver, shows_all: bool) -> None:
+def print_results(rows_by_driver: RowsByDriver, shows_all: bool, baseline: str = "") -> None:
     """Print the verdicts on drivers and the metrics that matter on their road, or all metrics with differences."""
-    for verdict in verdicts(rows_by_driver):
+    for verdict in verdicts(rows_by_driver, baseline):
         for line in verdict.lines:
             if console.is_terminal:  # elsewhere a line stays one, so that it can be searched
                 hanging = " " * (2 + len(line) - len(line.lstrip()))
@@ -77,7 +77,7 @@ def print_results(rows_by_driver: RowsByDriver, shows_all: bool) -> None:
                 line = fill(line, console.width, **wrapping)
             console.print(line, soft_wrap=True)
     if shows_all:
-        print_metrics(rows_by_driver, choose_baseline(rows_by_driver))
+        print_metrics(rows_by_driver, choose_baseline(rows_by_driver, baseline))
     else:
         print_metrics(rows_by_driver, "", short_table_metrics(rows_by_driver))
         err_console.print("all metrics, with differences: --all")

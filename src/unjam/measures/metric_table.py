@@ -48,8 +48,10 @@ class TableRow:
     cells: list[TableCell]
 
 
-def choose_baseline(rows_by_driver: RowsByDriver) -> str:
-    """Return the driver to compare with: the human baseline, else the expert with the largest return; or empty."""
+def choose_baseline(rows_by_driver: RowsByDriver, requested: str = "") -> str:
+    """Return the driver to compare with: a requested one, the human baseline, the best expert by return, or empty."""
+    if requested and len(rows_by_driver) > 1:
+        return requested
     if len(rows_by_driver) < 2 or HUMAN_LABEL in rows_by_driver:
         return HUMAN_LABEL if len(rows_by_driver) > 1 else ""
     returns = {

@@ -1,4 +1,4 @@
-"""Verdicts on drivers: feasible or not, better or worse than human drivers, and the numbers that matter on a road."""
+"""Verdicts on drivers: feasible or not, better or worse than a baseline, and the numbers that matter on a road."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from unjam.measures.statistics import Estimate, paired_difference, relative_diff
 Rows = Sequence[dict[str, Any]]
 """a row of metrics for each episode"""
 HIGHER_IS_BETTER = {"mean_speed", "mean_speed_steady", "outflow_veh_per_h", "min_ttc"}
-"""metrics that are compared with human drivers, of which lower values are worse; of the others they are better"""
+"""metrics that are compared with the baseline, of which lower values are worse; of the others they are better"""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class RoadMetrics:
     """What matters on a kind of road."""
 
     compared: tuple[str, ...]
-    """metrics that are compared with human drivers; the first one decides"""
+    """metrics that are compared with the baseline; the first one decides"""
     others: tuple[str, ...]
     """metrics that a short table shows besides"""
 
@@ -51,17 +51,17 @@ def short_table_metrics(rows_by_driver: RowsByDriver) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class DifferenceText:
-    """A paired difference to human drivers, as text."""
+    """A paired difference to the baseline, as text."""
 
     label: str
     text: str
-    """mean and CI with the unit, and the mean as a share of the human baseline"""
+    """mean and CI with the unit, and the mean as a share of the baseline"""
     is_better: bool | None
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is shown of a driver compared with human drivers on the same seeds."""
+    """What is shown of a driver compared with the baseline on the same seeds."""
 
     driver: str
     feasibility: str
@@ -85,48 +85,53 @@ class Verdict:
         return [f"{self.driver}: {'; '.join(filter(None, [self.feasibility_text, self.comparison]))}", *numbers]
 
 
-def verdicts(rows_by_driver: RowsByDriver) -> list[Verdict]:
-    """Return the verdict on each driver but the human baseline; none without this baseline."""
-    human = rows_by_driver.get(HUMAN_LABEL, [])
+def verdicts(rows_by_driver: RowsByDriver, baseline: str = "") -> list[Verdict]:
+    """Return the verdict on each driver but the baseline, empty: human drivers; none without this baseline."""
+    reference = baseline or HUMAN_LABEL
     names = road_metrics(rows_by_driver).compared
-    found = feasibility_by_driver(rows_by_driver) if human else {}
+    found = feasibility_by_driver(rows_by_driver) if rows_by_driver.get(reference) else {}
     return [
-        _verdict(label, rows_by_driver[label], human, feasible, names)
+        _verdict(label, rows_by_driver, reference, feasible, names)
         for label, feasible in found.items()
-        if label != HUMAN_LABEL
+        if label != reference
     ]
 
 
-def _verdict(label: str, rows: Rows, human: Rows, feasible: str, names: Sequence[str]) -> Verdict:
-    differences = {name: paired_difference(rows, human, name) for name in names}
+def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible: str, names: Sequence[str]) -> Verdict:
+    rows, others = rows_by_driver[label], rows_by_driver[reference]
+    name_of_others = "human drivers" if reference == HUMAN_LABEL else reference
+    differences = {name: paired_difference(rows, others, name) for name in names}
     pairs = max(each.count for each in differences.values())
     if not pairs:
-        return Verdict(label, "", "no episode can be compared with human drivers", None)
+        return Verdict(label, "", f"no episode can be compared with {name_of_others}", None)
     changes = {name: is_better(name, difference) for name, difference in differences.items()}
     texts = (
         DifferenceText(
             METRICS[name].label.partition(",")[0],
-            _difference_text(name, difference, relative_difference(rows, human, name).mean),
+            _difference_text(name, difference, relative_difference(rows, others, name).mean),
             changes[name],
         )
         for name, difference in differences.items()
         if difference.count
     )
-    return Verdict(label, feasible, _comparison(differences, changes, pairs), changes[names[0]], (*texts,))
+    comparison = _comparison(differences, changes, pairs, name_of_others)
+    return Verdict(label, feasible, comparison, changes[names[0]], (*texts,))
 
 
-def _comparison(differences: dict[str, Estimate], changes: dict[str, bool | None], pairs: int) -> str:
+def _comparison(
+    differences: dict[str, Estimate], changes: dict[str, bool | None], pairs: int, name_of_others: str
+) -> str:
     """Return whether the first metric is shown to be better or worse, and what is shown to be worse then."""
     first = next(iter(differences))
     label, seeds = METRICS[first].label.partition(",")[0], f"{pairs} paired seed{'' if pairs == 1 else 's'}"
     if changes[first] is None:
         reason = "" if isfinite(differences[first].low) else ", which are too few"
-        return f"{label} undecided compared with human drivers, {seeds}{reason}"
+        return f"{label} undecided compared with {name_of_others}, {seeds}{reason}"
     if not changes[first]:
-        return f"{label} worse than that of human drivers, {seeds}"
+        return f"{label} worse than that of {name_of_others}, {seeds}"
     prices = {FLOW_METRIC: "less flow", FUEL_METRIC: "more fuel by emission model"}
     price = " and ".join(text for name, text in prices.items() if changes.get(name) is False)
-    return f"{label} better than that of human drivers{price and f', but {price}'}, {seeds}"
+    return f"{label} better than that of {name_of_others}{price and f', but {price}'}, {seeds}"
 
 
 def _difference_text(name: str, difference: Estimate, relative: float) -> str:

@@ -148,6 +148,12 @@ class Results:
         """Label of the trained controller, if there is one."""
         return self.metadata.get("trained")
 
+    @property
+    def baseline(self) -> str:
+        """Label of the driver that the others are compared with; empty: human drivers."""
+        baseline = self.metadata.get("baseline") or ""
+        return baseline if baseline in self.rows else ""
+
 
 def read_results(folder: Path) -> Results:
     """Return the content of a folder of results; raise `InputError` if a file is missing or damaged."""

@@ -1,7 +1,7 @@
 """Texts, key figures and tables of the report, from the results of one or several folders."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -39,26 +39,31 @@ class ReportColumn:
     name: str
     rows: list[dict[str, Any]]
     episode: PlotEpisode | None
-    human_rows: list[dict[str, Any]] | None = None
-    """rows of the human baseline in the same folder; None for the baseline itself"""
+    baseline_rows: list[dict[str, Any]] | None = None
+    """rows of the baseline in the same folder; None for the baseline itself"""
+    verdict: Verdict | None = None
+    """the verdict compared with the baseline"""
 
 
 def report_columns(results: Sequence[Results]) -> list[ReportColumn]:
     """Return all drivers of a single folder; of several folders, shared baselines only once."""
     columns: dict[str, ReportColumn] = {}
     for result, folder in zip(results, folder_names(results), strict=True):
+        baseline = result.baseline or HUMAN_LABEL
+        found = {verdict.driver: verdict for verdict in verdicts(result.rows, baseline)}
         for label, rows in result.rows.items():
             is_own = len(results) > 1 and result.trained_label in (None, label)
             is_other = label in columns and _episode_keys(columns[label].rows) != _episode_keys(rows)
             name = f"{folder}: {label}" if is_own or is_other else label
-            human = None if label == HUMAN_LABEL else result.rows.get(HUMAN_LABEL)
-            columns.setdefault(name, ReportColumn(name, rows, result.plot_episodes.get(label), human))
+            others = None if label == baseline else result.rows.get(baseline)
+            verdict = replace(found[label], driver=name) if label in found else None
+            columns.setdefault(name, ReportColumn(name, rows, result.plot_episodes.get(label), others, verdict))
     return list(columns.values())
 
 
 def common_baseline(results: Sequence[Results]) -> str:
     """Return the baseline of the table of `report_columns`; empty if the folders do not share one."""
-    first, *others = (choose_baseline(result.rows) for result in results)
+    first, *others = (choose_baseline(result.rows, result.baseline) for result in results)
     is_same = len({tuple(_episode_keys(result.rows.get(first, []))) for result in results}) == 1
     is_own = len(results) > 1 and any(result.trained_label in (None, first) for result in results)
     return first if all(other == first for other in others) and is_same and not is_own else ""
@@ -90,10 +95,10 @@ def report_title(results: Sequence[Results]) -> str:
     return f"{names}: a trained " + ("network" if expert == "none" else f"residual on {expert}")
 
 
-def driver_verdicts(columns: Sequence[ReportColumn]) -> list[Verdict]:
-    """Return the verdict on each driver that has a human baseline in its folder."""
-    compared = ({HUMAN_LABEL: each.human_rows, each.name: each.rows} for each in columns if each.human_rows is not None)
-    return [verdict for rows in compared for verdict in verdicts(rows)]
+def name_baselines(results: Sequence[Results]) -> str:
+    """Return what the drivers of these results are compared with, in words."""
+    names = dict.fromkeys(result.baseline or "the human baseline" for result in results)
+    return " or ".join("the human baseline" if name == HUMAN_LABEL else name for name in names)
 
 
 def main_finding(result: Results) -> str:
@@ -188,19 +193,19 @@ def key_figures(result: Results) -> list[dict[str, str]]:
 
 
 def baseline_differences(columns: Sequence[ReportColumn]) -> dict[str, Any]:
-    """Return the table of paired differences to the human baseline of the same folder; empty without baselines.
+    """Return the table of paired differences to the baseline of the same folder; empty without baselines.
 
     A cell is marked as better or worse if its confidence interval excludes zero and all pairs count. There is no
     correction for multiple comparisons: of twenty cells, one is marked by chance.
     """
-    compared = [(column, column.human_rows) for column in columns if column.human_rows is not None]
+    compared = [(column, column.baseline_rows) for column in columns if column.baseline_rows is not None]
     if not compared:
         return {}
     rows = []
     for name in COMPARED_METRICS:
         metric, cells = METRICS[name], []
-        for column, human in compared:
-            gain, pairs = paired_difference(column.rows, human, name), len(pair_rows(column.rows, human))
+        for column, others in compared:
+            gain, pairs = paired_difference(column.rows, others, name), len(pair_rows(column.rows, others))
             verdict = is_better(name, gain) if gain.count == pairs else None
             mark = {True: "better", False: "worse", None: ""}[verdict]
             text = str(estimate_cell(gain, metric.digits, pairs, "+"))

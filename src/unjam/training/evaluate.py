@@ -92,6 +92,8 @@ class DriveResult(Evaluation):
     report: Path | None = None
     notes: list[str] = field(default_factory=list)
     """caveats, as controllers on a road that they were not made for"""
+    baseline: str = ""
+    """label of the driver that the others are compared with; empty: human drivers, or else the best expert"""
 
     @property
     def mean(self) -> dict[str, float]:
@@ -123,7 +125,7 @@ class DriveResult(Evaluation):
         """Return the verdicts, the metrics that matter, and the trajectories of all vehicles, for notebooks."""
         from unjam.reports.figures import data_uri
 
-        lines = ("<br>".join(map(escape, each.lines)) for each in verdicts(self.rows))
+        lines = ("<br>".join(map(escape, each.lines)) for each in verdicts(self.rows, self.baseline))
         table = "".join(f"<p>{text}</p>" for text in lines) + metric_frame(self.rows).to_html(index=False, border=0)
         if not self.plot_episodes:
             return table
@@ -148,7 +150,7 @@ class DriveResult(Evaluation):
     def document(self) -> dict[str, Any]:
         """Return the result as `unjam drive --json` prints it, with a document for each driver, also for one."""
         feasible, effects = feasibility_by_driver(self.rows), effects_by_driver(self.rows)
-        baseline, documents = choose_baseline(self.rows), list[dict[str, Any]]()
+        baseline, documents = choose_baseline(self.rows, self.baseline), list[dict[str, Any]]()
         for driver, rows in self.rows.items():
             summary, effect, differences = self.summary(driver), effects.get(driver), None
             if baseline and driver != baseline:
@@ -375,6 +377,7 @@ def drive(
     progress: Callable[[Any, int], None] | None = None,
     test_seeds: bool = False,
     backend: BackendLike = "sumo",
+    baseline: str = "",
 ) -> DriveResult:
     """Run episodes and measure them.
 
@@ -394,6 +397,7 @@ def drive(
         test_seeds: whether to use the test seeds instead of `seed` and the following ones.
         backend: the simulator: `sumo`, `batch`, `path.py:name`, or an object, with which all episodes run in this
             process.
+        baseline: label of the driver that the others are compared with; empty: human drivers, or else the best expert.
 
     Raises:
         InputError: an argument is wrong; nothing was started.
@@ -417,6 +421,8 @@ def drive(
         check_can_drive(one, road, f"driver {name}")
     if not drivers:
         raise invalid_value("driver", driver, driver_names())
+    if baseline and baseline not in drivers:
+        raise unknown_name("baseline", baseline, drivers)
     make_reward(reward or road.reward)
     with open_backend(backend) as simulator:
         check_support(simulator, road)
@@ -437,11 +443,11 @@ def drive(
             name = reward_label(reward or road.reward)
             metadata = {"scenario": Path(scenario).name, "reward": name, "backend": backend_label(backend)}
             hashes = _controller_hashes({label: label for label in drivers})
-            contents = {"manifest": manifest(), "controllers": hashes, "notes": notes}
+            contents = {"manifest": manifest(), "controllers": hashes, "notes": notes, "baseline": baseline}
             save_evaluation(folder, evaluation, {**metadata, **contents})
             from unjam.reports.html import write_report_page  # imported late: it draws
 
             report = write_report_page([folder], folder / "report.html")
     used_folder = folder if has_results else None
     made_by = scenario, backend_label(backend)
-    return DriveResult(evaluation.rows, evaluation.plot_episodes, *made_by, used_folder, report, notes)
+    return DriveResult(evaluation.rows, evaluation.plot_episodes, *made_by, used_folder, report, notes, baseline)
