@@ -124,6 +124,12 @@ def test_human_drivers_are_to_be_compared_with_the_controller_of_the_road(
 def test_a_training_on_several_roads_is_resumed_as_a_whole(messages: StringIO) -> None:
     output.suggest_after_training(Path("runs/all/ring"), estimate([0.0, 0.0]), 100, Path("runs/all"), is_finished=False)
     assert "unjam train --resume runs/all --steps 200" in messages.getvalue()
+    assert "drives as its expert: no network was better" in messages.getvalue()
+
+
+def test_a_training_that_changed_the_expert_without_a_gain_is_not_called_its_expert(messages: StringIO) -> None:
+    output.suggest_after_training(Path("runs/one"), estimate([-1.0, 1.0, 0.5]), 100, Path("runs/one"), False)
+    assert messages.getvalue() == "no gain is shown; train longer: unjam train --resume runs/one --steps 200\n"
 
 
 def test_a_finished_training_is_exported_if_it_gained(messages: StringIO) -> None:

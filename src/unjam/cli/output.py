@@ -229,7 +229,13 @@ def suggest_after_training(folder: Path, gain: "Estimate | None", steps: int, ru
     if gain is None or gain.low > 0:
         print_next_command("export it", "export", folder, "--out", f"{folder.name}.unjam")
     elif not is_finished:
-        print_next_command("no gain is shown; train longer", "train", "--resume", run, "--steps", 2 * steps)
+        is_expert = gain.low == gain.high == 0
+        reason = (
+            "the controller drives as its expert: no network was better in validation"
+            if is_expert
+            else "no gain is shown"
+        )
+        print_next_command(f"{reason}; train longer", "train", "--resume", run, "--steps", 2 * steps)
 
 
 @contextmanager
