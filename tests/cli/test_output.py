@@ -122,7 +122,7 @@ def test_human_drivers_are_to_be_compared_with_the_controller_of_the_road(
 
 
 def test_a_training_on_several_roads_is_resumed_as_a_whole(messages: StringIO) -> None:
-    output.suggest_after_training(Path("runs/all/ring"), estimate([0.0, 0.0]), 100, Path("runs/all"), is_finished=False)
+    output.suggest_after_training(Path("runs/all/ring"), estimate([0.0] * 3), 100, Path("runs/all"), is_finished=False)
     assert "unjam train --resume runs/all --steps 200" in messages.getvalue()
     assert "drives as its expert: no network was better" in messages.getvalue()
 
