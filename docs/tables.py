@@ -203,12 +203,12 @@ def _steps_of(text: str) -> int:
 
 
 def guesses() -> pd.DataFrame:
-    """Return what a car can guess of its road, by what it remembers: on seen rings; on held-out ones."""
+    """Return what a vehicle can infer of its road, by form of its memory: on training rings; on held-out ones."""
     explained = results_part("research-notes/memory")["explained"]
     seen, held_out = next(iter(explained.values()))
     rows = []
     for form, of in explained.items():
-        row = {"what is remembered": form}
+        row = {"memory": form}
         for target in of[seen]:
             for rings, where in ((seen, "training"), (held_out, "unseen")):
                 share = of[rings][target]
