@@ -1,4 +1,4 @@
-"""Tables of how people drive, from results/figure-6.json and results/field.json."""
+"""Tables of human drivers, from results/figure-6.json and results/field.json."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -55,7 +55,7 @@ def errors(driver: str, is_long: bool = False, name: str = "driver_error") -> pd
 
 
 def leaks() -> pd.DataFrame:
-    """Return the error on the test rows by split: what rows that training has seen hide."""
+    """Return the error on the test rows by split of the data."""
     rows = figure_6(driver="other", is_long=False)
     rows = rows[rows["size"].isin([0.01, 0.1, 1.0])]
     words = {"trajectories": "by trajectory", "rows": "row by row", "released": "as the released code"}
@@ -105,12 +105,12 @@ def gap_error(model: str, data: str = "ngsim", test: str = "test") -> float:
 
 
 def ring() -> pd.DataFrame:
-    """Return what happens on the ring, by who the people are and which driver drives the CAV."""
+    """Return what happens on the ring, by human drivers and driver of the CAV."""
     table = []
-    for (people, driver), found in rows_of("field/ring").groupby(["humans", "driver"], sort=False):
+    for (humans, driver), found in rows_of("field/ring").groupby(["humans", "driver"], sort=False):
         table.append(
             {
-                "human drivers": people,
+                "human drivers": humans,
                 "CAV": {"human": "none", "pi": "PI", "trained": "PI + residual"}[str(driver)],
                 "mean speed, steady [m/s]": _mean(found["mean_speed_steady"], 2),
                 "speed std across vehicles, steady [m/s]": _mean(found["speed_std_fleet_steady"], 2),
@@ -127,7 +127,7 @@ def _mean(values: pd.Series, digits: int) -> str:
 
 
 def people_claims() -> pd.DataFrame:
-    """Return what the paper says of the knowledge network, and what was measured."""
+    """Return the claims of the paper about the knowledge network, and the measurements."""
     findings = {
         "faster convergence": _passes(),
         "lower loss (substantially)": _final_loss(),
@@ -139,7 +139,7 @@ def people_claims() -> pd.DataFrame:
             "other", lambda errors: abs(errors - errors.median())
         ),
         "it captures what real drivers do": _one_step(),
-        "the residual improves on IDM": _driving_on(),
+        "the residual improves on IDM": _gap_in_simulation(),
     }
     return pd.DataFrame(
         {"the paper": words, "here": verdict, "number": number} for words, (verdict, number) in findings.items()
@@ -194,11 +194,11 @@ def _one_step() -> Finding:
     return verdict, f"error of one step, 218 drivers of NGSIM [m/s²]: {numbers}"
 
 
-def _driving_on() -> Finding:
+def _gap_in_simulation() -> Finding:
     own, idm = _of_seeds("gap", "knowledge, IDM"), _of_seeds("gap", "IDM")
     values = {"with the residual": own, "IDM alone": np.full(len(own), idm.mean())}
     verdict, numbers = compare(values, "with the residual", larger=False, digits=2)
-    return verdict, f"error of the gap, driving on, 218 drivers of NGSIM [m]: {numbers}"
+    return verdict, f"error of the simulated gap, 218 drivers of NGSIM [m]: {numbers}"
 
 
 def _of_seeds(name: str, model: str) -> np.ndarray:

@@ -69,16 +69,16 @@ def mean_of(name: str, driver: str, metric: str) -> float:
 
 
 def batch_sizes() -> pd.DataFrame:
-    """Return how many steps vehicles make in a second, by how many rings are stepped at once and on what."""
+    """Return vehicle steps per second by number of rings in a batch and by device."""
     columns = {}
     for name in ("cpu", "gpu"):
         measured = results_part(f"batch/sizes-{name}")
-        for people, found in measured["batches"].items():
-            columns[f"{measured['device']}, {people} [million/s]"] = {
+        for humans, found in measured["batches"].items():
+            columns[f"{measured['device']}, {humans} [million/s]"] = {
                 entry["rings"]: f"{entry['vehicle_steps_per_s'] / 1e6:,.1f}" for entry in found
             }
     table = pd.DataFrame(columns).fillna("")
-    table.insert(0, "rings at once", [f"{rings:,}" for rings in table.index])
+    table.insert(0, "rings per batch", [f"{rings:,}" for rings in table.index])
     return table
 
 
@@ -124,10 +124,11 @@ def knowledge_gain(roads: Sequence[str], columns: dict[str, str]) -> pd.DataFram
 
 
 def roads_known(road: str) -> pd.DataFrame:
-    """Return how wrong imagined whole roads are by what is known of people and by the data, in the mean.
+    """Return the mean errors of whole-road models by prior knowledge of human drivers and by amount of data.
 
-    Of a step, and of whole episodes: speed of all, and how unlike speeds are in the second half, beyond the
-    actual ones, where PI drives and where a CAV follows as people do; in brackets the range of the seeds.
+    These are one-step errors, and differences of whole episodes to those of the environment: mean speed, and standard
+    deviation of speeds in the second half, with PI and with a CAV that follows as a human driver. Brackets have the
+    range of the seeds.
     """
     rows = results_part("model/whole_roads")["rows"]
     drivers = {"PI": "PI", "CAV that follows as a human driver": "as a human driver"}
@@ -136,7 +137,7 @@ def roads_known(road: str) -> pd.DataFrame:
 
 
 def on_ramps_known() -> pd.DataFrame:
-    """Return how wrong imagined on-ramps are, as `roads_known`: travel time and flow beyond the actual."""
+    """Return the errors of on-ramp models, as `roads_known`: differences of travel time and flow."""
     rows = results_part("model/on_ramps")["rows"]
     drivers = {"expert of the data": "the expert", "human baseline": "human baseline"}
     metrics = {"travel_time": ("travel time", "s", 1), "outflow_veh_per_h": ("flow", "veh/h", 0)}
@@ -148,15 +149,15 @@ Metrics = dict[str, tuple[str, str, int]]
 
 
 def _known(rows: list[dict], drivers: dict[str, str], metrics: Metrics) -> pd.DataFrame:
-    """Return a table of `rows`, one of which is what was, by `drivers` with their labels.
+    """Return a table of `rows`, one of which is the environment, by `drivers` with their labels.
 
-    Where half of the episodes or more ended in a collision they say nothing of speeds.
+    Differences are left out where half of the episodes or more ended in a collision.
     """
     (actual,) = (row for row in rows if not row["known"])
     found, table = pd.DataFrame([row for row in rows if row["known"]]), []
     for (known, steps), of in found.groupby(["known", "steps"], sort=False):
-        cells = {"what is known": known, "environment steps": f"{steps:,}" if steps else "none"}
-        cells["error of a step [m/s]"] = f"{of['step_error'].mean():.4f}"
+        cells = {"prior knowledge": known, "environment steps": f"{steps:,}" if steps else "none"}
+        cells["one-step error [m/s]"] = f"{of['step_error'].mean():.4f}"
         for driver, label in drivers.items():
             for name, (heading, unit, digits) in metrics.items():
                 whole = [each for each in of[driver] if 2 * each["collisions"] < len(each[name])]
@@ -164,7 +165,7 @@ def _known(rows: list[dict], drivers: dict[str, str], metrics: Metrics) -> pd.Da
                 cells[f"{heading}, {label} [{unit}]"] = _in_range(beyond, digits) if whole else "–"
         crashed = sum(each["collisions"] for driver in drivers for each in of[driver])
         episodes = len(drivers) * len(of) * len(actual[driver][name])
-        cells["collide"] = f"{crashed} of {episodes}"
+        cells["episodes with collisions"] = f"{crashed} of {episodes}"
         table.append(cells)
     return pd.DataFrame(table)
 
@@ -202,12 +203,12 @@ def _steps_of(text: str) -> int:
 
 
 def guesses() -> pd.DataFrame:
-    """Return what a car can guess of its road, by what it remembers: on seen rings; on held-out ones."""
+    """Return what a vehicle can infer of its road, by form of its memory: on training rings; on held-out ones."""
     explained = results_part("research-notes/memory")["explained"]
     seen, held_out = next(iter(explained.values()))
     rows = []
     for form, of in explained.items():
-        row = {"what is remembered": form}
+        row = {"memory": form}
         for target in of[seen]:
             for rings, where in ((seen, "training"), (held_out, "unseen")):
                 share = of[rings][target]

@@ -43,7 +43,7 @@ MAX_SAMPLE_INTERVAL = 60
 MIN_ERROR_REDUCTION = 0.3
 """share by which networks must reduce the base's mean squared error: a record has no lane-change memory of human
 drivers, which rollouts have, and its mean effect would be added twice. Networks that reduced it by a fifth made model
-episodes 10 s too long; others, by more than half, 20 s instead of 180 (docs/virtual.md)"""
+episodes 10 s too long; others, by more than half, 20 s instead of 180 (docs/virtual-measurements.md)"""
 PERCEPTION_ERROR_STD = 0.5
 """stationary standard deviation of drivers' errors in gap and leader speed; that of their driving error is 1"""
 
