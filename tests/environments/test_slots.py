@@ -1,5 +1,6 @@
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test
@@ -22,6 +23,12 @@ def test_passes_the_api_test_of_pettingzoo(scenario: str, options: Any) -> None:
     environment = unjam.parallel_env(scenario, slots=3, **options)
     parallel_api_test(environment, num_cycles=30)
     environment.close()
+
+
+@pytest.mark.parametrize("name", ["slots", "num_envs"])
+def test_a_single_environment_names_the_environments_with_slots_and_copies(name: str) -> None:
+    with pytest.raises(InputError, match=f"{name}: it is not allowed in a single environment .* gymnasium.make_vec"):
+        gymnasium.make("unjam/OnRamp-v0", **{name: 8})
 
 
 def test_slots_are_the_same_all_the_time_and_empty_ones_are_zero() -> None:

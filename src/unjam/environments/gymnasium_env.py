@@ -346,6 +346,10 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
             raise unknown_name("render_mode", render_mode, ("human", "rgb_array"))
         if render_mode == "human" and not has_display():
             raise MissingPartError("render_mode: 'human' needs a display; without one: 'rgb_array'")
+        for name in ("slots", "num_envs"):
+            if name in changes:
+                others = "gymnasium.make_vec and, with slots, unjam.parallel_env"
+                raise InputError(f"{name}: it is not allowed in a single environment of one CAV; allowed in: {others}")
         self.render_mode, self._spec = render_mode, None
         if render_mode == "human" and backend != "sumo":
             raise invalid_value("render_mode", render_mode, "rgb_array, except with backend='sumo'")
