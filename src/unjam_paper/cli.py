@@ -15,7 +15,7 @@ def reproduce_command(
     studies: Annotated[
         list[str], typer.Argument(help="Names of studies: table-1, figure-4 ..., or all.", metavar="STUDY...")
     ],
-    seeds: Annotated[int, typer.Option(min=1, help="Trainings of each variant.")] = 3,
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Trainings of each variant.")] = 3,
     workers: opt.TrainingWorkersOption = opt.DEFAULT_WORKERS,
     executor: opt.ExecutorOption = "local",
     out: Annotated[Path, typer.Option(help="Folder of all studies; existing trainings are reused.")] = Path(

@@ -495,6 +495,12 @@ def test_a_pipe_a_folder_or_nothing_is_no_key(tmp_path: Path) -> None:
                 read(tmp_path / name)
 
 
+@pytest.mark.skipif(not os.path.exists("/proc/self/mem"), reason="there is no such file")
+def test_a_special_file_that_cannot_be_read_is_no_key() -> None:
+    with pytest.raises(InputError, match="'/proc/self/mem' cannot be read: "):
+        read_private_key(Path("/proc/self/mem"))
+
+
 def test_only_signatures_need_what_checks_them(tmp_path: Path) -> None:
     write_signed(tmp_path)
     (tmp_path / "cryptography.py").write_text("raise ImportError('gone')")

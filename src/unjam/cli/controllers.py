@@ -92,9 +92,9 @@ def certify_command(
     from unjam.reports.certificate import write_certificate_page  # loads matplotlib
 
     certificate = make_certificate(controller)
-    add_certificate(file, controller, certificate)
     assert isinstance(controller.driver, FilteredDriver)  # only such drivers are certified
-    write_certificate_page(file.name, controller.driver, certificate, target)
+    write_certificate_page(file.name, controller.driver, certificate, target)  # may be refused: before the file changes
+    add_certificate(file, controller, certificate)
     if json:
         print_json({"file": str(file), "page": str(target), "certificate": certificate})
         return

@@ -93,7 +93,10 @@ def _read_key(field: str, file: Path, allowed: str, key_class: type[KeyT]) -> Ke
         raise InputError(f"{field}: {str(file)!r} does not exist; allowed: {allowed}")
     if not os.path.isfile(file) or os.path.getsize(file) > MAX_KEY_BYTES:  # a pipe or a device could block
         raise invalid_value(field, str(file), allowed)
-    content = file.read_bytes()
+    try:
+        content = file.read_bytes()
+    except OSError as error:  # some special files look like files
+        raise InputError(f"{field}: {str(file)!r} cannot be read: {error.strerror}; allowed: {allowed}") from None
     try:
         is_private = key_class is Ed25519PrivateKey
         key: Any = load_pem_private_key(content, None) if is_private else load_pem_public_key(content)

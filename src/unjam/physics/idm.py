@@ -3,9 +3,10 @@
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from math import sqrt
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from unjam.parameters import STRICT, Positive, Subclassable, parameter_dataclass
 from unjam.physics.arrays import Array, clamp_min, square_root
@@ -23,8 +24,8 @@ class IDMParameters(Subclassable):
     """a [m/s2]"""
     comfortable_deceleration: Positive = 1.5
     """b [m/s2]"""
-    exponent: Positive = 4.0
-    """delta"""
+    exponent: Annotated[float, Field(ge=0.1)] = 4.0
+    """delta; with much smaller ones no equilibrium can be computed"""
     minimum_gap: Positive = 2.0
     """s0 [m], bumper to bumper at standstill"""
 
