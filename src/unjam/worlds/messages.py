@@ -2,6 +2,7 @@
 
 import json
 import os
+import select
 import signal
 import struct
 import subprocess
@@ -79,6 +80,18 @@ def read_message(pipe: IO[bytes]) -> tuple[dict[str, Any], Arrays]:
         arrays[name] = np.empty(shape, dtype)
         _read_into(pipe, _array_bytes(arrays[name]))
     return content, arrays
+
+
+def has_message(pipe: IO[bytes], seconds: float) -> bool:
+    """Return whether an answer or the end arrives within a time; True at once where pipes cannot be polled (Windows).
+
+    Nothing of an earlier answer may be unread.
+    """
+    if not hasattr(select, "poll"):
+        return True
+    poller = select.poll()
+    poller.register(pipe, select.POLLIN)
+    return bool(poller.poll(1000 * seconds))
 
 
 def _array_bytes(array: np.ndarray) -> memoryview:

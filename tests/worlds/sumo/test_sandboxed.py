@@ -1,11 +1,16 @@
 """Programs that drive on users' networks: SUMO is sandboxed, the driver is not."""
 
+import itertools
 import os
+import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
+from typing import IO, Any
 
+import gymnasium
 import numpy as np
 import psutil
 import pytest
@@ -20,6 +25,7 @@ from unjam.errors import EpisodeError
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
+from unjam.worlds.messages import read_message
 from unjam.worlds.sumo.backend import SumoBackend, make_traffic, sumo_inputs
 from unjam.worlds.sumo.sandboxed import SandboxedSimulation, open_simulation
 from unjam.worlds.sumo.simulation import Simulation
@@ -183,6 +189,41 @@ def test_a_lost_process_is_an_error_in_one_line_and_leaves_nothing(road: Scenari
             simulation.step()
     assert soon(process.pid)
     assert not folder.exists()
+
+
+def test_an_interrupt_within_a_call_does_not_mix_up_answers(
+    road: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = tmp_path / "straight.sumocfg"
+    environment = gymnasium.make("unjam/UserNetwork-v0", scenario=str(network), penetration_rate=0.5, horizon=40)
+
+    def drive_steps() -> list[np.ndarray]:
+        return [environment.reset(seed=1)[0], *(environment.step(np.zeros(1, np.float32))[0] for _ in range(5))]
+
+    with closing(environment):
+        expected = drive_steps()
+        calls = itertools.count()
+
+        def interrupt(pipe: IO[bytes]) -> Any:
+            if next(calls) == 3:
+                raise KeyboardInterrupt
+            return read_message(pipe)
+
+        with monkeypatch.context() as patch:
+            patch.setattr("unjam.worlds.sumo.sandboxed.read_message", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                drive_steps()
+        np.testing.assert_equal(drive_steps(), expected)
+
+
+def test_a_silent_process_is_lost_after_a_time(road: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("unjam.worlds.sumo.sandboxed.MAX_ANSWER_SECONDS", 0.5)
+    with SandboxedSimulation() as simulation:
+        os.kill(simulation._process.pid, signal.SIGSTOP)
+        with pytest.raises(EpisodeError, match=r"SUMO was lost: it did not answer for 0.5 s"):
+            simulation.step()
+        assert soon(simulation._process.pid)
+        assert simulation.is_lost
 
 
 def test_the_process_outlives_the_thread_that_started_it(road: Scenario) -> None:

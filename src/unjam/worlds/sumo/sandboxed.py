@@ -19,13 +19,22 @@ from unjam.errors import LostWorkerError, as_unjam_error, error_from_name
 from unjam.processes import PrivateFolder, check_owner, remove_stale_private_folders
 from unjam.sandbox import confine_process, limit_resources
 from unjam.tree import Arrays, pack, unpack
-from unjam.worlds.messages import answer_requests, open_answer_pipe, read_message, start_child, write_message
+from unjam.worlds.messages import (
+    answer_requests,
+    has_message,
+    open_answer_pipe,
+    read_message,
+    start_child,
+    write_message,
+)
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.transports import InUseError
 
 MAX_NETWORK_MEMORY = 16 * 2**30
 """memory limit of a process that drives on a user's network [bytes]"""
+MAX_ANSWER_SECONDS = 150.0
+"""time without an answer after which SUMO counts as lost [s]; reading a large network takes longest"""
 
 
 def open_simulation(is_sandboxed: bool) -> Simulation:
@@ -107,9 +116,16 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
         ]
         try:
             write_message(self._process.stdin, {"call": name, "arguments": lists})
+            if not has_message(self._process.stdout, MAX_ANSWER_SECONDS):
+                self._process.kill()
+                raise LostWorkerError(f"SUMO was lost: it did not answer for {MAX_ANSWER_SECONDS:g} s")
             content, arrays = read_message(self._process.stdout)
         except (BrokenPipeError, EOFError):
             raise LostWorkerError(f"SUMO was lost: its process ended with code {self._process.wait()}") from None
+        except BaseException:  # such as an interrupt: the next call would take this answer for its own
+            self._process.kill()
+            self._process.wait()
+            raise
         if "error" in content:
             raise error_from_name(*content["error"])
         return unpack(_return_type(name), content["answer"], arrays)

@@ -127,6 +127,7 @@ class Traci:
     """SUMO as a child process, over a connection that other code in this process does not get."""
 
     is_lost = has_refused = False
+    """an interrupt within a step makes it lost: the next call would take the answer of this one for its own"""
 
     def __init__(self) -> None:
         self._traci, self._owner = import_library("traci"), os.getpid()
@@ -173,7 +174,11 @@ class Traci:
 
     def step(self) -> None:
         """Simulate one time step."""
-        self._step()
+        try:
+            self._step()
+        except KeyboardInterrupt:
+            self.is_lost = True
+            raise
 
     def end(self) -> None:
         """End SUMO unless it has ended already."""
