@@ -1,5 +1,6 @@
 """Locks of folders, and processes that end with their parent."""
 
+import errno
 import os
 import platform
 import signal
@@ -21,6 +22,7 @@ from unjam.processes import (
     MAX_MISSED_HEARTBEATS,
     PARENT_VARIABLE,
     PRIVATE_LOCK_FILE,
+    PrivateFolder,
     bind_to_parent,
     check_not_locked,
     exit_with_parent,
@@ -241,3 +243,40 @@ def test_private_folders_of_killed_processes_are_removed(tmp_path: Path, monkeyp
     assert (killed.exists(), alive.exists(), mine.exists()) == (False, True, True)
     started[1].communicate("")
     assert not alive.exists()
+
+
+@pytest.fixture
+def without_file_locks(monkeypatch: pytest.MonkeyPatch) -> None:
+    fcntl = pytest.importorskip("fcntl")
+
+    def refuse(*arguments: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+
+
+@pytest.mark.usefixtures("without_file_locks")
+def test_a_folder_on_a_file_system_without_locks_has_one_owner(tmp_path: Path) -> None:
+    with lock_folder(tmp_path):
+        assert is_locked(tmp_path)
+        with pytest.raises(InputError, match="is being written by another process"), lock_folder(tmp_path):
+            raise AssertionError
+    assert not is_locked(tmp_path)
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    (tmp_path / LOCK_FILE).write_text(f"{platform.node()} {ended.pid}\n")
+    assert not is_locked(tmp_path)
+    with lock_folder(tmp_path):
+        assert is_locked(tmp_path)
+
+
+@pytest.mark.usefixtures("without_file_locks")
+def test_private_folders_on_a_file_system_without_locks_are_not_removed_by_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with PrivateFolder() as name:
+        os.utime(name, (1, 1))
+        remove_stale_private_folders.__wrapped__()
+        assert Path(name).exists()
+    assert not Path(name).exists()

@@ -12,6 +12,7 @@ import ctypes
 import os
 import platform
 import sys
+import warnings
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -91,7 +92,10 @@ def processor_info() -> dict[str, str]:
 
 def _find_obstacle() -> str | None:
     """Return why kernels cannot be pinned here; None: they can."""
-    if os.environ.get(KERNELS_VARIABLE) == "native":
+    requested = os.environ.get(KERNELS_VARIABLE, "")
+    if requested not in ("", "native"):
+        warnings.warn(f"{KERNELS_VARIABLE}: {requested!r} has no effect; allowed: native", stacklevel=2)
+    if requested == "native":
         return f"{KERNELS_VARIABLE}=native"
     if platform.machine() not in ("x86_64", "AMD64"):
         return f"the processor is not x86-64: {platform.machine()}"

@@ -220,11 +220,26 @@ def _send_heartbeats(descriptor: int, stop: threading.Event) -> None:
 
 def _check_other_machine(path: Path, descriptor: int, target: str) -> None:
     """Raise `InputError` if a process of another machine has locked the file and is alive."""
-    owner = os.pread(descriptor, 300, 0).decode(errors="replace").split()
-    age, max_age = time.time() - os.fstat(descriptor).st_mtime, MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL
+    owner, age, max_age = _read_owner(descriptor)
     if owner and owner[0] != platform.node() and abs(age) < max_age:
         message = f"{target} is being written on {owner[0]}"
         raise InputError(f"{message}; allowed: one at a time, or {max_age:g} s after its end")
+
+
+def _read_owner(descriptor: int) -> tuple[list[str], float, float]:
+    """Return machine and process that have locked a file, the age of their last heartbeat, and its limit [s]."""
+    owner = os.pread(descriptor, 300, 0).decode(errors="replace").split()
+    return owner, time.time() - os.fstat(descriptor).st_mtime, MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL
+
+
+def _check_this_machine(descriptor: int, target: str) -> None:
+    """Raise `InputError` if a living process of this machine has named itself in a file that cannot be locked."""
+    owner, age, max_age = _read_owner(descriptor)
+    if len(owner) == 2 and owner[0] == platform.node() and owner[1].isdecimal() and abs(age) < max_age:
+        with suppress(ProcessLookupError, OverflowError):
+            with suppress(PermissionError):  # it is of another user
+                os.kill(int(owner[1]), 0)
+            raise InputError(f"{target} is being written by another process; allowed: one at a time")
 
 
 def check_owner(owner: int, name: str) -> None:
@@ -271,7 +286,12 @@ def remove_stale_private_folders() -> None:
             status, lock = folder.lstat(), folder / PRIVATE_LOCK_FILE
             is_old = time.time() - status.st_mtime >= MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL
             is_own_folder = status.st_uid == os.getuid() and stat.S_ISDIR(status.st_mode)
-            if is_old and is_own_folder and lock.is_file() and (descriptor := _open_locked(lock)) is not None:
+            if (
+                is_old
+                and is_own_folder
+                and lock.is_file()
+                and (descriptor := _open_locked(lock, needs_lock=True)) is not None
+            ):
                 with suppress(DiskError):
                     if os.pread(descriptor, 100, 0) == _folder_identity(folder):  # else another program made it
                         remove(folder)
@@ -306,8 +326,13 @@ def is_locked(folder: Path) -> bool:
     return False
 
 
-def _open_locked(path: Path, target: str = "", is_shared: bool = False) -> int | None:
-    """Return an open and locked file, with `is_shared` for reading alone; None without locks."""
+def _open_locked(path: Path, target: str = "", is_shared: bool = False, needs_lock: bool = False) -> int | None:
+    """Return an open and locked file, with `is_shared` for reading alone; None without locks on this platform.
+
+    On a file system without locks return the open file, or with `needs_lock` None.
+
+    Raise `InputError` if another process has locked it, or without locks, if one that is alive has named itself in it.
+    """
     try:
         import fcntl
     except ImportError:
@@ -319,7 +344,14 @@ def _open_locked(path: Path, target: str = "", is_shared: bool = False) -> int |
         os.close(descriptor)
         raise InputError(f"{target} is being written by another process; allowed: one at a time") from None
     except OSError:  # a file system without locks
-        pass
+        try:
+            _check_this_machine(descriptor, target)
+        except InputError:
+            os.close(descriptor)
+            raise
+        if needs_lock:
+            os.close(descriptor)
+            return None
     return descriptor
 
 

@@ -127,6 +127,10 @@ def test_code_that_changes_under_way_is_another_driver(tmp_path: Path) -> None:
         ("{}", "[0.3], {}", r"acceleration has shape \(1,\); allowed: \(2,\), one for each CAV"),
         ("{}", "state.speed[:, None], {}", r"acceleration has shape \(2, 1\); allowed: \(2,\), one for each CAV"),
         ("{}", "'fast', {}", "acceleration is not numbers: 'fast'"),
+        ("{}", "state.speed * 1j, {}", "acceleration is not numbers"),
+        ("{}", "np.ma.masked_less(state.speed, 99), {}", "acceleration is not numbers"),
+        ("{}", "np.array(['1', '2']), {}", "acceleration is not numbers"),
+        ("{}", "np.array([1, 2], 'timedelta64[s]'), {}", "acceleration is not numbers"),
         ("{}", "state.speed", r"act\(\) returns .*; allowed: \(accelerations, memory\)"),
     ],
 )

@@ -14,9 +14,18 @@ from unjam.errors import InputError, UnjamError
 from unjam.files import to_json
 from unjam.training.config import load_config
 from unjam.training.executors import CommandLine, LocalExecutor
-from unjam.training.search import SearchTrial, check_search_space, describe_trial, search, trial_config, validation_gain
+from unjam.training.search import (
+    SearchTrial,
+    _propose_trials,
+    _restore_study,
+    check_search_space,
+    describe_trial,
+    search,
+    trial_config,
+    validation_gain,
+)
 from unjam.training.search_space import parse_search_space
-from unjam.training.trial_log import TRIALS_FILE
+from unjam.training.trial_log import TRIALS_FILE, TrialLog
 
 BASE = small_config(evaluation__validation_interval=1)
 SPACE = parse_search_space(["trpo.target_kl=0.001..0.1:log", "trpo.critic_batch_size=8,16", "trpo.critic_epochs=1..9"])
@@ -245,3 +254,22 @@ def test_search_over_experts_maximizes_the_return(tmp_path: Path, trainings: Tra
     assert best.values["expert"] == "constant"
     worth = -abs(math.log10(best.values["trpo.target_kl"]) + 2)
     assert best.gain == pytest.approx(worth), "relative to its expert, whatever the return of the expert is"
+
+
+def test_an_interrupted_search_proposes_the_same_trials(tmp_path: Path) -> None:
+    space = parse_search_space(["trpo.target_kl=0.001..0.1:log", "trpo.critic_epochs=1,2,3"])
+
+    def propose(folder: Path, trials: int) -> list[dict[str, Any]]:
+        log = TrialLog(folder, {})
+        study = _restore_study(log, space)
+        proposed = list[dict[str, Any]]()
+        for number, values in _propose_trials(study, log, space, trials, 3):
+            proposed.append(values)
+            log.append({"trial": number, "objective": values["trpo.target_kl"]})
+            study.tell(number, values["trpo.target_kl"])
+        return proposed
+
+    whole = propose(tmp_path / "whole", 16)
+    parts = [values for trials in (3, 12, 16) for values in propose(tmp_path / "parts", trials)]
+    assert parts == whole
+    assert len({values["trpo.target_kl"] for values in whole}) == 16

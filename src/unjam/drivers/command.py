@@ -36,7 +36,10 @@ class Limits(NamedTuple):
 
 
 def _as_doubles(answer: Any) -> NDArray[np.float64]:
-    return np.asarray(answer, np.float64)
+    array = np.asarray(answer)
+    if array.dtype.kind in "cSUmM" or isinstance(answer, np.ma.MaskedArray):  # part of it would be dropped
+        raise TypeError(f"{array.dtype} is no real number")
+    return array.astype(np.float64, copy=False)
 
 
 def as_numbers(

@@ -83,8 +83,8 @@ def search(
     """
     log = TrialLog(folder, {"config": asdict(base), "space": repr(space)})
     atomic_write(folder / CONFIG_FILE, to_toml(base))  # below it, files may only name trusted code
-    study = _restore_study(log, base.seed, space)
-    proposed = _propose_trials(study, log, space, trials)
+    study = _restore_study(log, space)
+    proposed = _propose_trials(study, log, space, trials, base.seed)
     with open_executor(executor, workers) as start:
         jobs: dict[Future[int], int] = {}
         while True:
@@ -134,11 +134,10 @@ def _trial_command(base: RunConfig, folder: Path, number: int, values: dict[str,
     return training_command(config, _trial_folder(folder, number), config_file, log)
 
 
-def _restore_study(log: TrialLog, seed: int, space: SearchSpace) -> Study:
+def _restore_study(log: TrialLog, space: SearchSpace) -> Study:
     """Return the study with the trials of earlier calls; some may have been interrupted."""
     proposals = [row["values"] for row in log.rows if "values" in row]
-    # A new sampler with the same seed would repeat earlier proposals.
-    study = create_study(direction="maximize", sampler=TPESampler(seed=seed + 1_000_003 * len(proposals)))
+    study = create_study(direction="maximize")
     try:
         objectives = {row["trial"]: row["objective"] for row in log.rows if "trial" in row}
         for number, values in enumerate(proposals):
@@ -152,12 +151,13 @@ def _restore_study(log: TrialLog, seed: int, space: SearchSpace) -> Study:
 
 
 def _propose_trials(
-    study: Study, log: TrialLog, space: SearchSpace, trials: int
+    study: Study, log: TrialLog, space: SearchSpace, trials: int, seed: int
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield number and values of interrupted trials, then of new ones, up to a total number."""
     stored = study.get_trials()
     yield from ((trial.number, trial.params) for trial in stored if not trial.state.is_finished())
     for number in range(len(stored), trials):
+        study.sampler = TPESampler(seed=seed + 1_000_003 * number)  # an interrupted search proposes the same trials
         values = study.ask(dict(space)).params
         log.append({"values": values})
         yield number, values

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from unjam.errors import EpisodeError
+from unjam.errors import DiskError, EpisodeError
 from unjam.worlds.record import SumoWarning, Trips
 from unjam.worlds.sumo.networks import MESSAGE_TOTAL_MARKER
 
@@ -40,18 +40,22 @@ def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -
     """Return the trips in a file that SUMO has closed, in SUMO's order.
 
     `vehicle_classes` has the vehicle class of each vehicle type. Trips that ended during the warm-up, which ends at
-    `warmup_end` [s], and trips of vehicles that were to depart later are left out.
+    `warmup_end` [s], and trips of vehicles that were to depart later are left out. Raise `DiskError` if the file is not
+    complete.
     """
     ids, kinds, times = list[str](), list[str](), list[list[float]]()
-    for _, element in ElementTree.iterparse(path):
-        trip = element.attrib
-        if element.tag != "tripinfo" or NOT_ARRIVED < float(trip["arrival"]) <= warmup_end:
-            continue
-        if float(trip["depart"]) >= 0.0 or float(trip["departDelay"]) > 0.0:
-            ids.append(trip["id"])
-            kinds.append(_vehicle_class(trip["vType"], vehicle_classes))
-            times.append([float(trip[name]) for name in TRIP_TIME_ATTRIBUTES])
-        element.clear()
+    try:
+        for _, element in ElementTree.iterparse(path):
+            trip = element.attrib
+            if element.tag != "tripinfo" or NOT_ARRIVED < float(trip["arrival"]) <= warmup_end:
+                continue
+            if float(trip["depart"]) >= 0.0 or float(trip["departDelay"]) > 0.0:
+                ids.append(trip["id"])
+                kinds.append(_vehicle_class(trip["vType"], vehicle_classes))
+                times.append([float(trip[name]) for name in TRIP_TIME_ATTRIBUTES])
+            element.clear()
+    except ElementTree.ParseError:
+        raise DiskError(f"SUMO has not written {path.name} whole; allowed: space in {path.parent}") from None
     depart_delay, duration, time_loss, arrival = np.array(times, np.float64).reshape(-1, len(TRIP_TIME_ATTRIBUTES)).T
     return Trips(tuple(ids), tuple(kinds), depart_delay, duration, time_loss, arrival != NOT_ARRIVED)
 

@@ -9,7 +9,7 @@ import tempfile
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from functools import cache, partial
 from pathlib import Path
 from threading import Lock
@@ -135,7 +135,11 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
         if os.getpid() != self._owner:
             return
         self._process.kill()
-        self._process.communicate()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with suppress(OSError, ValueError):  # an unsent message; at the end of Python it may be closed
+                assert pipe is not None
+                pipe.close()
+        self._process.wait()
         self._folder.cleanup()
 
     def __exit__(self, *error: object) -> None:

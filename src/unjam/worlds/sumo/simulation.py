@@ -161,7 +161,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         process has changed the simulation, and `EpisodeError` for other reasons.
         """
         self.check()
-        self._traffic_file.write_text(inputs.traffic_xml)
+        self._traffic_file.write_text(inputs.traffic_xml, encoding="utf-8")
         paths = {
             option: [self._readable_path(path, inputs) for path in files]
             for option, files in inputs.existing_files.items()
