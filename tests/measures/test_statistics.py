@@ -284,7 +284,8 @@ def test_bimodality_is_detected_with_few_false_positives(count: int) -> None:
         (1.0, 3.0, "The return increases in one training; a verdict on the residual needs 10 trainings."),
         (-3.0, -1.0, "The return decreases in one training; a verdict on the residual needs 10 trainings."),
         (-1.0, 3.0, "No gain is shown: the confidence interval contains zero."),
-        (0.0, 0.0, "No gain is shown: the confidence interval contains zero."),
+        (0.0, 2.0, "No gain is shown: the confidence interval contains zero."),
+        (0.0, 0.0, "The trained controller drives exactly as its expert: no network was better in validation."),
         (np.nan, np.nan, "No conclusion: there is no confidence interval."),
     ],
 )

@@ -276,9 +276,16 @@ def test_learning_curve_has_all_runs() -> None:
 
 
 def test_learning_curve_has_all_references() -> None:
-    references = {f"driver {number}": float(number) for number in range(7)}
+    references = {f"driver {number}": 90.0 + number for number in range(7)}
     [axes] = panels_of(learning_curve_figure({"ring-001": RUN}, references))
     assert [line.get_label() for line in axes.lines[2:]] == list(references)
+
+
+def test_a_driver_far_from_a_training_is_only_in_the_legend() -> None:
+    [axes] = panels_of(learning_curve_figure({"ring-001": RUN}, {"human": -2479.0, "pi": 100.0}))
+    labels = [line.get_label() for line in axes.lines[2:]]
+    assert labels == ["human: -2,479, below this range", "pi"]
+    assert axes.get_ylim()[0] > 0
 
 
 def test_training_time_has_a_bar_for_each_part() -> None:

@@ -15,6 +15,7 @@ from unjam.reports.summary import (
     format_difference,
     key_figures,
     main_finding,
+    mismatch_warning,
     name_baselines,
     report_columns,
     report_notes,
@@ -67,11 +68,32 @@ def test_finding_reports_a_negative_gain() -> None:
     assert "The return decreases in one training" in finding
 
 
-@pytest.mark.parametrize("trained", [[125.0, 125.0, 205.0, 110.0], [90.0, 150.0, 155.0, 125.0], EXPERT])
+@pytest.mark.parametrize("trained", [[125.0, 125.0, 205.0, 110.0], [90.0, 150.0, 155.0, 125.0]])
 def test_finding_claims_no_gain_that_may_be_zero(trained: list[float]) -> None:
     assert main_finding(trained_on_pi(trained, EXPERT)).endswith(
         "No gain is shown: the confidence interval contains zero."
     )
+
+
+def test_finding_says_that_the_controller_is_its_expert() -> None:
+    assert "+0 [+0, +0]. The trained controller drives exactly as its expert" in main_finding(
+        trained_on_pi(EXPERT, EXPERT)
+    )
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        ({"scenario": "ring", "pi": rows_of([1.0, 2.0])}, "different seeds: differences between them are not effects"),
+        ({"scenario": "merge", "pi": rows_of([1.0])}, "different roads: "),
+        ({"scenario": "ring", "idm": rows_of([5.0])}, ""),
+    ],
+)
+def test_folders_of_other_roads_or_seeds_are_compared_with_a_warning(other: dict[str, Any], words: str) -> None:
+    results = [drive_results("a", pi=rows_of([1.0])), drive_results("b", **other)]
+    assert words in (found := mismatch_warning(results))
+    assert bool(found) == bool(words)
+    assert mismatch_warning(results[:1]) == ""
 
 
 def test_finding_on_one_seed_has_no_interval() -> None:

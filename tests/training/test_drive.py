@@ -99,6 +99,8 @@ def test_a_requested_baseline_is_compared_with_in_results_and_report(tmp_path: P
     expected = result.summary("pi")["mean_speed"].mean - result.summary("idm")["mean_speed"].mean
     assert documents["pi"]["difference_to_baseline"]["mean_speed"][0] == pytest.approx(expected)
     assert "that of idm" in result._repr_html_() or "compared with idm" in result._repr_html_()
+    assert "pi: " in str(result)
+    assert "m/s" in str(result)
     assert result.report is not None
     assert "Differences to idm" in result.report.read_text()
     with pytest.raises(InputError, match="baseline: 'nobody' is not allowed; allowed: human, pi"):

@@ -202,6 +202,8 @@ def gain_verdict(gain: Estimate) -> str:
     """Return a verdict on the difference of the return of one training to that of its expert, as a sentence."""
     if isnan(gain.low):
         return "No conclusion: there is no confidence interval."
+    if gain.low == gain.high == 0:
+        return "The trained controller drives exactly as its expert: no network was better in validation."
     if gain.low <= 0 <= gain.high:
         return "No gain is shown: the confidence interval contains zero."
     change = "increases" if gain.low > 0 else "decreases"

@@ -15,6 +15,8 @@ Rows = Sequence[dict[str, Any]]
 """a row of metrics for each episode"""
 HIGHER_IS_BETTER = {"mean_speed", "mean_speed_steady", "outflow_veh_per_h", "min_ttc"}
 """metrics that are compared with the baseline, of which lower values are worse; of the others they are better"""
+NEITHER_IS_BETTER = {"cav_mean_gap"}
+"""metrics of which neither direction is better: a larger gap can dissolve a wave, and lets vehicles cut in"""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible:
     changes = {name: is_better(name, difference) for name, difference in differences.items()}
     texts = (
         DifferenceText(
-            METRICS[name].label.partition(",")[0],
+            METRICS[name].label.removesuffix(", departure delay included"),
             _difference_text(name, difference, relative_difference(rows, others, name).mean),
             changes[name],
         )
@@ -141,7 +143,7 @@ def _difference_text(name: str, difference: Estimate, relative: float) -> str:
 
 
 def is_better(metric: str, difference: Estimate) -> bool | None:
-    """Return whether a paired difference is shown to be an improvement; None if its CI contains zero."""
-    if difference.low > 0 or difference.high < 0:
+    """Return whether a paired difference is shown to be an improvement; None if its CI contains zero, or for a gap."""
+    if metric not in NEITHER_IS_BETTER and (difference.low > 0 or difference.high < 0):
         return (difference.mean > 0) == (metric in HIGHER_IS_BETTER)
     return None

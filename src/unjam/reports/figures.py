@@ -144,9 +144,16 @@ def _time_series(episode: PlotEpisode, has_same_vehicles: bool) -> dict[str, np.
     return {"mean speed [m/s]": np.nanmean(speeds, axis=1), **waves, "insertion backlog\n[vehicles]": backlog}
 
 
+FAR = 1.5
+"""distance from the returns of a training beyond which a driver is not drawn, as a share of their range"""
+
+
 @rc_context(PLOT_STYLE)
 def learning_curve_figure(runs: dict[str, list[dict[str, Any]]], references: dict[str, float]) -> Figure:
-    """Draw return against environment steps: of each run by its label, and of drivers that do not learn."""
+    """Draw return against environment steps: of each run by its label, and of drivers that do not learn.
+
+    A driver far outside the range of the runs is only in the legend: otherwise their changes could not be seen.
+    """
     figure = new_figure(3.8)
     axes = figure.subplots()
     for (label, rows), color in zip(runs.items(), cycle(LINE_COLORS[2:]), strict=False):
@@ -159,9 +166,15 @@ def learning_curve_figure(runs: dict[str, list[dict[str, Any]]], references: dic
         points = np.array([point for point in validations if point[1] is not None], float).reshape(-1, 2)
         label = f"{prefix}validation, deterministic"
         axes.plot(*points.T, color=color, lw=1.8, marker="o", ms=3.5, label=label)
+    low, high = axes.dataLim.intervaly
+    high = max(high, low + 0.02 * abs(low))  # returns that are nearly equal
     styles = cycle(("--", ":", "-.", (0, (1, 3))))
     for (label, value), style in zip(references.items(), styles, strict=False):
-        axes.axhline(value, color=TEXT_COLOR, lw=1.1, ls=style, label=label)
+        if low - FAR * (high - low) <= value <= high + FAR * (high - low):
+            axes.axhline(value, color=TEXT_COLOR, lw=1.1, ls=style, label=label)
+        else:
+            side = "below" if value < low else "above"
+            axes.plot([], [], color=TEXT_COLOR, lw=1.1, ls=style, label=f"{label}: {value:,.0f}, {side} this range")
     axes.set(xlabel="environment steps [thousands]", ylabel="return of an episode")
     axes.margins(x=0.01, y=0.06)
     figure.legend(loc="outside upper left", ncols=3)

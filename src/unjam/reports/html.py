@@ -106,6 +106,7 @@ def render_report(results: Sequence[Results]) -> str:
         verdicts=[column.verdict for column in columns if column.verdict is not None],
         baseline_name=summary.name_baselines(results),
         findings=[(name, finding) for name, result in sources if (finding := summary.main_finding(result))],
+        warning=summary.mismatch_warning(results),
         notes=[(name, note) for name, result in sources for note in summary.report_notes(result)],
         cards=summary.key_figures(single) if single else [],
         figures={name: figures.data_uri(figure) for name, figure in _report_figures(sources, panels).items()},

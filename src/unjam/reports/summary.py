@@ -95,6 +95,23 @@ def report_title(results: Sequence[Results]) -> str:
     return f"{names}: a trained " + ("network" if expert == "none" else f"residual on {expert}")
 
 
+def mismatch_warning(results: Sequence[Results]) -> str:
+    """Return a warning if several folders have different roads, seeds or durations; else an empty text."""
+    episodes = [next(iter(result.plot_episodes.values()), None) for result in results]
+    known = [each for each in episodes if each is not None and not each.has_recorded_leader]
+    kinds = {
+        "roads": [result.metadata["scenario"] for result in results],
+        "geometries": [each.outline.round().tobytes() + each.lane_lines.round().tobytes() for each in known],
+        "seeds": [str([row["seed"] for row in next(iter(result.rows.values()), [])]) for result in results],
+        "durations": [str(each.times[-1]) for each in known if each.status == "completed"],
+    }
+    different = [kind for kind, values in kinds.items() if len(set(values)) > 1]
+    if not different:
+        return ""
+    listed = ", ".join(different)
+    return f"These folders have different {listed}: differences between them are not effects of the drivers alone."
+
+
 def name_baselines(results: Sequence[Results]) -> str:
     """Return what the drivers of these results are compared with, in words."""
     names = dict.fromkeys(result.baseline or "the human baseline" for result in results)

@@ -131,7 +131,7 @@ def make_request(
         raise InputError(f"{name}: it is not allowed here: --penetration-rates says how many vehicles are CAVs")
     for rate in penetration_rates:
         if not 0 <= rate <= 1:
-            raise invalid_value("penetration_rates", rate, ">= 0, <= 1")
+            raise invalid_value("penetration_rates", rate, "shares from 0 to 1, such as 0.05 for 5 %")
     rates = tuple(sorted(set(penetration_rates) - {0.0}))
     if not rates:
         text = ",".join(f"{rate:g}" for rate in penetration_rates)

@@ -121,6 +121,11 @@ class DriveResult(Evaluation):
         """Return a row per episode and driver, with seed, status and every metric."""
         return rows_to_frame(self.rows)
 
+    def __str__(self) -> str:
+        """Return the verdicts and the table of the metrics that matter, for `print`."""
+        lines = (line for each in verdicts(self.rows, self.baseline) for line in each.lines)
+        return "\n".join([*lines, metric_frame(self.rows).to_string(index=False)])
+
     def _repr_html_(self) -> str:
         """Return the verdicts, the metrics that matter, and the trajectories of all vehicles, for notebooks."""
         from unjam.reports.figures import data_uri

@@ -161,7 +161,7 @@
       }
       pen.restore();
     }
-    road.mean.textContent = count ? `mean ${(sum / count).toFixed(1)} m/s` : "no vehicle on the road";
+    road.mean.textContent = count ? `mean now ${(sum / count).toFixed(1)} m/s` : "no vehicle on the road";
   }
 
   let now = 0, playing = false, last = 0;
