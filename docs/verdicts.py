@@ -1,7 +1,7 @@
 """Verdicts on claims: values of trainings compared with 95 % intervals, and their texts."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from math import inf, isnan
 from typing import Any
 
@@ -32,16 +32,27 @@ def _margin(difference: Estimate, larger: bool) -> tuple[float, float]:
 
 
 def compare(
-    values: Values, label: str, *others: str, larger: bool = True, digits: int = 0, unit: str = "trainings"
+    values: Values,
+    label: str,
+    *others: str,
+    larger: bool = True,
+    digits: int = 0,
+    unit: str = "trainings",
+    resolution: float = 0.0,
 ) -> Finding:
     """Judge whether the values of a label are larger (or smaller) than those of all others, paired in their order.
 
-    The numbers are the means of all, and the difference that decides: that to the other which contradicts most.
+    Intervals are widened by the `resolution` of the values: equal differences of coarse values have no spread. The
+    numbers are the means of all, and the difference that decides: that to the other which contradicts most.
     """
     others = others or tuple(each for each in values if each != label)
     count = min(len(values[each]) for each in (label, *others))
     differences = {
         other: estimate_over_trainings((values[label][:count] - values[other][:count]).tolist()) for other in others
+    }
+    differences = {
+        other: replace(each, low=each.low - resolution, high=each.high + resolution)
+        for other, each in differences.items()
     }
     verdict, margins = judge(list(differences.values()), larger), {}
     for other, difference in differences.items():
