@@ -95,24 +95,22 @@ def selection_effect() -> str:
 
 
 def exact_effect() -> str:
-    """Return the returns on test seeds of trainings with all of `paper-exact`, but with the filter."""
-    trainings = results_part("to-the-letter-ring-filtered/paper-exact")
+    """Return the returns on test seeds of trainings with all of `paper-exact`."""
+    trainings = results_part("to-the-letter-ring/paper-exact")
     returns = {name: sorted(round(each["test_return"]) for each in found) for name, found in trainings.items()}
     texts = (f"{VARIANTS[name].label} {', '.join(f'{each:,}' for each in found)}" for name, found in returns.items())
-    source = "`results/to-the-letter-ring-filtered.json`"
-    return (
-        f"not alone; all of `paper-exact` but with the filter, returns of the trainings: {'; '.join(texts)} ({source})"
-    )
+    source = "`results/to-the-letter-ring.json`"
+    return f"not alone; all of `paper-exact`, returns of the trainings: {'; '.join(texts)} ({source})"
 
 
 def stop_effect() -> str:
     """Return how many trainings the rule would have ended."""
-    trainings = results_part("to-the-letter-ring-filtered/paper-exact").values()
+    trainings = results_part("to-the-letter-ring/paper-exact").values()
     ends = [each["converged"] for found in trainings for each in found]
     steps = [each["steps"] for each in ends if each]
     return (
         f"it would end {len(steps)} of {len(ends)} trainings, after {min(steps):,} to {max(steps):,} steps "
-        "(`results/to-the-letter-ring-filtered.json`)"
+        "(`results/to-the-letter-ring.json`)"
     )
 
 
