@@ -111,12 +111,6 @@ def test_a_folder_where_a_file_is_in_the_way_is_a_disk_error(tmp_path: Path, bel
     assert (tmp_path / "file").read_text() == "mine"
 
 
-@pytest.mark.skipif(not Path("/proc/self").exists(), reason="there is no such folder")
-def test_a_folder_that_the_system_does_not_make_is_a_disk_error() -> None:
-    with pytest.raises(DiskError, match="cannot write"):
-        make_folder(Path("/proc/cache/networks"))
-
-
 Writer = Callable[[Path], object]
 WRITERS: dict[str, Writer] = {
     "whole": lambda path: atomic_write(path, "new"),

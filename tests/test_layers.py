@@ -219,7 +219,7 @@ READS = {"shutil.which", "shutil.disk_usage", "shutil.get_terminal_size"}
 PRIVATE = "in a private temporary folder, with a random name, that its user alone may enter"
 BUFFER = "into memory, or to the standard output"
 UNSAFE_BUT = {
-    "worlds/sumo/simulation.py: self._traffic_file.write_text(inputs.traffic_xml)": PRIVATE,
+    "worlds/sumo/simulation.py: self._traffic_file.write_text(inputs.traffic_xml, encoding='utf-8')": PRIVATE,
     "worlds/sumo/networks.py: (folder / name).write_text(content)": PRIVATE,
     "unjam_paper/open_test_roads.py: (folder / 'road.rou.xml').write_text(routes)": PRIVATE,
     "unjam_paper/open_test_roads.py: path.write_text(f'<configuration>{lines}</configuration>')": PRIVATE,
@@ -331,7 +331,7 @@ CHANGES_THE_PROCESS = {
     "kernels": "when unjam is imported",
     "trust": "for the length of a block that the user writes, under a lock",
     "child_processes": "in the command line, and while Ray or multiprocessing starts processes",
-    "training/train": "for the length of a training, under a lock, and restored",
+    "training/random_state": "for the length of a training, under a lock, and restored",
     "learners/algorithm": "within training/train",
     "training/model_facts": "within training/train, or in the command line",
     "training/speed": "in the command line",

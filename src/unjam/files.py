@@ -174,7 +174,7 @@ def check_parent_folder(path: Path) -> None:
 def make_folder(path: Path) -> None:
     """Make a folder and its parents, unless it exists."""
     absolute = path.absolute()
-    with _disk_errors(path, errno.EEXIST, errno.ENOENT):  # the last below /proc
+    with _disk_errors(path, errno.EEXIST):
         try:
             if protected_root(absolute) == absolute:
                 path.mkdir(parents=True, exist_ok=True)

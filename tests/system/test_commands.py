@@ -120,7 +120,7 @@ def test_drive_prints_a_table_and_the_path_of_a_report(unjam: Run, tmp_path: Pat
     lines = ran.stdout.splitlines()[5:]
     assert verdict.startswith("pi:window=10: ")
     labels = [line.split("  ")[1] for line in differences]
-    assert labels == ["mean speed", "flow", "speed std across vehicles"]
+    assert labels == ["mean speed", "flow", "speed std across vehicles, steady"]
     assert header.split() == ["metric", "unit", "human", "pi:window=10"]
     assert len(lines) < 12
     assert "all metrics, with differences: --all" in ran.stderr

@@ -85,10 +85,7 @@ def test_acc_property_is_compared_with_unchanged_vehicles(name: str, file: str) 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (
-            {"penetration_rates": [0.1, 1.2]},
-            "penetration_rates: 1.2 is not allowed; allowed: shares from 0 to 1",
-        ),
+        ({"penetration_rates": [0.1, 1.2]}, "penetration_rates: 1.2 is not allowed; allowed: shares from 0 to 1"),
         ({"penetration_rates": [float("nan")]}, "penetration_rates: nan"),
         ({"penetration_rates": [0.0]}, "penetration_rates: '0' is not allowed; allowed: one above 0"),
         ({"episodes": 23}, "episodes: 23 is not allowed; allowed: >= 24 for 2 penetration rates and 3 control"),

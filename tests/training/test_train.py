@@ -22,8 +22,9 @@ from unjam.reports.results import read_progress, read_results
 from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig
 from unjam.training.evaluate import gain_over_expert
+from unjam.training.random_state import exclusive_random_state
 from unjam.training.run_folder import read_config
-from unjam.training.train import TrainResult, exclusive_random_state, train
+from unjam.training.train import TrainResult, train
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import WorkerPool
 

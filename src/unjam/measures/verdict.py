@@ -3,13 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from unjam.measures.effect import FLOW_METRIC, FUEL_METRIC, LAG_METRIC, POWER_FUEL_METRIC, TIME_METRIC, is_measured
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
-from unjam.measures.metric_table import HUMAN_LABEL, RowsByDriver, estimate_cell
+from unjam.measures.metric_table import HUMAN_LABEL, RowsByDriver, estimate_cell, metric_table
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, paired_difference, relative_difference
+
+if TYPE_CHECKING:  # imported late, so that commands start quickly
+    import pandas as pd
 
 Rows = Sequence[dict[str, Any]]
 """a row of metrics for each episode"""
@@ -49,6 +52,15 @@ def short_table_metrics(rows_by_driver: RowsByDriver) -> tuple[str, ...]:
     """Return the metrics of a short table."""
     metrics = road_metrics(rows_by_driver)
     return *metrics.compared, *metrics.others, *COMMON_METRICS
+
+
+def metric_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":
+    """Return the table of the metrics that matter on the road as texts: a row per metric, a column per driver."""
+    import pandas as pd
+
+    headings, rows = metric_table(rows_by_driver, "", short_table_metrics(rows_by_driver))
+    cells = [[f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)] for row in rows]
+    return pd.DataFrame(cells, columns=["", *headings])
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,11 @@ from unjam.files import atomic_write, make_folder, remove_leftovers, sha256_of, 
 from unjam.manifest import manifest
 from unjam.measures.effect import effects_by_driver
 from unjam.measures.feasibility import feasibility_by_driver
-from unjam.measures.metric_table import RowsByDriver, choose_baseline, metric_table
+from unjam.measures.metric_table import RowsByDriver, choose_baseline
 from unjam.measures.metrics import METRICS, measure
 from unjam.measures.notes import count_early_ends, episode_notes
 from unjam.measures.statistics import Estimate, paired_difference, summarize
-from unjam.measures.verdict import short_table_metrics, verdicts
+from unjam.measures.verdict import metric_frame, short_table_metrics, verdicts
 from unjam.parameters import check_integer
 from unjam.reports.results import (
     EPISODE_ENTRIES,
@@ -182,15 +182,6 @@ class DriveResult(Evaluation):
                 }
             )
         return {"scenario": self.scenario, "drivers": documents}
-
-
-def metric_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":
-    """Return the table of the metrics that matter on the road as texts: a row per metric, a column per driver."""
-    import pandas as pd
-
-    headings, rows = metric_table(rows_by_driver, "", short_table_metrics(rows_by_driver))
-    cells = [[f"{row.label} [{row.unit}]" if row.unit else row.label, *map(str, row.cells)] for row in rows]
-    return pd.DataFrame(cells, columns=["", *headings])
 
 
 def rows_to_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":

@@ -1,10 +1,8 @@
 """Training: from a configuration to a run folder. `unjam train`, `unjam.train`."""
 
-import random
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -12,13 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.user_driver import is_file_reference
-from unjam.errors import InputError, UnjamError, invalid_value, one_line
+from unjam.errors import InputError, invalid_value, one_line
 from unjam.files import UNREADABLE_ERRORS, append_line, atomic_write, make_folder, to_json
 from unjam.kernels import needs_new_process
 from unjam.learners.agent import AgentSpec, check_network, check_state, learner_class, reporting_user_errors
@@ -35,24 +32,19 @@ from unjam.learners.algorithm_1 import make_algorithm
 from unjam.learners.model_rollouts import full_policy
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, format_ci
+from unjam.measures.verdict import metric_frame
 from unjam.processes import lock_folder
 from unjam.reports.html import write_report_page
 from unjam.reports.results import read_progress
 from unjam.seeds import VALIDATION_SEED
 from unjam.training import run_folder
 from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
-from unjam.training.evaluate import (
-    EvaluationProgress,
-    RowsByDriver,
-    evaluate_run,
-    gain_over_expert,
-    metric_frame,
-    raise_failure,
-)
+from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert, raise_failure
 from unjam.training.executors import IterationCallback, train_in_subprocess
 from unjam.training.export import ControllerStore
 from unjam.training.fingerprint import check_file_hashes, code_hashes, fingerprint
 from unjam.training.model_facts import no_facts_reason, write_model_facts
+from unjam.training.random_state import exclusive_random_state
 from unjam.training.string_limit import find_operating_points
 from unjam.training.task_sampling import TaskSampler, make_episodes, warm_up_iterations
 from unjam.tree import unpack
@@ -73,7 +65,6 @@ ALGORITHM_PREFIX = "algorithm/"
 """of the tensors of the algorithm in checkpoints"""
 ValidationReturns = Sequence[float] | None
 """return on the validation seeds of each task; None without a validation"""
-_training_lock = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -154,37 +145,6 @@ def train(
         for name, task in config.task_configs().items()
     }
     return TrainResult(folder, {}, None, results) if config.tasks else results[""]
-
-
-@contextmanager
-def exclusive_random_state() -> Iterator[None]:
-    """Lend the global generators of Python, NumPy and torch to the block, with one thread for torch's operations.
-
-    In the block torch has its own defaults, whatever the program has set: single precision, the CPU, gradients, no
-    automatic precision. Generators, threads and defaults are restored at the end. Raise `UnjamError` if another thread
-    is in such a block.
-    """
-    if not _training_lock.acquire(blocking=False):
-        raise UnjamError("train: another training runs in this process; allowed: one, or a process for each")
-    try:
-        threads, dtype, device = torch.get_num_threads(), torch.get_default_dtype(), torch.get_default_device()
-        python_state, numpy_state = random.getstate(), np.random.get_state()
-        gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
-        own_modes = torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False)
-        with torch.random.fork_rng(gpus), own_modes[0], own_modes[1], own_modes[2]:
-            torch.set_num_threads(1)  # more threads would compete with the workers for the cores
-            torch.set_default_dtype(torch.float32)
-            torch.set_default_device(None)
-            try:
-                yield
-            finally:
-                torch.set_num_threads(threads)
-                torch.set_default_dtype(dtype)
-                torch.set_default_device(device if device.type != "cpu" else None)
-                np.random.set_state(numpy_state)
-                random.setstate(python_state)
-    finally:
-        _training_lock.release()
 
 
 @exclusive_random_state()

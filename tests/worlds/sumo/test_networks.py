@@ -186,10 +186,13 @@ def test_a_netconvert_on_the_path_is_used_without_the_packages(tmp_path: Path) -
     assert sumo_program("netconvert") == str(program)
 
 
-def test_a_cache_that_cannot_be_a_folder_is_a_disk_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("folder", ["file/cache", "/proc/cache"])
+def test_a_cache_that_cannot_be_a_folder_is_a_disk_error(
+    folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "file").write_text("")
-    monkeypatch.setenv("UNJAM_CACHE", str(tmp_path / "file" / "cache"))
-    with pytest.raises(DiskError, match=r"cannot write .*file/cache/networks"):
+    monkeypatch.setenv("UNJAM_CACHE", str(tmp_path / folder))
+    with pytest.raises(DiskError, match=rf"cannot write .*{folder}/networks: .*UNJAM_CACHE can name another"):
         network_file(road_of(230))
 
 

@@ -108,8 +108,9 @@ def network_file(network: RoadNetwork) -> Path:
         return target
     try:
         make_folder(target.parent)
-    except DiskError as error:
-        raise DiskError(f"{error}; UNJAM_CACHE can name another folder") from None
+    except (DiskError, FileNotFoundError) as error:  # the second below /proc
+        reason = error if isinstance(error, DiskError) else disk_error(error, target.parent)
+        raise DiskError(f"{reason}; UNJAM_CACHE can name another folder") from None
     remove_leftovers(target.parent, min_age=STALE_FILE_SECONDS)
     try:
         with PrivateFolder() as folder:

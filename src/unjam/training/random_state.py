@@ -1,0 +1,44 @@
+"""The random state and the defaults of torch that a training has to itself in the process of a program."""
+
+import random
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+
+from unjam.errors import UnjamError
+
+_training_lock = threading.Lock()
+
+
+@contextmanager
+def exclusive_random_state() -> Iterator[None]:
+    """Lend the global generators of Python, NumPy and torch to the block, with one thread for torch's operations.
+
+    In the block torch has its own defaults, whatever the program has set: single precision, the CPU, gradients, no
+    automatic precision. Generators, threads and defaults are restored at the end. Raise `UnjamError` if another thread
+    is in such a block.
+    """
+    if not _training_lock.acquire(blocking=False):
+        raise UnjamError("train: another training runs in this process; allowed: one, or a process for each")
+    try:
+        threads, dtype, device = torch.get_num_threads(), torch.get_default_dtype(), torch.get_default_device()
+        python_state, numpy_state = random.getstate(), np.random.get_state()
+        gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+        own_modes = torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False)
+        with torch.random.fork_rng(gpus), own_modes[0], own_modes[1], own_modes[2]:
+            torch.set_num_threads(1)  # more threads would compete with the workers for the cores
+            torch.set_default_dtype(torch.float32)
+            torch.set_default_device(None)
+            try:
+                yield
+            finally:
+                torch.set_num_threads(threads)
+                torch.set_default_dtype(dtype)
+                torch.set_default_device(device if device.type != "cpu" else None)
+                np.random.set_state(numpy_state)
+                random.setstate(python_state)
+    finally:
+        _training_lock.release()
