@@ -248,13 +248,13 @@ def first_arrival(study: str, road: str, variant: str, *others: str, is_last: bo
     def judge_steps(version: Version) -> Finding:
         curves = version.curves(study, road, (variant, *others))
         final = float(version.curve_means(study, road, ("trpo",), "return_mean", LAST)[label_of("trpo")].mean())
-        goal, values, ends = final - 0.1 * abs(final), dict[str, np.ndarray](), np.zeros(2)
+        goal, values, resolution = final - 0.1 * abs(final), dict[str, np.ndarray](), 0.0
         for each, curve in zip((variant, *others), curves.values(), strict=True):
             steps = np.array(version.part(study, road, "curves")[version.study(study, road)[1]][each]["steps"])
             blocks = curve.reshape(len(curve), -1, BLOCK).mean(2) >= goal
             ends = steps[BLOCK - 1 :: BLOCK]
+            resolution = float(ends[1] - ends[0])
             values[label_of(each)] = np.where(blocks.any(1), ends[blocks.argmax(1)], steps[-1])
-        resolution = float(ends[1] - ends[0])
         verdict, numbers = compare(values, label_of(variant), larger=is_last, resolution=resolution)
         what = f"steps to 0.9 of TRPO's final return, to the next {resolution:,.0f} steps, all steps if never"
         return verdict, f"{what}: {numbers}"

@@ -47,13 +47,10 @@ def compare(
     """
     others = others or tuple(each for each in values if each != label)
     count = min(len(values[each]) for each in (label, *others))
-    differences = {
-        other: estimate_over_trainings((values[label][:count] - values[other][:count]).tolist()) for other in others
-    }
-    differences = {
-        other: replace(each, low=each.low - resolution, high=each.high + resolution)
-        for other, each in differences.items()
-    }
+    differences = dict[str, Estimate]()
+    for other in others:
+        found = estimate_over_trainings((values[label][:count] - values[other][:count]).tolist())
+        differences[other] = replace(found, low=found.low - resolution, high=found.high + resolution)
     verdict, margins = judge(list(differences.values()), larger), {}
     for other, difference in differences.items():
         low, high = _margin(difference, larger)

@@ -37,6 +37,9 @@ KERNEL_LIBRARIES = ("numpy", "torch")
 def pin_kernels() -> None:
     """Set the variables, for this process and its children."""
     global _unpinned_reason
+    requested = os.environ.get(KERNELS_VARIABLE, "")
+    if requested not in ("", "native"):
+        warnings.warn(f"{KERNELS_VARIABLE}: {requested!r} has no effect; allowed: native", stacklevel=2)
     _unpinned_reason = _find_obstacle()
     if _unpinned_reason is None:
         settings = kernel_settings()
@@ -92,10 +95,7 @@ def processor_info() -> dict[str, str]:
 
 def _find_obstacle() -> str | None:
     """Return why kernels cannot be pinned here; None: they can."""
-    requested = os.environ.get(KERNELS_VARIABLE, "")
-    if requested not in ("", "native"):
-        warnings.warn(f"{KERNELS_VARIABLE}: {requested!r} has no effect; allowed: native", stacklevel=2)
-    if requested == "native":
+    if os.environ.get(KERNELS_VARIABLE) == "native":
         return f"{KERNELS_VARIABLE}=native"
     if platform.machine() not in ("x86_64", "AMD64"):
         return f"the processor is not x86-64: {platform.machine()}"

@@ -96,6 +96,13 @@ def test_folders_of_other_roads_or_seeds_are_compared_with_a_warning(other: dict
     assert mismatch_warning(results[:1]) == ""
 
 
+def test_roads_of_one_training_are_compared_without_a_warning(tmp_path: Path) -> None:
+    results = [drive_results(str(tmp_path / road), road, pi=rows_of([1.0])) for road in ("ring", "merge")]
+    assert "different roads" in mismatch_warning(results)
+    (tmp_path / "config.toml").write_text("steps = 1")
+    assert mismatch_warning(results) == ""
+
+
 def test_finding_on_one_seed_has_no_interval() -> None:
     result = trained_on_pi([150.0], [100.0])
     finding = main_finding(result)

@@ -107,7 +107,7 @@ INVALID: dict[str, tuple[str, list[str]]] = {
         "humans.exponent: 1e-300 is not allowed; allowed: greater than or equal to 0.1",
         ["drive ring --driver human --set humans.exponent=1e-300"],
     ),
-    "more trainings than anybody makes": ("seeds", ["reproduce theory --seeds 1000000000000"]),
+    "too many trainings": ("seeds", ["reproduce theory --seeds 1000000000000"]),
     "negative seed": ("seed", ["train ring --seed -1"]),
     "tuning a family that is changed": ("scenario: with rings", ["tune rings --length 230"]),
     "tuning with too few steps": ("steps: 10", ["tune rings --steps 10"]),

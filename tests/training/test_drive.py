@@ -103,8 +103,8 @@ def test_a_requested_baseline_is_compared_with_in_results_and_report(tmp_path: P
     assert "m/s" in str(result)
     assert result.report is not None
     assert "Differences to idm" in result.report.read_text()
-    with pytest.raises(InputError, match="baseline: 'nobody' is not allowed; allowed: human, pi"):
-        drive("ring", ["human", "pi"], baseline="nobody")
+    with pytest.raises(InputError, match="baseline: 'ghost' is not allowed; allowed: human, pi"):
+        drive("ring", ["human", "pi"], baseline="ghost")
 
 
 def test_document_is_strict_json_with_null_for_nan() -> None:

@@ -130,6 +130,9 @@ def _format_warning(message: Warning | str, category: type[Warning], *place: Any
     return printable(f"{category.__name__}: {' '.join(str(message).split())}\n")
 
 
+TOO_LITTLE_MEMORY = "memory: there is not enough for this command"
+
+
 def main() -> None:
     """Run the command line; print every error that a user can correct as one line, and exit with its code."""
     for stream, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
@@ -175,15 +178,15 @@ def _run_app() -> int:
         return _print_error("input: it is nested too deeply", InputError.exit_code)
     except OverflowError as error:
         return _print_error(f"input: a number is too large: {error}", InputError.exit_code)
-    except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError) and "start new thread" not in str(error):
-            raise
-        return _print_error("memory: there is not enough for this command", InputError.exit_code)
+    except MemoryError:
+        return _print_error(TOO_LITTLE_MEMORY, InputError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return _print_error("interrupted", INTERRUPTED_EXIT_CODE)
     except _Terminated as error:
         return _print_error("terminated", 128 + error.args[0])
     except Exception as error:
+        if isinstance(error, RuntimeError) and "start new thread" in str(error):
+            return _print_error(TOO_LITTLE_MEMORY, InputError.exit_code)
         if hasattr(error, "format_message"):  # typer's errors about the command line
             return _print_error(f"{error.format_message()}{_given_value(error)}", 2)  # pyright: ignore[reportAttributeAccessIssue]
         raise

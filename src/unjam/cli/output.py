@@ -23,7 +23,7 @@ from unjam.errors import InputError, MissingPartError, printable
 from unjam.files import to_json
 from unjam.measures.metric_table import RowsByDriver, TableCell, choose_baseline, metric_table
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import Estimate
+from unjam.measures.statistics import Estimate, is_expert_unchanged
 from unjam.measures.verdict import short_table_metrics, verdicts
 
 PROGRESS_LINE_SECONDS = 5.0
@@ -229,12 +229,9 @@ def suggest_after_training(folder: Path, gain: "Estimate | None", steps: int, ru
     if gain is None or gain.low > 0:
         print_next_command("export it", "export", folder, "--out", f"{folder.name}.unjam")
     elif not is_finished:
-        is_expert = gain.low == gain.high == 0
-        reason = (
-            "the controller drives as its expert: no network was better in validation"
-            if is_expert
-            else "no gain is shown"
-        )
+        reason = "no gain is shown"
+        if is_expert_unchanged(gain):
+            reason = "the controller drives as its expert: no network was better in validation"
         print_next_command(f"{reason}; train longer", "train", "--resume", run, "--steps", 2 * steps)
 
 

@@ -198,11 +198,16 @@ def format_ci(value: Estimate, format_spec: str) -> str:
     return f"({value.smallest:{format_spec}} to {value.largest:{format_spec}})"
 
 
+def is_expert_unchanged(gain: Estimate) -> bool:
+    """Return whether a controller has the returns of its expert on all seeds: validation kept no trained network."""
+    return gain.low == gain.high == 0
+
+
 def gain_verdict(gain: Estimate) -> str:
     """Return a verdict on the difference of the return of one training to that of its expert, as a sentence."""
     if isnan(gain.low):
         return "No conclusion: there is no confidence interval."
-    if gain.low == gain.high == 0:
+    if is_expert_unchanged(gain):
         return "The trained controller drives exactly as its expert: no network was better in validation."
     if gain.low <= 0 <= gain.high:
         return "No gain is shown: the confidence interval contains zero."

@@ -33,7 +33,7 @@ MAX_REPLAY_FRAMES = 600
 MAX_REPLAY_VALUES = 600_000
 """vehicles times frames of all drivers of a replay: about three megabytes"""
 MAX_MERGE_DISTANCE = 50.0
-"""largest distance of a vehicle from a merge whose place in the plane it gives [m]"""
+"""a merge is drawn at the vehicle that was nearest to it, if that was no farther away [m]"""
 REPLAY_NAN = 65535
 """code of NaN in the arrays of a replay"""
 WORST_SHARE = 0.9
@@ -220,6 +220,7 @@ def _replay_track(episode: PlotEpisode, step: float, frames: int, longest_platoo
             "speeds": [_encode_array(speeds)],
             "positions": [_encode_array(episode.positions[indices])],
             "lines": [np.round(episode.outline, 2).tolist()],
+            "merges": [],
         }
     vehicles = np.flatnonzero(~np.isnan(speeds).all(axis=0))
     is_present, is_cav = ~np.isnan(speeds[:, vehicles]), np.isin(vehicles, episode.controlled_columns)

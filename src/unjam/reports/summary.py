@@ -96,7 +96,13 @@ def report_title(results: Sequence[Results]) -> str:
 
 
 def mismatch_warning(results: Sequence[Results]) -> str:
-    """Return a warning if several folders have different roads, seeds or durations; else an empty text."""
+    """Return a warning if several folders have different roads, seeds or durations; else an empty text.
+
+    The roads of one training are different by intention.
+    """
+    parents = {result.folder.resolve().parent for result in results}
+    if len(parents) == 1 and (parents.pop() / "config.toml").is_file():
+        return ""
     episodes = [next(iter(result.plot_episodes.values()), None) for result in results]
     known = [each for each in episodes if each is not None and not each.has_recorded_leader]
     kinds = {

@@ -27,8 +27,12 @@ def exclusive_random_state() -> Iterator[None]:
         threads, dtype, device = torch.get_num_threads(), torch.get_default_dtype(), torch.get_default_device()
         python_state, numpy_state = random.getstate(), np.random.get_state()
         gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
-        own_modes = torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False)
-        with torch.random.fork_rng(gpus), own_modes[0], own_modes[1], own_modes[2]:
+        with (
+            torch.random.fork_rng(gpus),
+            torch.inference_mode(False),
+            torch.enable_grad(),
+            torch.autocast("cpu", enabled=False),
+        ):
             torch.set_num_threads(1)  # more threads would compete with the workers for the cores
             torch.set_default_dtype(torch.float32)
             torch.set_default_device(None)

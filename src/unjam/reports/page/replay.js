@@ -110,7 +110,7 @@
     const width = Math.round(road.canvas.clientWidth * (window.devicePixelRatio || 1));
     const meter = width / (right - left + 12);
     const factor = Number(zoom.value), across = high - low + 12;
-    const top = (road.merges || []).length ? 32 * (window.devicePixelRatio || 1) : 0;  // of the labels of ramps
+    const top = road.merges.length ? 32 * (window.devicePixelRatio || 1) : 0;  // of the labels of ramps
     const height = top + Math.round(Math.max(Math.min(1.2 * width, meter * across), Math.min(0.15 * width, factor * meter * across)));
     if (road.canvas.width !== width || road.canvas.height !== height) {
       road.canvas.width = width; road.canvas.height = height;
@@ -128,7 +128,7 @@
     road.lines.forEach((line) => line.forEach(([, x, y], index) => index ? pen.lineTo(x, y) : pen.moveTo(x, y)));
     pen.lineWidth = Math.max(4, 1.5 / scale); pen.strokeStyle = "#dfe3e8"; pen.stroke();
 
-    (road.merges || []).forEach(([x, y]) => {
+    road.merges.forEach(([x, y]) => {
       pen.save();
       pen.translate(x, y);
       pen.scale(1 / road.meter, -1 / road.meter);  // in pixels of the page

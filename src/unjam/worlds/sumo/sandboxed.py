@@ -117,12 +117,11 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
         try:
             write_message(self._process.stdin, {"call": name, "arguments": lists})
             if not has_message(self._process.stdout, MAX_ANSWER_SECONDS):
-                self._process.kill()
                 raise LostWorkerError(f"SUMO was lost: it did not answer for {MAX_ANSWER_SECONDS:g} s")
             content, arrays = read_message(self._process.stdout)
         except (BrokenPipeError, EOFError):
             raise LostWorkerError(f"SUMO was lost: its process ended with code {self._process.wait()}") from None
-        except BaseException:  # such as an interrupt: the next call would take this answer for its own
+        except BaseException:  # silence, or an interrupt: the next call would take this answer for its own
             self._process.kill()
             self._process.wait()
             raise
