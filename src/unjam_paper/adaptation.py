@@ -114,7 +114,7 @@ def _measure_speeds(name: str, driver: str, workers: int) -> dict[str, list[Any]
     speeds = [episode.speeds[1:].mean(1).reshape(-1, STEPS_PER_SECOND).mean(1) for episode in episodes]
     after = replace(ring, humans=world.humans_after)
     limits = [after.limit_speed(episode.drawn_values[after.size_parameter]) for episode in episodes]
-    return {"limits": limits, "speeds": [values.round(4).tolist() for values in speeds]}
+    return {"limits": limits, "speeds": [values.round(2).tolist() for values in speeds]}
 
 
 def read_speeds(folder: Path, name: str, label: str) -> dict[str, Floats]:
