@@ -7,8 +7,9 @@ import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 from unjam.drivers.driver import Driver
@@ -27,7 +28,9 @@ from unjam.worlds.reward import RewardLike
 MAX_EPISODE_ATTEMPTS = 3
 """attempts to run an episode before its row reports a failure"""
 WORKER_TIMEOUT = 30.0
-"""seconds without a message after which a worker counts as hung"""
+"""seconds without a message, except those of waiting for a processor, after which a worker counts as hung"""
+MIN_REMAINING_TIME = 0.1
+"""[s]"""
 
 ResultT = TypeVar("ResultT")
 Message = tuple[dict[str, Any], Arrays]
@@ -180,7 +183,7 @@ class _Worker:
         timeout = self._timeout + (MAX_READER_TIME if self._is_sandboxed else 0.0)
         try:
             self._send(process, *task.message())
-            while (message := self._messages.get(timeout=timeout)) is not None:
+            while (message := self._next_message(process, timeout)) is not None:
                 timeout = self._timeout
                 content, arrays = message
                 if "episode" in content:
@@ -192,6 +195,17 @@ class _Worker:
         except BrokenPipeError:
             pass
         raise _WorkerLostError(self._exit_reason(process))
+
+    def _next_message(self, process: subprocess.Popen[bytes], timeout: float) -> Message | None:
+        """Return the next message, None after the last one; raise `queue.Empty` after a time without one [s]."""
+        while True:
+            start = processor_wait(process.pid)
+            try:
+                return self._messages.get(timeout=timeout)
+            except queue.Empty:  # on a busy machine the process may not have run
+                timeout = processor_wait(process.pid) - start
+                if timeout < MIN_REMAINING_TIME:
+                    raise
 
     def _send(self, process: subprocess.Popen[bytes], content: dict[str, Any], arrays: Arrays) -> None:
         """Send a task, with the content of the user's files the first time that the process needs it."""
@@ -229,6 +243,13 @@ class _Worker:
         with self._start_lock:
             self._is_stopped = True
             self._kill()
+
+
+def processor_wait(process_id: int) -> float:
+    """Return for how long a process was ready to run, but had no processor [s]; 0 where that is unknown."""
+    with suppress(OSError, ValueError, IndexError):
+        return int(Path(f"/proc/{process_id}/schedstat").read_text().split()[1]) / 1e9
+    return 0.0
 
 
 def _forward_messages(process: subprocess.Popen[bytes], messages: "queue.SimpleQueue[Message | None]") -> None:
