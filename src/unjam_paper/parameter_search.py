@@ -90,6 +90,7 @@ def search_parameters(
     human: RowScores,
     seed: int,
     budget: SearchBudget,
+    limits: PlanLimits = LIMITS,
 ) -> list[dict[str, Any]]:
     """Return the best candidate so far after each generation: its parameters, fuel relative to human drivers [%], gaps.
 
@@ -112,9 +113,9 @@ def search_parameters(
         mean_gap, max_gap, time_gap = scores.mean_gap.mean(1), scores.max_gap.max(1), scores.min_time_gap.min(1)
         total = (
             fuel
-            + MEAN_GAP_PRICE * np.maximum(mean_gap - LIMITS.largest_mean_gap + MARGIN, 0.0)
-            + MAX_GAP_PRICE * np.maximum(max_gap - LIMITS.largest_gap + MARGIN, 0.0)
-            + TIME_GAP_PRICE * np.maximum(LIMITS.time_gap - time_gap, 0.0)
+            + MEAN_GAP_PRICE * np.maximum(mean_gap - limits.largest_mean_gap + MARGIN, 0.0)
+            + MAX_GAP_PRICE * np.maximum(max_gap - limits.largest_gap + MARGIN, 0.0)
+            + TIME_GAP_PRICE * np.maximum(limits.time_gap - time_gap, 0.0)
         )
         order = np.argsort(total)
         elite = points[order[: round(ELITE_SHARE * budget.size)]]

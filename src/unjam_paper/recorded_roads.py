@@ -53,8 +53,11 @@ from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.study import Study, StudyFolder, Table
 
 RECORDED_STUDY = "recorded-roads"
-RECORDINGS_FOLDER, PUBLISHED_FILE = "recordings/i24", "recordings/model.onnx"
-"""in the folder of all studies: the drives, and controllers/cra/model.onnx of CIRCLES-consortium/algos-stack"""
+RECORDINGS_FOLDER = "recordings/i24"
+"""the drives, in the folder of all studies"""
+PUBLISHED_LABEL, LATER_LABEL = "published", "published, later version"
+PUBLISHED_FILES = {PUBLISHED_LABEL: "recordings/model.onnx", LATER_LABEL: "recordings/later/model.onnx"}
+"""controllers/cra/model.onnx of CIRCLES-consortium/algos-stack, there: of the branches `master` and `cra_08_04`"""
 TRAINING_MONTH, TEST_MONTH = "2021-03", "2021-04"
 TIME_STEP = 0.1
 TUNED_SET_SPEED = 45.0
@@ -92,7 +95,7 @@ DRIVE_METRICS = (
 IDEAL_CAR: dict[str, Any] = {"actuator": Actuator(), "safety": SafetyFilter(active=False), "actuation": "raw"}
 """the car of a plan"""
 SEARCH_SEED, SEARCH_BUDGET = 0, SearchBudget()
-PUBLISHED_LABEL, PLAN_LABEL = "published", "plan that knows the recording"
+PLAN_LABEL = "plan that knows the recording"
 DRIVES_PARTS = {TRAINING_DRIVES_PART: TRAINING_MONTH, TEST_DRIVES_PART: TEST_MONTH}
 SETTING_METRICS = "fuel_by_power", "cav_mean_gap", "min_time_gap", "feasibility"
 SUMO_METRICS = ("fuel_ml_per_km", "fuel_by_power")
@@ -185,8 +188,8 @@ def measure_fuel_in_sumo(folder: str, month: str, name: str, workers: int) -> Ta
 
 def compared_driver(folder: Path, name: str) -> Driver:
     """Return a driver by its name in tables."""
-    if name == PUBLISHED_LABEL:
-        return PublishedController(str(folder / PUBLISHED_FILE))
+    if name in PUBLISHED_FILES:
+        return PublishedController(str(folder / PUBLISHED_FILES[name]))
     return make_driver(name, TIME_STEP)
 
 

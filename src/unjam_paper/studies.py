@@ -21,6 +21,7 @@ from unjam_paper.human_traffic import HUMAN_TRAFFIC_STUDY
 from unjam_paper.information_ahead import INFORMATION_AHEAD
 from unjam_paper.motorway_benchmark import MOTORWAY_BENCHMARK
 from unjam_paper.motorway_ensemble import MOTORWAY_ENSEMBLE
+from unjam_paper.recorded_gaps import RECORDED_GAPS
 from unjam_paper.recorded_roads import RECORDED_ROADS
 from unjam_paper.robustness import FIGURE_10, FIGURE_10_UNFILTERED, ROBUSTNESS
 from unjam_paper.string_stability import STRING_STABILITY
@@ -105,6 +106,7 @@ STUDIES: dict[str, Study] = {
     "fuel": FUEL,
     "string-stability": STRING_STABILITY,
     "recorded-roads": RECORDED_ROADS,
+    "recorded-gaps": RECORDED_GAPS,
     "information-ahead": INFORMATION_AHEAD,
     "do-no-harm": DO_NO_HARM,
     "assess-examples": ASSESS_EXAMPLES,

@@ -13,7 +13,14 @@ from unjam.errors import InputError
 from unjam.physics.fuel import fuel_rate
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.worker_pool import EpisodeTask
-from unjam_paper import fuel_optimal_plan, information_ahead, recorded_residuals, recorded_roads, recorded_tables
+from unjam_paper import (
+    fuel_optimal_plan,
+    information_ahead,
+    recorded_gaps,
+    recorded_residuals,
+    recorded_roads,
+    recorded_tables,
+)
 from unjam_paper.fuel_optimal_plan import PlanLimits, plan_speeds
 from unjam_paper.information_ahead import (
     FIXED_PARAMETERS,
@@ -24,13 +31,15 @@ from unjam_paper.information_ahead import (
     roads_with_vehicles_between,
 )
 from unjam_paper.parameter_search import SearchBudget, measure_candidates
+from unjam_paper.recorded_gaps import FIXED_PARAMETERS as FIXED_BY_LAW
+from unjam_paper.recorded_gaps import LIMITED, RECORDED_GAPS, gap_limits, search_space
 from unjam_paper.recorded_residuals import MODEL_RATIOS
 from unjam_paper.recorded_roads import (
     DRIVE_SETTINGS,
     DRIVES_PARTS,
     IDEAL_CAR,
     PLAN_LABEL,
-    PUBLISHED_FILE,
+    PUBLISHED_FILES,
     RECORDED_ROADS,
     RECORDINGS_FOLDER,
     TEST_DRIVES_PART,
@@ -41,7 +50,7 @@ from unjam_paper.recorded_roads import (
 )
 from unjam_paper.recorded_tables import DriveResults
 from unjam_paper.results_file import read_part
-from unjam_paper.study import StudyFolder
+from unjam_paper.study import NO_VALUE_TEXT, StudyFolder
 
 STEP = 0.1
 DESCRIPTION = """inputs = [{ quantity = "speed" }, { quantity = "leader_speed" }, { quantity = "leader_gap" }]
@@ -58,7 +67,9 @@ def folder(tmp_path: Path) -> Path:
     for number, name in enumerate(("2021-03-01_a", "2021-03-02_b", "2021-04-01_c")):
         speeds = 15.0 + 4.0 * np.sin(times / (6.0 + number))
         pd.DataFrame({"time": times, "speed": speeds}).to_csv(drives / f"{name}.csv", index=False)
-    write(tmp_path / "recordings", linear(3, [-0.2, 0.15, 0.01]), DESCRIPTION, Path(PUBLISHED_FILE).stem)
+    for file in map(Path, PUBLISHED_FILES.values()):
+        (tmp_path / file.parent).mkdir(exist_ok=True)
+        write(tmp_path / file.parent, linear(3, [-0.2, 0.15, 0.01]), DESCRIPTION, file.stem)
     return tmp_path
 
 
@@ -188,6 +199,33 @@ def test_the_value_of_information_is_that_on_test_drives(folder: Path, monkeypat
     difference = np.mean(np.subtract(rows[1]["by_drive"], rows[0]["by_drive"]))
     assert float(str(table["difference to nothing received"][1]).split()[0]) == pytest.approx(difference, abs=0.01)
     assert table["share of the plan's saving"].tolist()[-1] == 1.0
+
+
+def test_laws_are_tuned_for_each_gap_with_the_same_limits(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorded_gaps, "MEAN_GAPS", (60.0, 40.0))
+    monkeypatch.setattr(recorded_gaps, "GAPS_BUDGET", SearchBudget(1, 6))
+    study = folder / "recorded-gaps"
+    RECORDED_GAPS.run(StudyFolder(folder), 1, study, 1)
+    names = {law: set(row["parameters"]) for row in read_part(study, "search") if (law := row["law"])}
+    assert names["smooth-acc"] - names[LIMITED] == {"averaging_time", "leader_weight"} == set(FIXED_BY_LAW[LIMITED])
+    table = pd.read_csv(study / "gaps.csv", keep_default_na=False)
+    assert table["law"].tolist() == [*PUBLISHED_FILES, "smooth-acc", "smooth-acc", LIMITED, LIMITED]
+    assert table["tuned for a mean gap of"].tolist()[2:] == ["60 m", "40 m"] * 2
+    assert (table["difference to that ACC [points]"] == NO_VALUE_TEXT).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        True,
+        True,
+    ]
+
+
+def test_the_largest_gap_of_a_search_shrinks_with_its_mean_gap() -> None:
+    for gap in (73.0, 40.0):
+        limits = gap_limits(gap)
+        assert limits.largest_gap / limits.largest_mean_gap == pytest.approx(105.0 / 73.0)
+        assert search_space("smooth-acc", limits)["largest_gap"].high < limits.largest_gap
 
 
 def test_a_plan_behind_human_drivers_starts_with_their_speeds_and_gaps(

@@ -1,0 +1,122 @@
+"""Fuel that two laws with equal limits save behind recorded vehicles, each tuned for several mean gaps.
+
+The laws are tuned on the drives of March 2021, as in `unjam_paper.recorded_roads`, and measured on those of April.
+"""
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from optuna.distributions import FloatDistribution
+
+from unjam.controller import make_driver
+from unjam.drivers.smooth_acc import SmoothACC
+from unjam.measures.metric_table import HUMAN_LABEL
+from unjam.measures.metrics import METRICS
+from unjam_paper.fuel_optimal_plan import PlanLimits
+from unjam_paper.parameter_search import SearchBudget, measure_candidates, search_parameters
+from unjam_paper.recorded_roads import (
+    PUBLISHED_FILES,
+    SEARCH_SEED,
+    SEARCH_SPACES,
+    STANDARD_SETTING,
+    TEST_MONTH,
+    TIME_STEP,
+    measure_driver,
+    recorded_drives,
+)
+from unjam_paper.recorded_tables import SEARCH_PART, TEST_DRIVES_PART, WAVE_METRICS, DriveResults
+from unjam_paper.results_file import StudyPart, read_part
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
+
+GAPS_STUDY = "recorded-gaps"
+MEAN_GAPS = (73.0, 60.0, 50.0, 40.0)
+"""largest mean gap for which a law is tuned; human drivers keep 30 m [m]"""
+LARGEST_GAP_RATIO = PlanLimits().largest_gap / PlanLimits().largest_mean_gap
+AVERAGING, LIMITED = "smooth-acc", "acc with the limits of smooth-acc"
+FIXED_PARAMETERS: dict[str, dict[str, float]] = {AVERAGING: {}, LIMITED: {"averaging_time": 0.0, "leader_weight": 1.0}}
+"""the law is the same: without averaging it follows the present speed of its leader, as an ACC does"""
+GAPS_BUDGET = SearchBudget(generations=14, size=24)
+
+
+def gap_limits(mean_gap: float) -> PlanLimits:
+    """Return the limits of a search: the largest gap shrinks with the mean gap [m]."""
+    return PlanLimits(largest_mean_gap=mean_gap, largest_gap=LARGEST_GAP_RATIO * mean_gap)
+
+
+def search_space(law: str, limits: PlanLimits) -> dict[str, FloatDistribution]:
+    """Return the parameters of a law that are searched."""
+    space = SEARCH_SPACES[AVERAGING] | {"largest_gap": FloatDistribution(35.0, limits.largest_gap - 1.0)}
+    return {name: each for name, each in space.items() if name not in FIXED_PARAMETERS[law]}
+
+
+def tune_law(folder: str, law: str, mean_gap: float, workers: int) -> Table:
+    """Return the best parameters of a law with a mean gap [m] on the training drives, as a list of one row."""
+    scenarios, limits = recorded_drives(Path(folder)), gap_limits(mean_gap)
+    human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
+    driver = replace(SmoothACC(time_step=TIME_STEP), **FIXED_PARAMETERS[law])
+    space = search_space(law, limits)
+    best = search_parameters(scenarios, driver, space, human, SEARCH_SEED, GAPS_BUDGET, limits)[-1]
+    return [{"law": law, "mean gap": mean_gap, **best}]
+
+
+def _driver_name(row: dict[str, Any]) -> str:
+    parameters = FIXED_PARAMETERS[row["law"]] | row["parameters"]
+    return f"{AVERAGING}:" + ",".join(f"{key}={value:g}" for key, value in parameters.items())
+
+
+def _label(law: str, mean_gap: float) -> str:
+    return f"{law}, {mean_gap:g} m"
+
+
+def measure_law(folder: str, label: str, name: str, workers: int) -> Table:
+    """Return the metrics of a driver behind each test drive, under a label."""
+    return [{**row, "driver": label} for row in measure_driver(folder, TEST_MONTH, STANDARD_SETTING, name, workers)]
+
+
+def make_gap_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+    """Return a search for each law and mean gap, and then the test drives."""
+    root, folder = str(study_folder.folder), study_folder.folder / GAPS_STUDY
+    parts: dict[str, StudyPart] = {
+        f"{SEARCH_PART}/{_label(law, gap)}": (tune_law, (root, law, gap))
+        for law, gap in product(FIXED_PARAMETERS, MEAN_GAPS)
+    }
+    if not (folder / f"{SEARCH_PART}.json").is_file():
+        return parts
+    drivers = {name: name for name in (HUMAN_LABEL, *PUBLISHED_FILES)}
+    drivers |= {_label(row["law"], row["mean gap"]): _driver_name(row) for row in read_part(folder, SEARCH_PART)}
+    for label, name in drivers.items():
+        parts[f"{TEST_DRIVES_PART}/{label}"] = measure_law, (root, label, name)
+    return parts
+
+
+def gaps_table(folder: Path) -> pd.DataFrame:
+    """Return fuel, gaps, flow and waves behind the test drives, by the mean gap that a law was tuned for."""
+    results = DriveResults(read_part(folder, TEST_DRIVES_PART))
+    return pd.DataFrame(_gap_row(results, label) for label in results.groups() if label != HUMAN_LABEL)
+
+
+def _gap_row(results: DriveResults, label: str) -> dict[str, str]:
+    law, _, gap = label.rpartition(", ")
+    is_tuned = law in FIXED_PARAMETERS
+    acc = f"{LIMITED}, {gap}" if law == AVERAGING else label
+    mean_gap, largest = results.values(label, "cav_mean_gap").mean(), results.values(label, "cav_max_gap").max()
+    return {
+        "law": law if is_tuned else label,
+        "tuned for a mean gap of": gap if is_tuned else NO_VALUE_TEXT,
+        "fuel of the platoon [%]": results.change_text(label, "fuel_by_power"),
+        "difference to that ACC [points]": results.change_text(label, "fuel_by_power", baseline=acc),
+        "gap: mean / largest [m]": f"{mean_gap:.0f} / {largest:.0f}",
+        "flow [%]": results.change_text(label, "outflow_veh_per_h"),
+        **{METRICS[name].label: f"{results.values(label, name).mean():.2f}" for name in WAVE_METRICS[:2]},
+    }
+
+
+RECORDED_GAPS = Study(
+    title="fuel that laws with equal limits save behind recorded vehicles, by their mean gap",
+    make_parts=make_gap_parts,
+    minutes=30.0,
+    tables={"gaps": gaps_table},
+)
