@@ -21,7 +21,6 @@ import numpy as np
 from tests.worlds.sumo.test_plain_sumo import human_baseline
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
-from unjam.scenarios import make_scenario
 from unjam.sumo_files import read_sumo_files
 from unjam.tree import pack, unpack
 from unjam.worlds.record import Trips
@@ -89,7 +88,7 @@ def compare(path: Path, seconds: float) -> dict[str, Any]:
         found = json.loads(ours.read_text())
         arrays = {name: np.array(values) for name, values in found["arrays"].items()}
         trips: Trips = unpack(Trips, found["trips"], arrays)
-        end = read_sumo_files(path).begin + seconds + make_scenario(str(path)).simulation_step
+        end = read_sumo_files(path).begin + seconds
         command = [sumo_program("sumo"), "-c", str(path), "--seed", str(found["seed"]), "--end", str(end)]
         statistics = folder / "statistics.xml"
         command += [*trip_options(plain_file), "--no-step-log", "--statistic-output", str(statistics)]

@@ -45,15 +45,15 @@ TIMES = '<time><begin value="30"/><end value="90"/><step-length value="0.2"/></t
 @pytest.mark.parametrize(
     ("changes", "step", "horizon"),
     [
-        ({}, 0.2, 300),
-        ({"steps_per_control_step": 5}, 0.2, 60),
-        ({"simulation_step": 0.5}, 0.5, 120),
+        ({}, 0.2, 299),
+        ({"steps_per_control_step": 5}, 0.2, 59),
+        ({"simulation_step": 0.5}, 0.5, 119),
         ({"horizon": 7}, 0.2, 7),
-        ({"simulation_step": 0.1, "steps_per_control_step": 3}, 0.1, 200),
-        ({"begin": 50.0}, 0.2, 200),
-        ({"begin": 40.0, "end": 70.0}, 0.2, 150),
+        ({"simulation_step": 0.1, "steps_per_control_step": 3}, 0.1, 199),
+        ({"begin": 50.0}, 0.2, 199),
+        ({"begin": 40.0, "end": 70.0}, 0.2, 149),
         ({"end": 70.0, "horizon": 9}, 0.2, 9),
-        ({"begin": 40.0, "end": 70.0, "warmup": 50}, 0.2, 100),
+        ({"begin": 40.0, "end": 70.0, "warmup": 50}, 0.2, 99),
     ],
 )
 def test_step_and_horizon_are_those_of_the_configuration_unless_set(
@@ -80,10 +80,10 @@ def test_a_begin_after_the_end_that_the_configuration_names_needs_another_end(
     tmp_path: Path, sumo: SumoBackend
 ) -> None:
     road = str(straight(tmp_path, '<vehicle id="it" type="car" route="along" depart="90"/>', end=60.0))
-    for end in ({"end": 100.0}, {"horizon": 200}):
+    for end, horizon in (({"end": 100.0}, 199), ({"horizon": 200}, 200)):
         late = load_user_network(road, {"penetration_rate": 1.0, "begin": 80.0, **end})
         episode = run_episode(late, Human(), (0,), backend=sumo)
-        assert (episode.vehicle_ids, late.horizon) == (("it",), 200)
+        assert (episode.vehicle_ids, late.horizon) == (("it",), horizon)
 
 
 @pytest.mark.parametrize("times", [{"begin": 90.0}, {"end": 20.0}, {"begin": 50.0, "end": 50.0}])
@@ -99,7 +99,7 @@ def test_sumo_receives_all_digits_of_the_begin(tmp_path: Path) -> None:
 
 
 def test_without_an_end_an_episode_lasts_an_hour(tmp_path: Path) -> None:
-    assert own(tmp_path).horizon == 3600
+    assert own(tmp_path).horizon == 3599
 
 
 EVERYTHING = {
@@ -275,7 +275,7 @@ def test_demand_that_begins_after_the_end_is_refused(changes: dict[str, Any], tm
     words = "no vehicle entered before .* s; the first departs at 25,200 s; use --begin 25200"
     with pytest.raises(InputError, match=words):
         make_scenario(str(path), {"penetration_rate": 0.5, **changes})
-    assert make_scenario(str(path), {"penetration_rate": 0.5, "begin": 25200.0, "end": 25300.0}).horizon == 100
+    assert make_scenario(str(path), {"penetration_rate": 0.5, "begin": 25200.0, "end": 25300.0}).horizon == 99
 
 
 def test_the_default_penetration_rate_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -1,7 +1,6 @@
 """The user network: any SUMO network with its traffic, in which some vehicles become CAVs."""
 
 import logging
-import os
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import field, replace
@@ -173,7 +172,12 @@ class UserNetwork(Scenario):
         return files.begin if self.begin is None else self.begin
 
     def _end(self, begin: float) -> float:
-        return begin + (self.warmup * self.simulation_step + self.horizon * self.control_step)
+        return begin + self._time_before_control + self.horizon * self.control_step
+
+    @property
+    def _time_before_control(self) -> float:
+        """Warm-up, and the step in which SUMO inserts the first vehicles [s]."""
+        return (self.warmup + 1) * self.simulation_step
 
     @property
     def human_description(self) -> str:
@@ -217,7 +221,7 @@ def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
 
     Raise `InputError` with one line about what is missing or broken, before SUMO starts.
     """
-    files = read_sumo_files(Path(os.path.realpath(file)))
+    files = read_sumo_files(Path.cwd() / file)  # a link stays one: SUMO finds other files beside it
     _log_once(*notes_on_files(files, MAX_LOGGED_NAMES))
     if isinstance(cruise := changes.get("cruise", {}), dict):
         changes = {**changes, "cruise": {"acceleration": None, "deceleration": None, **cruise}}
@@ -233,10 +237,10 @@ def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
 
 
 def _control_steps_until_end(files: SumoFiles, scenario: UserNetwork) -> int:
-    """Return the number of control steps until the end of a configuration, or of an hour."""
+    """Return the number of whole control steps until the end of a configuration, or of an hour, as in plain SUMO."""
     begin = scenario._begin(files)
     end = scenario.end or (begin + DEFAULT_DURATION if files.end is None else files.end)
-    duration = end - begin - scenario.warmup * scenario.simulation_step
+    duration = end - begin - scenario._time_before_control
     if duration <= 0:
         raise invalid_value("end", end, f"after begin, {begin:g} s" + (" and the warm-up" if scenario.warmup else ""))
     return max(1, int(duration / scenario.control_step + 1e-9))

@@ -52,10 +52,9 @@ def random_network(folder: Path, seed: int, lanes: int, junctions: str, period: 
 
 
 def trips_of_plain_sumo(path: Path, seed: int, end: float) -> Trips:
-    """Return the trips of `sumo -c` itself; it ends a step later, as unjam's first step only inserts."""
+    """Return the trips of `sumo -c` itself."""
     out = path.with_name("plain.xml")
-    step = make_scenario(str(path), {"penetration_rate": 0.2}).simulation_step
-    command = [sumo_program("sumo"), "-c", str(path), "--seed", str(seed), "--end", str(end + step)]
+    command = [sumo_program("sumo"), "-c", str(path), "--seed", str(seed), "--end", str(end)]
     subprocess.run([*command, *trip_options(out)], check=True, capture_output=True, cwd=path.parent)
     return read_trips(out, CLASSES, 0.0)
 
@@ -111,6 +110,20 @@ def test_the_human_baseline_of_a_motorway_has_the_trips_of_plain_sumo(tmp_path: 
     check_same_trips(episode.trips, trips_of_plain_sumo(path, sumo_seed, 60.0))
 
 
+def test_files_beside_a_link_are_those_that_plain_sumo_reads(tmp_path: Path, simulation: Simulation) -> None:
+    roads = list[Path]()
+    for count in (1, 9):
+        (folder := tmp_path / str(count)).mkdir()
+        flow = f'<flow id="f" type="car" route="along" begin="0" number="{count}" period="5"/>'
+        roads.append(straight(folder, flow))
+    one, many = roads
+    one.unlink()
+    one.symlink_to(many)
+    episode, sumo_seed = human_baseline(one, simulation, end=100.0)
+    assert episode.trips.vehicle_ids == ("f.0",)
+    check_same_trips(episode.trips, trips_of_plain_sumo(one, sumo_seed, 100.0))
+
+
 def test_flows_without_an_end_have_as_many_vehicles_as_in_plain_sumo(tmp_path: Path, simulation: Simulation) -> None:
     flow = '<flow id="f" type="car" route="along" begin="0" number="40" departSpeed="max"/>'
     path = straight(tmp_path, flow, end=120.0, step=0.5)
@@ -120,7 +133,7 @@ def test_flows_without_an_end_have_as_many_vehicles_as_in_plain_sumo(tmp_path: P
     for end in (None, 60.0):
         changes = {} if end is None else {"end": end}
         episode, _ = human_baseline(path, simulation, **changes)
-        assert len(episode.trips.vehicle_ids) == (len(plain.vehicle_ids) if end is None else 21)
+        assert len(episode.trips.vehicle_ids) == (len(plain.vehicle_ids) if end is None else 20)
     assert len(plain.vehicle_ids) == 40
 
 
