@@ -116,8 +116,21 @@ def test_restored_learner_does_not_change_its_source_state(agent: str) -> None:
 def test_weights_of_another_network_are_refused(agent: str) -> None:
     values, tensors = Toy(agent=agent).learn(1).algorithm.state()
     other = Toy(PolicySettings(hidden=(4,)), agent=agent)
-    with pytest.raises(RuntimeError, match="size mismatch"):
+    with pytest.raises(ValueError, match=r"has the shape .*, expected"):
         other.algorithm.restore(values, tensors)
+
+
+@every_learner
+def test_stored_tensors_of_another_shape_are_refused_before_anything_is_computed_with_them(agent: str) -> None:
+    values, tensors = Toy(agent=agent).learn(1).algorithm.state()
+    other = Toy(agent=agent)
+    for name, tensor in tensors.items():
+        changed = tensor.reshape(-1)[:1].reshape(1, 1, 1)
+        with pytest.raises((ValueError, RuntimeError), match=f"shape|size|{name}"):
+            other.algorithm.restore(values, {**tensors, name: changed})
+    incomplete = {name: tensor for name, tensor in tensors.items() if not name.endswith("/exp_avg_sq")}
+    with pytest.raises(ValueError, match="is no state of Adam"):
+        other.algorithm.restore(values, incomplete)
 
 
 means = st.floats(-3, 3)

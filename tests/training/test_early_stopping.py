@@ -1,5 +1,6 @@
 """When a training ends before its steps, and where its numbers go while it runs."""
 
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -146,3 +147,10 @@ def test_unscheduled_validation_does_not_count_for_patience() -> None:
         row["return_validation"] = found  # pyright: ignore[reportArgumentType]
     config = small_config(evaluation__validation_interval=2, evaluation__patience=2)
     assert not config.evaluation.is_out_of_patience(rows)
+
+
+@pytest.mark.parametrize("changed", [{"environment_steps": "x"}, {"return_validation": []}, {"iteration": None}])
+def test_rows_of_progress_with_other_kinds_of_values_are_left_out(changed: dict[str, Any], tmp_path: Path) -> None:
+    row = {"iteration": 1, "environment_steps": 300, "return_validation": None, "return_expert": 2.0}
+    (tmp_path / "progress.jsonl").write_text(f"{json.dumps(row)}\n{json.dumps(row | changed)}\n")
+    assert read_progress(tmp_path) == [row]

@@ -24,6 +24,7 @@ from unjam.learners.sb3_learner import (
     MixedReplayBuffer,
     SB3Learner,
     add_to_replay_buffer,
+    check_shape,
     network_layers,
     shift_rewards,
     zero_layer,
@@ -190,9 +191,9 @@ class OffPolicyLearner(SB3Learner):
     def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
         """Resume from what `state` of a learner with the same configuration returned."""
         super().restore(values, tensors)
-        for name in REPLAY_POSITION:
-            setattr(self.buffer, name, values[name])
+        self.buffer.pos, self.buffer.full = range(self.buffer.buffer_size)[values["pos"]], bool(values["full"])
         for name, tensor in self._shared_tensors().items():
+            check_shape(name, tensors[name], tensor.shape)
             tensor.detach().copy_(tensors[name])
 
     def _shared_tensors(self) -> Tensors:

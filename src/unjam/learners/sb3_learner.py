@@ -10,6 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
@@ -19,6 +20,9 @@ from unjam.learners.agent import AgentSpec
 from unjam.learners.algorithm import Tensors, tensors_with_prefix
 from unjam.learners.experience import Experience, Float64
 from unjam.learners.learner import Learner
+
+ADAM_STATE = {"step", "exp_avg", "exp_avg_sq"}
+"""what Adam stores for each parameter"""
 
 
 class SB3Learner(Learner):
@@ -70,21 +74,31 @@ class SB3Learner(Learner):
 
     def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
         """Resume from what `state` of a learner with the same configuration returned."""
-        parts = self.sb3.get_parameters()
-        self.sb3.set_parameters({part: _restored_state(part, state, tensors) for part, state in parts.items()})
+        parts = {part: self._restored_state(part, each, tensors) for part, each in self.sb3.get_parameters().items()}
+        self.sb3.set_parameters(parts)
         self.sb3._n_updates = values["updates"]
 
+    def _restored_state(self, part: str, initial_state: dict[str, Any], tensors: Tensors) -> dict[str, Any]:
+        """Return the stored state of a part of the learner in torch's form; `initial_state` is that of a new one."""
+        stored = tensors_with_prefix(f"{part}/", tensors)
+        if "param_groups" not in initial_state:
+            return stored
+        groups = recursive_getattr(self.sb3, part).param_groups
+        shapes = [parameter.shape for group in groups for parameter in group["params"]]
+        entries: dict[int, Tensors] = {}
+        for name, tensor in stored.items():
+            index, _, key = name.partition("/")
+            check_shape(f"{part}/{name}", tensor, torch.Size() if key == "step" else shapes[int(index)])
+            entries.setdefault(int(index), {})[key] = tensor
+        if any(entry.keys() != ADAM_STATE for entry in entries.values()):
+            raise ValueError(f"{part} is no state of Adam")
+        return {"state": entries, "param_groups": initial_state["param_groups"]}
 
-def _restored_state(part: str, initial_state: dict[str, Any], tensors: Tensors) -> dict[str, Any]:
-    """Return the stored state of a part of a learner in torch's form; `initial_state` is that of a new one."""
-    stored = tensors_with_prefix(f"{part}/", tensors)
-    if "param_groups" not in initial_state:
-        return stored
-    entries: dict[int, Tensors] = {}
-    for name, tensor in stored.items():
-        index, _, key = name.partition("/")
-        entries.setdefault(int(index), {})[key] = tensor
-    return {"state": entries, "param_groups": initial_state["param_groups"]}
+
+def check_shape(name: str, tensor: torch.Tensor, expected: torch.Size) -> None:
+    """Raise `ValueError` if a stored tensor has another shape than expected: torch would repeat it, or crash."""
+    if tensor.shape != expected:
+        raise ValueError(f"{name} has the shape {tuple(tensor.shape)}, expected {tuple(expected)}")
 
 
 def policy_spaces(inputs: int, critic_inputs: int, authority: float) -> tuple[spaces.Box, spaces.Box]:

@@ -209,7 +209,15 @@ def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:
     """Return the rows of a run's progress without damaged rows, such as one that a crash truncated."""
-    return [row for row in read_json_lines(folder / "progress.jsonl") if isinstance(row.get("iteration"), int)]
+    return [row for row in read_json_lines(folder / "progress.jsonl") if _is_progress(row)]
+
+
+def _is_progress(row: dict[str, Any]) -> bool:
+    counts = row.get("iteration"), row.get("environment_steps", 0)
+    returns = row.get("return_validation"), row.get("return_expert")
+    return all(isinstance(each, int) for each in counts) and all(
+        isinstance(each, int | float | None) for each in returns
+    )
 
 
 def validation_gains(progress: Sequence[dict[str, Any]]) -> tuple[float, float] | None:

@@ -228,6 +228,21 @@ def test_commands_are_carried_out_exactly_where_it_is_safe_and_allowed(tmp_path:
     assert not (trajectory.shield_braking > 1e-9).any()
 
 
+def test_a_vehicle_with_the_name_of_one_that_has_left_is_controlled_as_well(
+    tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = '<vehicle id="{}" type="car" route="along" depart="{}"/>'
+    departures = ("v", 0), ("other", 210), ("v", 300)  # SUMO reads 200 s ahead, and there refuses a name of a vehicle
+    file = straight(tmp_path, "".join(one.format(*each) for each in departures), length=100.0, step=1.0)
+    controlled, take_control = list[str](), simulation.take_control
+    monkeypatch.setattr(
+        simulation, "take_control", lambda names, *given: (controlled.extend(names), take_control(names, *given))
+    )
+    scenario = scenario_of(file, penetration_rate=1.0, horizon=330)
+    run_episode(scenario, IDM(), (0,), backend=SumoBackend(simulation))
+    assert controlled == ["v", "other", "v"]
+
+
 def test_a_command_holds_for_its_step_whatever_the_configuration_says(tmp_path: Path, sumo: SumoBackend) -> None:
     one = '<vehicle id="v" type="car" route="along" depart="0" departPos="10" departSpeed="5"/>'
     file = straight(tmp_path, one)

@@ -243,7 +243,9 @@ class OpenTraffic(Traffic[OpenRoadT]):
 
     def _update_active_vehicles(self) -> None:
         self._cached_speeds: tuple[Sequence[str], Floats] | None = None
-        self._update_vehicles(*self._vehicles.update(self._simulation, self._is_cav))
+        left, entered = self._vehicles.update(self._simulation, self._is_cav)
+        self._controlled_cavs.difference_update(entered)  # SUMO allows the name of a vehicle that has left
+        self._update_vehicles(left, entered)
 
     def _log_moment(self) -> None:
         """Take control of CAVs that have entered, and log the state after a control step."""
