@@ -1,5 +1,6 @@
 """Controller files: those in run folders, and the export of controllers."""
 
+import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -120,6 +121,11 @@ def export_controller(
     check_parent_folder(out)
     if _is_signed(out):
         raise InputError(f"out: {str(out)!r} is a signed controller; allowed: another file")
+    siblings = [
+        out.with_suffix(suffix) for suffix, is_asked in ((".onnx", onnx), (".zip", stable_baselines3)) if is_asked
+    ]
+    if not out.exists() and (others := [str(file) for file in siblings if os.path.lexists(file)]):
+        raise InputError(f"out: {', '.join(others)} exists and belongs to no {out.name}; allowed: another name")
     read_origin = _read_run_origin if source.is_dir() else _read_driver_origin
     road, driver, metadata = read_origin(str(source), scenario)
     code = user_code_recipes(driver_recipe(driver)[0])
