@@ -260,3 +260,12 @@ def test_json_has_null_where_a_number_is_not_finite(value: float) -> None:
 def test_json_preserves_every_finite_value(value: object) -> None:
     assert json.loads(to_json(value)) == value
     assert json.loads(to_json(value, indent=1)) == value
+
+
+@pytest.mark.parametrize("rights", [0o600, 0o640, 0o666])
+def test_a_file_that_is_written_again_keeps_its_rights(rights: int, tmp_path: Path) -> None:
+    file = tmp_path / "controller.unjam"
+    atomic_write(file, "before")
+    file.chmod(rights)
+    atomic_write(file, "after")
+    assert (file.stat().st_mode & 0o777, file.read_text()) == (rights, "after")

@@ -76,10 +76,17 @@ def _replacement(path: Path) -> Iterator[tuple[Folder, str]]:
 
 
 def atomic_write(path: Path, content: bytes | str) -> None:
-    """Write a complete file, or keep the previous one: under a temporary name, synced to the disk, then renamed."""
+    """Write a complete file, or keep the previous one: under a temporary name, synced to the disk, then renamed.
+
+    The rights of the previous file stay.
+    """
     with _replacement(path) as (folder, temporary):
         folder.check_writable(path.name or ".")
-        _write_and_sync(folder.create(temporary), content)
+        descriptor = folder.create(temporary)
+        if rights := folder.mode(path.name) & 0o777:
+            with suppress(OSError):  # the file system has none
+                os.fchmod(descriptor, rights)
+        _write_and_sync(descriptor, content)
 
 
 def write_new_file(path: Path, content: bytes, mode: int) -> None:

@@ -88,7 +88,7 @@ def test_a_begin_after_the_end_that_the_configuration_names_needs_another_end(
 
 @pytest.mark.parametrize("times", [{"begin": 90.0}, {"end": 20.0}, {"begin": 50.0, "end": 50.0}])
 def test_an_end_before_the_begin_is_refused(times: dict[str, Any], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"end: .* is not allowed; allowed: after begin"):
+    with pytest.raises(InputError, match=r"end: .* is not allowed; allowed: > [0-9.]+ s, the first step after begin"):
         own(tmp_path, TIMES, penetration_rate=0.1, **times)
 
 
@@ -311,3 +311,12 @@ def test_traffic_that_sumo_makes_otherwise_is_noted(tmp_path: Path) -> None:
 def test_sources_of_speeds_that_only_motorways_have_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"roadside.source: 'cavs' is not allowed here; allowed: 'vehicles'"):
         own(tmp_path, penetration_rate=0.5, **{"roadside.source": "cavs"})
+
+
+def test_a_vehicle_type_with_the_name_that_cavs_get_is_refused(tmp_path: Path) -> None:
+    types = '<vType id="car"/><vType id="cav_of_car"/><route id="short" edges="ab bc"/>'
+    routes = f'<routes>{types}<vehicle id="v" type="car" route="short" depart="0"/></routes>'
+    with pytest.raises(
+        InputError, match="file: the vehicle type 'cav_of_car' is not allowed: CAVs of type 'car' have it"
+    ):
+        own(tmp_path, routes=routes, penetration_rate=1.0)

@@ -17,6 +17,7 @@ from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, build_d
 from unjam.scenarios.road import UserNetworkRoad
 from unjam.scenarios.scenario import CruiseControl, Scenario
 from unjam.sumo_files import SumoFiles, read_sumo_files
+from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
 
 DEFAULT_DURATION = 3600.0
 """duration of an episode if the configuration has no end [s]"""
@@ -91,6 +92,11 @@ class UserNetwork(Scenario):
         except InputError as error:
             raise ValueError(str(error)) from None
         used = ", ".join(sorted(files.used_types))
+        for name in files.types:
+            if (cav_type := CAV_TYPE_TEMPLATE.format(name)) in files.types:
+                raise ValueError(
+                    f"file: the vehicle type {cav_type!r} is not allowed: CAVs of type {name!r} have this name"
+                )
         if self.roadside.source != "vehicles":
             raise ValueError(f"roadside.source: {self.roadside.source!r} is not allowed here; allowed: 'vehicles'")
         for name in self.cav_classes:
@@ -242,7 +248,8 @@ def _control_steps_until_end(files: SumoFiles, scenario: UserNetwork) -> int:
     end = scenario.end or (begin + DEFAULT_DURATION if files.end is None else files.end)
     duration = end - begin - scenario._time_before_control
     if duration <= 0:
-        raise invalid_value("end", end, f"after begin, {begin:g} s" + (" and the warm-up" if scenario.warmup else ""))
+        first = f"> {begin + scenario._time_before_control:g} s, the first step after begin"
+        raise invalid_value("end", end, first + (" and the warm-up" if scenario.warmup else ""))
     return max(1, int(duration / scenario.control_step + 1e-9))
 
 

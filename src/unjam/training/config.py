@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, field, fields, replace
-from math import ceil
+from math import ceil, nan
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -77,7 +77,7 @@ class EvaluationSettings:
         window = self.convergence_window
         if not window or len(progress) % window or len(progress) < 2 * window:
             return False
-        returns = [row["return_mean"] for row in progress[-2 * window :]]
+        returns = [nan if (value := row.get("return_mean")) is None else value for row in progress[-2 * window :]]
         return sum(returns[window:]) <= sum(returns[:window])
 
     def is_out_of_patience(self, progress: Sequence[dict[str, Any]]) -> bool:

@@ -222,7 +222,9 @@ class Trainer:
     def _restore(self, values: dict[str, Any], tensors: Tensors) -> None:
         """Continue from a checkpoint; raise one of `UNREADABLE_ERRORS` if another program has written it."""
         state = unpack(run_folder.CheckpointValues, values, {})
-        if not 0 < state.iteration <= state.environment_steps or len(state.expert_returns) != len(self.tasks):
+        returns = [state.best_validation, *state.expert_returns]
+        is_consistent = 0 < state.iteration <= state.environment_steps and len(returns) == 1 + len(self.tasks)
+        if not is_consistent or not all(isinstance(each, float) for each in returns):
             raise ValueError("its numbers contradict each other")
         is_stopped = self.config.evaluation.should_stop_early(read_progress(self.folder))
         self._controllers.restore(tensors, is_stopped or state.environment_steps >= self.config.steps)

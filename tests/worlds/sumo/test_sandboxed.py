@@ -1,6 +1,7 @@
 """Programs that drive on users' networks: SUMO is sandboxed, the driver is not."""
 
 import itertools
+import locale
 import os
 import signal
 import subprocess
@@ -22,7 +23,7 @@ from tests.worlds.test_record import fingerprint
 from unjam import drive
 from unjam.drivers import IDM, LocalState
 from unjam.errors import EpisodeError
-from unjam.scenarios import make_scenario
+from unjam.scenarios import Ring, make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.messages import read_message
@@ -87,7 +88,7 @@ def test_a_drivers_function_runs_in_its_own_process(road: Scenario, tmp_path: Pa
 FORKING = """
 import os, sys
 from unjam import run_episode
-from unjam.scenarios import make_scenario
+from unjam.scenarios import Ring, make_scenario
 codes = []
 def forking(state):
     if not codes:
@@ -116,7 +117,7 @@ FORKED = """
 import os, sys
 from unjam.drivers import IDM
 from unjam.errors import LostWorkerError
-from unjam.scenarios import make_scenario
+from unjam.scenarios import Ring, make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.sandboxed import SandboxedSimulation
@@ -214,6 +215,14 @@ def test_an_interrupt_within_a_call_does_not_mix_up_answers(
             with pytest.raises(KeyboardInterrupt):
                 drive_steps()
         np.testing.assert_equal(drive_steps(), expected)
+
+
+def test_where_numbers_have_a_comma_sumo_runs_in_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    ring = Ring(horizon=40)
+    expected = fingerprint(run_episode(ring, IDM(), (0,)))
+    monkeypatch.setattr(locale, "localeconv", lambda: {"decimal_point": ","})
+    with pytest.warns(UserWarning, match="the locale of this process writes numbers with ','"), SumoBackend() as sumo:
+        assert fingerprint(run_episode(ring, IDM(), (0,), backend=sumo)) == expected
 
 
 def test_a_silent_process_is_lost_after_a_time(road: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:

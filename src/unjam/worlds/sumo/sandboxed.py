@@ -4,6 +4,7 @@ Programs that drive on such a network call the functions of `Simulation` over a 
 driver stays in their own process. Started as `python -m unjam.worlds.sumo.sandboxed`.
 """
 
+import locale
 import os
 import tempfile
 import warnings
@@ -41,9 +42,15 @@ def open_simulation(is_sandboxed: bool) -> Simulation:
     """Open a simulation, a sandboxed one or one in this process.
 
     If libsumo already holds one there, unjam's or the user's, it runs in its own process, too, with a warning: another
-    thread may use libsumo at the same time.
+    thread may use libsumo at the same time. So it does where SUMO could not read numbers.
     """
-    if not is_sandboxed:
+    if not is_sandboxed and (point := locale.localeconv()["decimal_point"]) != ".":
+        warnings.warn(
+            f"the locale of this process writes numbers with {str(point)!r}, which SUMO does not read: it runs in a "
+            "process of its own, several times slower; allowed: locale.setlocale(locale.LC_NUMERIC, 'C')",
+            stacklevel=2,
+        )
+    elif not is_sandboxed:
         try:
             return Simulation()
         except InUseError:
