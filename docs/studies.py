@@ -112,19 +112,19 @@ COLUMNS = {
     "return, Eq. 16": ("return_eq16", 0),
     "mean speed [m/s]": ("mean_speed", 2),
     "steady [m/s]": ("mean_speed_steady", 2),
-    "of the limit, steady": ("speed_limit_ratio_steady", 3),
+    "speed / limit, steady": ("speed_limit_ratio_steady", 3),
     "std across vehicles [m/s]": ("speed_std_fleet", 2),
     "min time gap [s]": ("min_time_gap", 2),
-    "hardest braking [m/s²]": ("cav_max_braking", 1),
-    "leave [veh/h]": ("outflow_veh_per_h", 0),
-    "wait [veh]": ("insertion_backlog_veh", 0),
+    "max braking [m/s²]": ("cav_max_braking", 1),
+    "outflow [veh/h]": ("outflow_veh_per_h", 0),
+    "insertion backlog [veh]": ("insertion_backlog_veh", 0),
 }
 """columns of `evaluation_table`: a metric and its digits"""
-RING_COLUMNS = ("return", "mean speed [m/s]", "of the limit, steady", "std across vehicles [m/s]")
+RING_COLUMNS = ("return", "mean speed [m/s]", "speed / limit, steady", "std across vehicles [m/s]")
 RING_COLUMNS += ("min time gap [s]",)
 FIGURE_EIGHT_COLUMNS = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
-ON_RAMP_COLUMNS = ("return", "mean speed [m/s]", "leave [veh/h]", "min time gap [s]")
-MERGE_COLUMNS = ("return", "mean speed [m/s]", "steady [m/s]", "leave [veh/h]", "wait [veh]")
+ON_RAMP_COLUMNS = ("return", "mean speed [m/s]", "outflow [veh/h]", "min time gap [s]")
+MERGE_COLUMNS = ("return", "mean speed [m/s]", "steady [m/s]", "outflow [veh/h]", "insertion backlog [veh]")
 
 
 def evaluation_table(
@@ -158,7 +158,7 @@ def unfiltered_table(study: str, road: str, columns: tuple[str, ...] = RING_COLU
     """Return `evaluation_table` without the safety filter, for PI and the trainings."""
     names = f"{study}-unfiltered", UNFILTERED_ROADS[road]
     learned = tuple(row["name"] for row in study_rows(*names) if row["is_learned"])
-    return evaluation_table(*names, (*columns, "hardest braking [m/s²]"), ("PI (paper)", "tuned PI", *learned))
+    return evaluation_table(*names, (*columns, "max braking [m/s²]"), ("PI (paper)", "tuned PI", *learned))
 
 
 def _feasibility_text(verdicts: str | list[str]) -> str:
