@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from differences import differences_table
 from people import people_claims
-from studies import beyond_own_expert, rows_of
+from studies import difference_to_expert, study_rows
 from tables import markdown_table, results_part
 from verdicts import HELD, INCONSISTENT, NOT_HELD, UNDECIDED, Finding, Values, compare, judge, list_values, worst
 
@@ -116,7 +116,7 @@ class Version:
     def rows(self, name: str, road: str) -> dict[str, dict[str, Any]]:
         """Return the rows of a study by variant, those of drivers that do not learn by label."""
         self.part(name, road, "table")
-        return {row.get("variant", row["name"]): row for row in rows_of(*self.study(name, road))}
+        return {row.get("variant", row["name"]): row for row in study_rows(*self.study(name, road))}
 
     def returns(self, name: str, road: str, variants: Sequence[str]) -> Values:
         """Return the return of each training on test seeds."""
@@ -193,7 +193,7 @@ def larger_return(study: str, road: str, variant: str, *others: str) -> Assessme
         verdict, numbers = compare(returns, label_of(variant))
         if not variant.startswith("proposed"):
             return verdict, f"return on test seeds: {numbers}"
-        gain = beyond_own_expert(rows, variant, EXPERT)
+        gain = difference_to_expert(rows, variant, EXPERT)
         is_beyond = judge([Estimate(**gain)]) == HELD
         alone = BY_EXPERT if verdict.startswith(HELD) and not is_beyond else ""
         numbers = f"{numbers}; {list_values({EXPERT: rows[EXPERT]['return']['mean']})}"
@@ -461,7 +461,7 @@ def bound(version: Version) -> Finding:
 def gain_over_expert(version: Version) -> Finding:
     """Is the residual worth anything beyond the expert?"""
     rows = version.rows("table-2", "ring")
-    gain = beyond_own_expert(rows, "proposed", EXPERT)
+    gain = difference_to_expert(rows, "proposed", EXPERT)
     share = 100 * gain["mean"] / rows[EXPERT]["return"]["mean"]
     verdict = judge([Estimate(**gain)])
     return (
@@ -699,7 +699,7 @@ def short_answer() -> str:
         ("merge", "table-1-merge"),
     ):
         proposed, trpo = version.returns(study, road, ("proposed", "trpo")).values()
-        gain = interval_text(beyond_own_expert(version.rows(study, road), "proposed", EXPERT), 0, "+,")
+        gain = interval_text(difference_to_expert(version.rows(study, road), "proposed", EXPERT), 0, "+,")
         lines.append(
             f"- {road}: return {proposed.mean():,.0f}; difference to TRPO {_difference_text(proposed, trpo)}, to PI, "
             f"its expert without learning, {gain} ({len(proposed)} trainings)"

@@ -1,21 +1,21 @@
-"""Learning with the virtual environment and without it, from what `unjam reproduce` made."""
+"""Curves of trainings with and without a learned model, from the results of `unjam reproduce`."""
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
-from studies import rows_of
+from studies import study_rows
 from tables import results_part
 
 from unjam_paper.comparison import compared_variants
 from unjam_paper.study import PlannedRun, interval_text
 
 LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}
-COLOURS = ("#2b6cb0", "#e07a1f", "#3a8f5c", "#7b8794")
+COLORS = ("#2b6cb0", "#e07a1f", "#3a8f5c", "#7b8794")
 
 
-def road_model(prefix: str, road: str = "ring") -> dict[str, str]:
-    """Return the labels of the variants that a study of road models compares, large iterations first."""
+def road_model_labels(prefix: str, road: str = "ring") -> dict[str, str]:
+    """Return the labels of the variants in a study of road models, large iterations first."""
     modelled, *others = compared_variants(prefix)
     sizes = {name: PlannedRun(road, name, 0).config.learner.steps_per_iteration for name in others}
     labels = {name: f"without, in iterations of {size:,}" for name, size in sizes.items()}
@@ -23,32 +23,35 @@ def road_model(prefix: str, road: str = "ring") -> dict[str, str]:
     return {modelled: "with a model of the whole road", **{name: labels[name] for name in ordered}}
 
 
-def validations(variant: str, study: str = "table-2", road: str = "ring") -> tuple[np.ndarray, np.ndarray]:
-    """Return actual steps, shape (points,), and the returns on the validation seeds, shape (runs, points).
+def validation_curves(variant: str, study: str = "table-2", road: str = "ring") -> tuple[np.ndarray, np.ndarray]:
+    """Return environment steps, shape (points,), and the returns on the validation seeds, shape (trainings, points).
 
-    Before a training was validated for the first time there is nothing.
+    The curves start at the first validation.
     """
     curves = results_part(f"{study}/curves")[road][variant]
     steps, values = np.array(curves["steps"]), np.array(curves["return_validation"])
-    known = (values != values[:, :1]).any(0)  # until then the first is all that is known
-    first = int(np.argmax(known)) if known.any() else len(steps)
+    is_known = (values != values[:, :1]).any(0)  # up to the first validation all values are equal
+    first = int(np.argmax(is_known)) if is_known.any() else len(steps)
     return steps[max(0, first - 1) :], values[:, max(0, first - 1) :]
 
 
-def draw(
+def draw_validation(
     labels: dict[str, str] = LABELS, study: str = "table-2", lowest: float | None = None, road: str = "ring"
 ) -> Figure:
-    """Draw validation against actual steps: mean and range of the runs; from `lowest` on, steps by powers."""
+    """Draw the mean and range of validation returns against environment steps.
+
+    With `lowest`, the lower limit of the returns, steps have a logarithmic axis.
+    """
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     axes = figure.subplots()
     most = -np.inf
-    for (variant, label), colour in zip(labels.items(), COLOURS, strict=False):
-        steps, curves = validations(variant, study, road)
+    for (variant, label), color in zip(labels.items(), COLORS, strict=False):
+        steps, curves = validation_curves(variant, study, road)
         most = max(most, curves.max())
         low, high, once = curves.min(0), curves.max(0), len(steps) == 1
-        axes.fill_between(steps / 1000, low, high, color=colour, alpha=0.15, lw=0)
-        axes.plot(steps / 1000, curves.mean(0), "o" if once else "-", color=colour, label=label)
-        axes.vlines(steps / 1000, low, high, color=colour, alpha=0.15, lw=8 if once else 0)
+        axes.fill_between(steps / 1000, low, high, color=color, alpha=0.15, lw=0)
+        axes.plot(steps / 1000, curves.mean(0), "o" if once else "-", color=color, label=label)
+        axes.vlines(steps / 1000, low, high, color=color, alpha=0.15, lw=8 if once else 0)
     if lowest is not None:
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -63,17 +66,17 @@ def draw(
     return figure
 
 
-def judged() -> pd.DataFrame:
-    """Return what the trainings gain, each, and after how many steps they first reach a level.
+def step_count_table() -> pd.DataFrame:
+    """Return the gain of each training, and the environment steps after which it first reaches a return.
 
-    The level is what runs without the virtual environment reach at best, on average.
+    This return is the mean of the best validations of the trainings without the virtual environment.
     """
-    rows = {row["variant"]: row for row in rows_of("table-2", "ring") if row["is_learned"]}
-    level = float(validations("ours-without-model")[1].max(1).mean())
+    rows = {row["variant"]: row for row in study_rows("table-2", "ring") if row["is_learned"]}
+    level = float(validation_curves("ours-without-model")[1].max(1).mean())
     table = []
     for variant, label in LABELS.items():
-        steps, curves = validations(variant)
-        there = [int(steps[np.argmax(curve >= level)]) for curve in curves if curve.max() >= level]
+        steps, curves = validation_curves(variant)
+        reached = [int(steps[np.argmax(curve >= level)]) for curve in curves if curve.max() >= level]
         row = rows[variant]
         table.append(
             {
@@ -81,8 +84,8 @@ def judged() -> pd.DataFrame:
                 "trainings": len(curves),
                 "difference to the best tuned expert": interval_text(row["gain_over_best_expert"], 0, "+"),
                 "each": ", ".join(f"{gain:+.0f}" for gain in row["gains"]),
-                f"reach {level:.0f}": f"{len(there)} of {len(curves)}",
-                "after environment steps": ", ".join(f"{count:,}" for count in sorted(there)),
+                f"reach {level:.0f}": f"{len(reached)} of {len(curves)}",
+                "after environment steps": ", ".join(f"{count:,}" for count in sorted(reached)),
             }
         )
     return pd.DataFrame(table)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from people import figure_6
-from tables import mean_of, results_part, rows_of
+from tables import driver_rows, metric_mean, results_part
 
 from unjam.measures.statistics import paired_difference
 from unjam.parameters import flatten_keys
@@ -78,7 +78,7 @@ def expert_effect() -> str:
     """Return the differences of the return of PI as in the paper to the default one."""
     texts = []
     for road in ("ring", "ring-jammed"):
-        rows = rows_of(f"experts/all-on-{road}")
+        rows = driver_rows(f"experts/all-on-{road}")
         difference = paired_difference(rows["pi:time_constant=0"], rows["pi"], "return")
         texts.append(f"{interval_text(asdict(difference), 0, '+,')} on `{road}`")
     return f"return of the paper's PI, difference to the default one: {', '.join(texts)} (`results/experts.json`)"
@@ -140,7 +140,7 @@ def impatience_effect() -> str:
     """Return the speed of human traffic on the figure eight with other impatience."""
     parts = {"": "figure-eight-32", " with impatience 0": "figure-eight-32-impatience=0"}
     parts[" with 1"] = "figure-eight-32-impatience=1"
-    texts = (f"{mean_of(f'experts/{part}', 'human', 'mean_speed'):.2f} m/s{what}" for what, part in parts.items())
+    texts = (f"{metric_mean(f'experts/{part}', 'human', 'mean_speed'):.2f} m/s{what}" for what, part in parts.items())
     return f"human traffic, radius 32 m: {', '.join(texts)} (`results/experts.json`)"
 
 

@@ -1,4 +1,4 @@
-"""Write the tables and pictures of the pages, which the code in their comments makes of the files under results/.
+"""Write the tables and pictures of the pages from the files under results/, with the code in the pages' comments.
 
     python docs/pages.py
 
@@ -30,7 +30,7 @@ CELL = re.compile(rf"^{BEGIN}((?:(?!-->).)*)^-->\n(.*?)^<!-- end -->$", re.DOTAL
 
 
 def run_cell(code: str, name: str, variables: dict[str, Any]) -> list[str | Picture]:
-    """Run a cell and return what it shows, as in a notebook; error messages contain `name`."""
+    """Run a cell and return the values that it shows, as in a notebook; error messages contain `name`."""
     shown: list[str | Picture] = []
     variables["display"] = lambda *values: shown.extend(value for value in values if value is not None)
     module = ast.parse(code, name)
@@ -41,7 +41,7 @@ def run_cell(code: str, name: str, variables: dict[str, Any]) -> list[str | Pict
 
 
 def render_page(page: Path) -> tuple[str, list[Picture]]:
-    """Return the text of a page with the present outputs of its cells, and its pictures.
+    """Return the text of a page with the current outputs of its cells, and its pictures.
 
     Raises `ValueError` if a cell has no end, or its comment an early one.
     """
@@ -62,7 +62,7 @@ def render_page(page: Path) -> tuple[str, list[Picture]]:
 
 
 def write_pages() -> None:
-    """Write all pages and their pictures, and remove pictures that no page shows any more."""
+    """Write all pages and their pictures, and remove pictures that no page shows."""
     updated = {page: render_page(page) for page in sorted(DOCS.glob("*.md"))}
     pictures = {
         PICTURES / f"{each.name}.png": png_bytes(each.figure) for _, found in updated.values() for each in found

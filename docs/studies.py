@@ -5,8 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 import pandas as pd
-from tables import RESULTS, metrics_of, results_part
-from tables import rows_of as rows_of_file
+from tables import RESULTS, driver_rows, metric_table, results_part
 
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import with_no_break_spaces
@@ -17,38 +16,42 @@ from unjam_paper.studies import STUDIES
 from unjam_paper.study import STUDY_ROADS, UNFILTERED_ROADS, interval_text, number_text
 from unjam_paper.variants import REFERENCE_DRIVERS, TUNED_REFERENCES, VARIANTS
 
-FREE = 15.0
-"""mean speed of an episode on the merge in which no jam stayed [m/s]"""
-PAPER = {"reward": "return", "speed": "CAV's speed [m/s]", "std": "its std [m/s]"}
+JAM_FREE_SPEED = 15.0
+"""an episode on the merge with a larger mean speed has no jam at its end [m/s]"""
+PAPER_COLUMNS = {"reward": "return", "speed": "CAV's speed [m/s]", "std": "its std [m/s]"}
 
 
 def page_table(study: str, name: str) -> pd.DataFrame:
-    """Return a table that a study itself makes for its page."""
+    """Return a table that the study itself defines for its page."""
     return STUDIES[study].tables[name](RESULTS / f"{study}.json")
 
 
-def rows_of(study: str, road: str) -> list[dict[str, Any]]:
+def study_rows(study: str, road: str) -> list[dict[str, Any]]:
     """Return the rows of a study's table on a road, compared with the best tuned expert.
 
-    Tables of before have percentile intervals: they are made again from the trainings' gains, where these are.
+    Trainings have the present label of their variant. Older results have percentile intervals, which are computed again
+    from the gains of the trainings if the file has them.
     """
     rows = results_part(f"{study}/table")
     for row in rows:
+        if row["is_learned"]:
+            row["name"] = VARIANTS[row["variant"]].label
         if "gains" in row and "smallest" not in row["gain_over_best_expert"]:
             row["gain_over_best_expert"] = asdict(estimate_over_trainings(row["gains"]))
             row["probability_of_improvement"] = {"mean": row["probability_of_improvement"]["mean"]}
     rows = [row for row in rows if row["road"] == road]
-    known = any(row["name"].startswith("tuned ") for row in rows)
-    later = f"tuned-on-{road}"
-    if known or later not in read_parts(RESULTS / "experts.json"):
+    has_tuned_experts = any(row["name"].startswith("tuned ") for row in rows)
+    part = f"tuned-on-{road}"
+    if has_tuned_experts or part not in read_parts(RESULTS / "experts.json"):
         return rows
-    return beside_tuned(rows, rows_of_file(f"experts/{later}"))
+    return add_tuned_experts(rows, driver_rows(f"experts/{part}"))
 
 
-def beside_tuned(rows: list[dict[str, Any]], tuned: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Return a table's rows as beyond the best tuned expert, which was driven later, on the same seeds.
+def add_tuned_experts(rows: list[dict[str, Any]], tuned: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Return the rows of a table with tuned experts that were evaluated later, on the same seeds.
 
-    Episodes of its trainings are not kept, so intervals are over the trainings' means alone.
+    Differences of trainings are to the best tuned expert. The results do not contain their episodes, so that confidence
+    intervals are over the means of the trainings only.
     """
     metric = next(row["gain_reference"]["metric"] for row in rows if row["is_learned"])
     names = {name: label for label, name in TUNED_REFERENCES[rows[0]["road"]].items()}
@@ -72,30 +75,33 @@ def beside_tuned(rows: list[dict[str, Any]], tuned: dict[str, list[dict[str, Any
     return [*others, *driven, *({**row, "probability_of_improvement": None} for row in learned)]
 
 
-def beyond_own_expert(rows: dict[str, dict[str, Any]], name: str, expert: str) -> dict[str, Any]:
-    """Return what the trainings of a row earn beyond an expert of their table, over the trainings' means."""
+def difference_to_expert(rows: dict[str, dict[str, Any]], name: str, expert: str) -> dict[str, Any]:
+    """Return the difference between the return of trainings and that of an expert of their table.
+
+    The confidence interval is over the means of the trainings.
+    """
     row = rows[name]
     metric, best = row["gain_reference"]["metric"], row["gain_reference"]["expert"]
     more = rows[best][metric]["mean"] - rows[expert][metric]["mean"]
     return asdict(estimate_over_trainings([gain + more for gain in row["gains"]]))
 
 
-def paper_convention(study: str, road: str) -> pd.DataFrame:
-    """Return a table in the paper's convention: the paper's numbers, and ours without and with the safety filter."""
-    with_filter = {row["name"]: row for row in rows_of(study, road)}
+def paper_convention_table(study: str, road: str) -> pd.DataFrame:
+    """Return a table in the paper's convention: its numbers, and those measured without and with the safety filter."""
+    with_filter = {row["name"]: row for row in study_rows(study, road)}
     unfiltered = f"{study}-unfiltered", UNFILTERED_ROADS.get(road, "")
     is_measured = (RESULTS / f"{unfiltered[0]}.json").is_file()
-    versions = {"without filter": {row["name"]: row for row in rows_of(*unfiltered)}} if is_measured else {}
-    versions["with filter" if road in UNFILTERED_ROADS else "ours"] = with_filter
+    versions = {"without filter": {row["name"]: row for row in study_rows(*unfiltered)}} if is_measured else {}
+    versions["with filter" if road in UNFILTERED_ROADS else "unjam"] = with_filter
     table = []
     for name, row in with_filter.items():
         cells, reported = {"": name}, row.get("paper") or {}
-        for key, heading in PAPER.items():
+        for key, heading in PAPER_COLUMNS.items():
             digits = 0 if key == "reward" else 2
             cells[f"{heading}, paper"] = f"{reported[key]:.{digits}f}" if key in reported else ""
             for label, rows in versions.items():
-                ours = rows[name]["paper_convention"][key]
-                text = f"{ours['mean']:.{digits}f} ± {ours['std']:.{digits}f}"
+                measured = rows[name]["paper_convention"][key]
+                text = f"{measured['mean']:.{digits}f} ± {measured['std']:.{digits}f}"
                 cells[f"{heading}, {label}"] = with_no_break_spaces(text)
         table.append(cells)
     return pd.DataFrame(table)
@@ -106,28 +112,30 @@ COLUMNS = {
     "return, Eq. 16": ("return_eq16", 0),
     "mean speed [m/s]": ("mean_speed", 2),
     "steady [m/s]": ("mean_speed_steady", 2),
-    "of the limit, steady": ("speed_limit_ratio_steady", 3),
+    "speed / limit, steady": ("speed_limit_ratio_steady", 3),
     "std across vehicles [m/s]": ("speed_std_fleet", 2),
     "min time gap [s]": ("min_time_gap", 2),
-    "hardest braking [m/s²]": ("cav_max_braking", 1),
-    "leave [veh/h]": ("outflow_veh_per_h", 0),
-    "wait [veh]": ("insertion_backlog_veh", 0),
+    "max braking [m/s²]": ("cav_max_braking", 1),
+    "outflow [veh/h]": ("outflow_veh_per_h", 0),
+    "insertion backlog [veh]": ("insertion_backlog_veh", 0),
 }
-"""what the honest tables show: a metric and its digits"""
-OF_THE_RING = ("return", "mean speed [m/s]", "of the limit, steady", "std across vehicles [m/s]")
-OF_THE_RING += ("min time gap [s]",)
-OF_THE_EIGHT = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
-OF_THE_ON_RAMP = ("return", "mean speed [m/s]", "leave [veh/h]", "min time gap [s]")
-OF_THE_MERGE = ("return", "mean speed [m/s]", "steady [m/s]", "leave [veh/h]", "wait [veh]")
+"""columns of `evaluation_table`: a metric and its digits"""
+RING_COLUMNS = ("return", "mean speed [m/s]", "speed / limit, steady", "std across vehicles [m/s]")
+RING_COLUMNS += ("min time gap [s]",)
+FIGURE_EIGHT_COLUMNS = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
+ON_RAMP_COLUMNS = ("return", "mean speed [m/s]", "outflow [veh/h]", "min time gap [s]")
+MERGE_COLUMNS = ("return", "mean speed [m/s]", "steady [m/s]", "outflow [veh/h]", "insertion backlog [veh]")
 
 
-def honest(study: str, road: str, columns: tuple[str, ...] = OF_THE_RING, names: tuple[str, ...] = ()) -> pd.DataFrame:
-    """Return a table in the honest convention, of the drivers of these names or of all."""
+def evaluation_table(
+    study: str, road: str, columns: tuple[str, ...] = RING_COLUMNS, names: tuple[str, ...] = ()
+) -> pd.DataFrame:
+    """Return the metrics of deterministic controllers on test seeds, of the drivers with these names or of all."""
     table = []
-    for row in rows_of(study, road):
+    for row in study_rows(study, road):
         if names and row["name"] not in names:
             continue
-        beyond, better = row.get("gain_over_best_expert"), row.get("probability_of_improvement")
+        gain, probability = row.get("gain_over_best_expert"), row.get("probability_of_improvement")
         cells = {
             "": f"{row['name']}{' (best expert)' if row.get('best_expert') else ''}",
             "trainings": row["trainings"] or "",
@@ -136,57 +144,57 @@ def honest(study: str, road: str, columns: tuple[str, ...] = OF_THE_RING, names:
             key, digits = COLUMNS[name]
             cells[name] = number_text(row[key]["mean"], digits)
         if "feasibility" in row:
-            cells["feasible"] = _feasibility(row["feasibility"])
-        nothing = beyond is None or row.get("best_expert")
-        cells["difference to best expert"] = "" if nothing else interval_text(beyond, 0, "+")
+            cells["feasible"] = _feasibility_text(row["feasibility"])
+        has_difference = gain is not None and not row.get("best_expert")
+        cells["difference to best expert"] = interval_text(gain, 0, "+") if has_difference else ""
         cells["probability of improvement"] = (
-            "" if better is None else interval_text({"low": None, "high": None, **better}, 2)
+            "" if probability is None else interval_text({"low": None, "high": None, **probability}, 2)
         )
         table.append(cells)
     return pd.DataFrame(table)
 
 
-def without_filter(study: str, road: str, columns: tuple[str, ...] = OF_THE_RING) -> pd.DataFrame:
-    """Return the table of `honest` without the safety filter: of the paper's expert and of all that learn."""
+def unfiltered_table(study: str, road: str, columns: tuple[str, ...] = RING_COLUMNS) -> pd.DataFrame:
+    """Return `evaluation_table` without the safety filter, for PI and the trainings."""
     names = f"{study}-unfiltered", UNFILTERED_ROADS[road]
-    learned = tuple(row["name"] for row in rows_of(*names) if row["is_learned"])
-    return honest(*names, (*columns, "hardest braking [m/s²]"), ("PI (paper)", "tuned PI", *learned))
+    learned = tuple(row["name"] for row in study_rows(*names) if row["is_learned"])
+    return evaluation_table(*names, (*columns, "max braking [m/s²]"), ("PI (paper)", "tuned PI", *learned))
 
 
-def _feasibility(verdicts: str | list[str]) -> str:
-    """Return whether a driver is feasible, or how many trainings are; a dash for the human baseline."""
+def _feasibility_text(verdicts: str | list[str]) -> str:
+    """Return whether a driver is feasible, or how many trainings are feasible; a dash for the human baseline."""
     if isinstance(verdicts, str):
         return {"": "–", FEASIBLE: "yes"}.get(verdicts, "no")
     return f"{verdicts.count(FEASIBLE)} of {len(verdicts)}"
 
 
-def merge_capacity() -> pd.DataFrame:
-    """Return how people alone fare on the merge, by how many want to enter and how the road begins."""
+def merge_capacity_table() -> pd.DataFrame:
+    """Return the metrics of human-only traffic on the merge by inflow and by the state at the start."""
     names = ("mean_speed", "mean_speed_steady", "outflow_veh_per_h", "insertion_backlog_veh")
     tables = []
     for part in read_parts(RESULTS / "research-notes.json"):
         if not part.startswith("merge-capacity-"):
             continue
         standing, inflow = (int(number) for number in part.split("-")[-2:])
-        table = metrics_of(f"research-notes/{part}", names)
+        table = metric_table(f"research-notes/{part}", names)
         table.insert(0, "highway [veh/h]", f"{inflow:,}")
         table.insert(0, "start", f"{standing} standing" if standing else "empty")
         tables.append(table)
     return pd.concat(tables)
 
 
-def closing_absorber() -> pd.DataFrame:
-    """Return what closing up is worth to the jam absorber, and in how many episodes no jam stays."""
+def closing_absorber_table() -> pd.DataFrame:
+    """Return the metrics of the jam absorber with and without closing up, and the episodes without a jam at the end."""
     names = ("return", "mean_speed", "mean_speed_steady", "outflow_veh_per_h", "insertion_backlog_veh")
-    table = metrics_of("research-notes/merge-closing", names)
+    table = metric_table("research-notes/merge-closing", names)
     table["without a jam"] = [
-        f"{sum(row['mean_speed'] > FREE for row in rows)} of {len(rows)}"
-        for rows in rows_of_file("research-notes/merge-closing").values()
+        f"{sum(row['mean_speed'] > JAM_FREE_SPEED for row in rows)} of {len(rows)}"
+        for rows in driver_rows("research-notes/merge-closing").values()
     ]
     return table
 
 
-def commands() -> pd.DataFrame:
+def command_table() -> pd.DataFrame:
     """Return the command that repeats the training of a row with the first seed, by study and road."""
     table = {}
     for name, study in STUDIES.items():
@@ -197,13 +205,13 @@ def commands() -> pd.DataFrame:
             changes = {key: value for key, value in road.items() if key != "scenario"} | dict(variant.changes)
             for key, value in changes.items():
                 words += ["--set", f"{key}={value}"]
-            said = {"study": name, "road": run.road, "row": variant.label, "command": f"`{shlex.join(words)}`"}
-            table.setdefault(run.name, said)
+            cells = {"study": name, "road": run.road, "row": variant.label, "command": f"`{shlex.join(words)}`"}
+            table.setdefault(run.name, cells)
     return pd.DataFrame(table.values())
 
 
-def drivers() -> pd.DataFrame:
-    """Return how drivers that do not learn are named on the command line."""
+def driver_name_table() -> pd.DataFrame:
+    """Return the command-line names of drivers that do not learn."""
     on_all = [{"row": label, "`--driver`": f"`{name}`", "on": ""} for label, name in REFERENCE_DRIVERS.items()]
     tuned = [
         {"row": label, "`--driver`": f"`{name}`", "on": road}

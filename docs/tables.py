@@ -1,4 +1,4 @@
-"""Tables of the documentation, made from the measured files under results/: no number is typed in."""
+"""Tables of the documentation, made from the files under results/."""
 
 import re
 from collections.abc import Sequence
@@ -19,7 +19,26 @@ from unjam_paper.results_file import read_part
 
 RESULTS = Path(__file__).parent.parent / "results"
 NUMBERS = re.compile(r"[-+−–±.,%\s\[\]]*\d[-+−–±.,%\s\[\]\d]*")
-"""what columns contain that are aligned to the right"""
+"""content of columns that are aligned to the right"""
+NOTE_TERMS = {
+    "also beside the acceleration lane": "also next to the acceleration lane",
+    "` as it is": "` with default parameters",
+    "One law": "One formula",
+    "longer tuned law": "longer tuned formula",
+    "no single law": "no single formula",
+    "No single law": "No single formula",
+    "make one law suit": "make one formula suit",
+    "Memory of the policy: one look": "Memory of the policy: one observation",
+    "twelve looks, a second apart": "twelve observations, 1 s apart",
+    "twelve looks, five seconds apart": "twelve observations, 5 s apart",
+    "among drivers with": "in traffic of human drivers with",
+    "from nothing, paid for the distance": "without an expert, reward: distance",
+    "What ends a wave soonest leaves a slower flow": "The setting that dissolves a wave first makes traffic slower",
+    "A trade between roads, no gain": "Gains on some roads equal losses on others",
+    "Less is lost, nothing is gained": "The loss is smaller, without a gain",
+    "The queue meets its own tail": "The queue closes around the loop",
+}
+"""glossary terms for expressions in `results/research-notes.json`"""
 
 
 def results_part(name: str) -> Any:
@@ -28,7 +47,7 @@ def results_part(name: str) -> Any:
     return read_part(RESULTS / f"{file}.json", part)
 
 
-def rows_of(name: str) -> dict[str, list[dict]]:
+def driver_rows(name: str) -> dict[str, list[dict]]:
     """Return the rows of a part of a results file, FILE/PART, by driver."""
     rows: dict[str, list[dict]] = {}
     for row in results_part(name)["rows"]:
@@ -38,13 +57,14 @@ def rows_of(name: str) -> dict[str, list[dict]]:
     return rows
 
 
-def metrics_of(name: str, metrics: Sequence[str], compared: bool = True) -> pd.DataFrame:
+def metric_table(name: str, metrics: Sequence[str], compared: bool = True) -> pd.DataFrame:
     """Return a table of a part of a results file: a row per driver, mean and 95 % interval per metric.
 
-    Last comes, where it is `compared`, the first metric beyond people alone, else beyond the best expert.
+    With `compared`, the last column is the difference of the first metric to the human baseline, or, without one, to
+    the best expert.
     """
     table = {}
-    by_driver = rows_of(name)
+    by_driver = driver_rows(name)
     baseline = choose_baseline(by_driver) if compared else ""
     for driver, rows in by_driver.items():
         cells = {}
@@ -56,19 +76,19 @@ def metrics_of(name: str, metrics: Sequence[str], compared: bool = True) -> pd.D
         if "human" in by_driver and len(by_driver) > 1 and "cav_max_braking" in rows[0]:
             cells["feasible"] = overall_feasibility(rows)
         if baseline:
-            beyond = paired_difference(rows, by_driver[baseline], metrics[0])
-            shown = "" if driver == baseline else str(estimate_cell(beyond, first.digits, sign="+"))
-            cells[f"{first.label} − {baseline}"] = shown
+            difference = paired_difference(rows, by_driver[baseline], metrics[0])
+            text = "" if driver == baseline else str(estimate_cell(difference, first.digits, sign="+"))
+            cells[f"{first.label} − {baseline}"] = text
         table[driver] = cells
     return pd.DataFrame.from_dict(table, orient="index")
 
 
-def mean_of(name: str, driver: str, metric: str) -> float:
+def metric_mean(name: str, driver: str, metric: str) -> float:
     """Return the mean of one metric of one driver in a part of a results file."""
-    return metric_estimate(rows_of(name)[driver], metric).mean
+    return metric_estimate(driver_rows(name)[driver], metric).mean
 
 
-def batch_sizes() -> pd.DataFrame:
+def batch_size_table() -> pd.DataFrame:
     """Return vehicle steps per second by number of rings in a batch and by device."""
     columns = {}
     for name in ("cpu", "gpu"):
@@ -83,15 +103,15 @@ def batch_sizes() -> pd.DataFrame:
 
 
 def knowledge_rows(road: str) -> pd.DataFrame:
-    """Return what the study of knowledge measured on a road: a row per model, number of steps and seed."""
+    """Return the rows of the study of prior knowledge on a road: one per model, number of steps and seed."""
     rows = results_part("model/knowledge")["rows"]
     return pd.json_normalize([row for row in rows if row["road"] == road])
 
 
-def knowledge_of(road: str, columns: dict[str, str], ranges: bool = True) -> pd.DataFrame:
-    """Return a table of the study of knowledge: mean over the seeds, and the smallest and the largest.
+def knowledge_table(road: str, columns: dict[str, str], ranges: bool = True) -> pd.DataFrame:
+    """Return a table of the study of prior knowledge: mean, smallest and largest value over the seeds.
 
-    `columns` has the names of what was measured, with their headings.
+    `columns` has the headings of the shown quantities by name.
     """
     table = []
     for (steps, model), rows in knowledge_rows(road).groupby(["steps", "model"], sort=False):
@@ -102,13 +122,13 @@ def knowledge_of(road: str, columns: dict[str, str], ranges: bool = True) -> pd.
             if ranges and len(values) > 1:
                 cells[heading] += f" [{error_text(values.min())}, {error_text(values.max())}]"
         table.append(cells)
-    return pd.DataFrame(table).sort_values(road, key=lambda texts: texts.map(_steps_of), kind="stable")
+    return pd.DataFrame(table).sort_values(road, key=lambda texts: texts.map(_count_in_text), kind="stable")
 
 
-def knowledge_gain(roads: Sequence[str], columns: dict[str, str]) -> pd.DataFrame:
-    """Return by how much errors are smaller with IDM + residual than with networks alone, same data paired.
+def knowledge_gain_table(roads: Sequence[str], columns: dict[str, str]) -> pd.DataFrame:
+    """Return the reduction of errors by IDM + residual relative to networks alone, paired on the same data.
 
-    In brackets the seeds of which that is true.
+    Brackets have the number of seeds with a reduction.
     """
     table = []
     for road in roads:
@@ -123,35 +143,35 @@ def knowledge_gain(roads: Sequence[str], columns: dict[str, str]) -> pd.DataFram
     return pd.DataFrame(table)
 
 
-def roads_known(road: str) -> pd.DataFrame:
+def road_model_table(road: str) -> pd.DataFrame:
     """Return the mean errors of whole-road models by prior knowledge of human drivers and by amount of data.
 
-    These are one-step errors, and differences of whole episodes to those of the environment: mean speed, and standard
-    deviation of speeds in the second half, with PI and with a CAV that follows as a human driver. Brackets have the
-    range of the seeds.
+    Columns are one-step errors, and differences of episodes in the model to those in the environment: mean speed, and
+    standard deviation of speeds in the second half, with PI and with a CAV that follows as a human driver. Brackets
+    have the range over the seeds.
     """
     rows = results_part("model/whole_roads")["rows"]
     drivers = {"PI": "PI", "CAV that follows as a human driver": "as a human driver"}
     metrics = {"speed": ("speed", "m/s", 2), "wave": ("spread", "m/s", 2)}
-    return _known([row for row in rows if row["road"] == road], drivers, metrics)
+    return _model_error_table([row for row in rows if row["road"] == road], drivers, metrics)
 
 
-def on_ramps_known() -> pd.DataFrame:
-    """Return the errors of on-ramp models, as `roads_known`: differences of travel time and flow."""
+def on_ramp_model_table() -> pd.DataFrame:
+    """Return the errors of on-ramp models, as `road_model_table`: differences of travel time and flow."""
     rows = results_part("model/on_ramps")["rows"]
     drivers = {"expert of the data": "the expert", "human baseline": "human baseline"}
     metrics = {"travel_time": ("travel time", "s", 1), "outflow_veh_per_h": ("flow", "veh/h", 0)}
-    return _known(rows, drivers, metrics)
+    return _model_error_table(rows, drivers, metrics)
 
 
 Metrics = dict[str, tuple[str, str, int]]
 """label, unit and digits of metrics"""
 
 
-def _known(rows: list[dict], drivers: dict[str, str], metrics: Metrics) -> pd.DataFrame:
+def _model_error_table(rows: list[dict], drivers: dict[str, str], metrics: Metrics) -> pd.DataFrame:
     """Return a table of `rows`, one of which is the environment, by `drivers` with their labels.
 
-    Differences are left out where half of the episodes or more ended in a collision.
+    Differences are omitted if half of the episodes or more ended in a collision.
     """
     (actual,) = (row for row in rows if not row["known"])
     found, table = pd.DataFrame([row for row in rows if row["known"]]), []
@@ -160,9 +180,9 @@ def _known(rows: list[dict], drivers: dict[str, str], metrics: Metrics) -> pd.Da
         cells["one-step error [m/s]"] = f"{of['step_error'].mean():.4f}"
         for driver, label in drivers.items():
             for name, (heading, unit, digits) in metrics.items():
-                whole = [each for each in of[driver] if 2 * each["collisions"] < len(each[name])]
-                beyond = [np.mean(each[name]) - np.mean(actual[driver][name]) for each in whole]
-                cells[f"{heading}, {label} [{unit}]"] = _in_range(beyond, digits) if whole else "–"
+                valid = [each for each in of[driver] if 2 * each["collisions"] < len(each[name])]
+                differences = [np.mean(each[name]) - np.mean(actual[driver][name]) for each in valid]
+                cells[f"{heading}, {label} [{unit}]"] = _range_text(differences, digits) if valid else "–"
         crashed = sum(each["collisions"] for driver in drivers for each in of[driver])
         episodes = len(drivers) * len(of) * len(actual[driver][name])
         cells["episodes with collisions"] = f"{crashed} of {episodes}"
@@ -177,10 +197,10 @@ LEVELS = {
 }
 
 
-def levels(name: str, columns: dict[str, str], chosen: dict[str, tuple]) -> pd.DataFrame:
-    """Return what drivers that never learned earn, of the part NAME of `results/research-notes.json`.
+def driver_return_table(name: str, columns: dict[str, str], chosen: dict[str, tuple]) -> pd.DataFrame:
+    """Return return and speed of drivers that do not learn, from a part of `results/research-notes.json`.
 
-    `columns` has headings of what tells rows apart, `chosen` the values of them that are shown.
+    `columns` has the headings of the columns that identify a row, `chosen` their values in the shown rows.
     """
     rows = results_part(f"research-notes/{name}")["rows"]
     return pd.DataFrame(
@@ -191,19 +211,19 @@ def levels(name: str, columns: dict[str, str], chosen: dict[str, tuple]) -> pd.D
     )
 
 
-def _in_range(values: Sequence[float], digits: int = 2) -> str:
+def _range_text(values: Sequence[float], digits: int = 2) -> str:
     mean, low, high = (
         f"{round(each, digits) + 0.0:+.{digits}f}" for each in (np.mean(values), min(values), max(values))
     )
     return mean if low == high else f"{mean} [{low}, {high}]"
 
 
-def _steps_of(text: str) -> int:
+def _count_in_text(text: str) -> int:
     return int("".join(digit for digit in text if digit.isdigit()) or 0)
 
 
-def guesses() -> pd.DataFrame:
-    """Return what a vehicle can infer of its road, by form of its memory: on training rings; on held-out ones."""
+def memory_table() -> pd.DataFrame:
+    """Return the explained variance of properties of a ring by memory of the policy, on training and unseen rings."""
     explained = results_part("research-notes/memory")["explained"]
     seen, held_out = next(iter(explained.values()))
     rows = []
@@ -217,8 +237,8 @@ def guesses() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def notes_table() -> dict[str, pd.DataFrame]:
-    """Return what was tried without success, a table for each topic."""
+def note_tables() -> dict[str, pd.DataFrame]:
+    """Return the negative results, a table for each topic."""
     tables: dict[str, list[dict[str, str]]] = {}
     for row in results_part("research-notes/notes"):
         number = "–" if row["mean"] is None else f"{row['mean']:,g}"
@@ -226,28 +246,34 @@ def notes_table() -> dict[str, pd.DataFrame]:
             number += f" [{row['low']:,g}, {row['high']:,g}]"
         tables.setdefault(row["topic"], []).append(
             {
-                "experiment": row["experiment"],
+                "experiment": _in_glossary_terms(row["experiment"]),
                 "measured": row["metric"],
                 "number": number,
-                "based on": row["basis"],
-                "conclusion": row["conclusion"],
+                "based on": _in_glossary_terms(row["basis"]),
+                "conclusion": _in_glossary_terms(row["conclusion"]),
                 "source": row["source"],
             }
         )
     return {topic: pd.DataFrame(rows) for topic, rows in tables.items()}
 
 
+def _in_glossary_terms(text: str) -> str:
+    for older, term in NOTE_TERMS.items():
+        text = text.replace(older, term)
+    return text
+
+
 def networks_table() -> pd.DataFrame:
-    """Return how the human baseline compares with plain SUMO on public networks: a row for each."""
+    """Return the human baseline compared with plain SUMO on public networks: a row for each."""
     rows = {}
     for name, found in results_part("networks/networks").items():
         about = {"simulated [s]": f"{found['seconds']:.0f}"}
         if "refused" in found:
             rows[name] = {**about, "result": f"refused: {found['refused']}"}
             continue
-        ours, plain = found["human_baseline"], found["plain_sumo"]
+        baseline, plain = found["human_baseline"], found["plain_sumo"]
         both = {
-            label: f"{ours[key]:.{digits}f} / {plain[key]:.{digits}f}"
+            label: f"{baseline[key]:.{digits}f} / {plain[key]:.{digits}f}"
             for key, label, digits in (
                 ("departures", "departures", 0),
                 ("arrivals", "arrivals", 0),
@@ -259,14 +285,14 @@ def networks_table() -> pd.DataFrame:
             **about,
             **both,
             "result": f"{found['different_trips']} trips differ",
-            "CPU time": f"{ours['seconds'] / plain['seconds']:.1f} x ({plain['seconds']:.1f} s)",
-            "memory [MB]": f"{ours['megabytes']:.0f} / {plain['megabytes']:.0f}",
+            "CPU time": f"{baseline['seconds'] / plain['seconds']:.1f} x ({plain['seconds']:.1f} s)",
+            "memory [MB]": f"{baseline['megabytes']:.0f} / {plain['megabytes']:.0f}",
         }
     return pd.DataFrame.from_dict(rows, orient="index").fillna("")
 
 
 def soak_table() -> pd.DataFrame:
-    """Return what was injected in the last soak, how often, and what happened."""
+    """Return the faults of the last soak: what was injected, how often, and the outcomes."""
     table = []
     for row in results_part("soak/rows"):
         happened = [f"{count:,}: {words}" for words, count in row["happened"].items()]
@@ -282,7 +308,7 @@ def soak_table() -> pd.DataFrame:
 
 
 def soak_origin() -> str:
-    """Return with what the rows of the soak were made."""
+    """Return the SUMO version, commits and date of the rows of the soak."""
     made = results_part("soak/manifest")
     commits = dict.fromkeys(row["commit"] for row in results_part("soak/rows"))
     return f"SUMO {made['packages']['libsumo']}, commit {', '.join(commits)}, {made['started'][:10]}"
@@ -290,7 +316,7 @@ def soak_origin() -> str:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of a page: the name of its file, and the text for readers that do not see it."""
+    """A figure of a page: the name of its file, and its alternative text."""
 
     name: str
     figure: Figure
@@ -298,7 +324,7 @@ class Picture:
 
 
 def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> str:
-    """Return a table in Markdown: parameters of drivers break after a comma, commands and intervals nowhere."""
+    """Return a table in Markdown; lines break after commas of parameters, but not in commands and intervals."""
     texts = table.map(lambda cell: _cell_text(cell, digits))
     if index:
         texts.insert(0, "", [_cell_text(name, digits) for name in table.index], allow_duplicates=True)

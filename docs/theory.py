@@ -1,4 +1,4 @@
-"""Tables of what was measured of the paper's theorems, from results/theory.json."""
+"""Tables of the measurements on the theorems of the paper, from results/theory.json."""
 
 from dataclasses import asdict
 from typing import Any
@@ -12,15 +12,15 @@ from unjam_paper.study import interval_text
 from unjam_paper.variants import VARIANTS
 
 
-def measured() -> dict[str, Any]:
-    """Return all that the study wrote."""
+def theory_results() -> dict[str, Any]:
+    """Return the results of the study."""
     return results_part("theory/theory")
 
 
-def untrained() -> pd.DataFrame:
-    """A1: returns of untrained policies, with and without the expert."""
+def untrained_table() -> pd.DataFrame:
+    """Return the returns of untrained policies with and without the expert (A1)."""
     table: dict[str, dict[str, str]] = {}
-    for row in measured()["untrained"]:
+    for row in theory_results()["untrained"]:
         cells = table.setdefault(row["road"], {"": row["road"]})
         cells[row["policy"]] = (
             interval_text(asdict(estimate_over_trainings(row["returns"])), 0)
@@ -30,14 +30,14 @@ def untrained() -> pd.DataFrame:
     return pd.DataFrame(table.values())
 
 
-def convergence() -> pd.DataFrame:
-    """A2: which trainings come within 5 % of the best return known, when, and whether they are there last."""
+def convergence_table() -> pd.DataFrame:
+    """Return when trainings come within 5 % of the best known return, and how many are there at the end (A2)."""
     table = []
-    for row in measured()["convergence"]:
+    for row in theory_results()["convergence"]:
         arrivals = ["never" if steps is None else f"{steps:,}" for steps in row["convergence_steps"]]
         table.append(
             {
-                "": row["name"],
+                "": VARIANTS[row["variant"]].label,
                 "trainings": row["trainings"],
                 "converge after [environment steps]": ", ".join(arrivals),
                 "converged at the end": f"{row['converged_at_end']} of {row['trainings']}",
@@ -47,10 +47,10 @@ def convergence() -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
-def model() -> pd.DataFrame:
-    """A3: the model's error and what hangs on it, in the first and the last tenth of the trainings."""
+def model_error_table() -> pd.DataFrame:
+    """Return the model error and what depends on it in the first and the last tenth of the trainings (A3)."""
     table = []
-    for variant, runs in measured()["model"].items():
+    for variant, runs in theory_results()["model"].items():
         cells: dict[str, Any] = {"": VARIANTS[variant].label}
         first = [row for run in runs for row in run[: max(1, len(run) // 10)]]
         last = [row for run in runs for row in run[-max(1, len(run) // 10) :]]

@@ -212,8 +212,8 @@ def _checkpoint_table(road: str, folder: Path) -> pd.DataFrame:
             values = np.array(curves[row["variant"]]["return_validation"])
             best, last = values.max(1), values[:, -1]
             difference = statistics.estimate_over_trainings(last - best, bounds=(-inf, 0.0))
-            cells = {"": row["name"], "trainings": len(values), "best trained": number_text(best.mean(), 0)}
-            cells |= {"last checkpoint": number_text(last.mean(), 0)}
+            cells = {"": VARIANTS[row["variant"]].label, "trainings": len(values)}
+            cells |= {"best trained": number_text(best.mean(), 0), "last checkpoint": number_text(last.mean(), 0)}
             cells |= {"last − best": str(estimate_cell(difference, 0, sign="+"))}
             table.append({**cells, "kept the untrained network": f"{row['untrained_count']} of {len(values)}"})
     return pd.DataFrame(table)

@@ -37,6 +37,7 @@ from unjam_paper.study import (
     number_text,
     planned_runs,
 )
+from unjam_paper.variants import VARIANTS
 
 CONDITION_EPISODES = 10
 """number of episodes of each driver under each condition"""
@@ -174,7 +175,8 @@ def _transfer_table(folder: Path) -> pd.DataFrame:
     rows = pd.json_normalize(read_part(folder, "transfer"))
     rows["trained as"] = rows["driver"].str.rstrip(" 0123456789")
     speeds = rows.pivot_table("mean_speed.mean", "road", "trained as", _mean_and_range, sort=False)
-    return speeds.rename_axis(index="", columns=None).reset_index()
+    labels = {variant: VARIANTS[variant].label for variant in TRANSFER_VARIANTS}
+    return speeds.rename_axis(index="", columns=None).rename(columns=labels).reset_index()
 
 
 def _mean_and_range(values: pd.Series) -> str:

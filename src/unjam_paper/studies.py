@@ -32,7 +32,7 @@ from unjam_paper.variants import WRONG_BASES
 TABLE_1_VARIANTS = ("trpo", "ppo", "sac", "proposed", "without-model", "ours")
 TABLE_2_VARIANTS = ("trpo", "mb-trpo", "no-initial-policy", "without-model", "proposed", "ours-without-model", "ours")
 FIGURE_9_VARIANTS = ("ppo", "sac", "proposed-ppo", "proposed-sac", "proposed", "without-model")
-TABLE_1_TITLE = "TRPO, PPO, SAC, the proposed method and ours on"
+TABLE_1_TITLE = "TRPO, PPO, SAC, the proposed method and an unjam residual on"
 TABLE_2_TITLE = "contribution of each part of the method, on the ring"
 FIGURE_9_TITLE = "PPO and SAC within the framework, on the ring"
 THEORY_TITLE = "measurable quantities of the theorems A1, A2 and A3"

@@ -1,4 +1,4 @@
-"""Reference drivers that do not learn, and variants of training: the paper's methods with its settings, and unjam's."""
+"""Reference drivers that do not learn, and variants of training: those of the paper with its settings, and of unjam."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -45,9 +45,9 @@ def reduced_step_variants(
     )
     model = {"model.model_ratio": 7.0, "model.kind": "road", "model.rollout_starts": "first", "model.k_max": horizon}
     return {
-        f"{prefix}-few": Variant("ours, few steps", "best", few, steps),
-        f"{prefix}-double": Variant("ours, double steps", "best", double, 2 * steps),
-        f"{prefix}-road-model": Variant("ours, few steps and road model", "best", {**few, **model}, steps),
+        f"{prefix}-few": Variant("unjam residual, few steps", "best", few, steps),
+        f"{prefix}-double": Variant("unjam residual, double steps", "best", double, 2 * steps),
+        f"{prefix}-road-model": Variant("unjam residual, few steps and road model", "best", {**few, **model}, steps),
     }
 
 
@@ -118,9 +118,9 @@ VARIANTS: dict[str, Variant] = {
     ),
     "trpo-exact-million": Variant("TRPO", "paper-exact", EXACT_TRPO, MILLION_STEPS, "trpo"),
     "proposed-exact-million": Variant("proposed", "paper-exact", NO_EARLY_STOPPING, MILLION_STEPS, "proposed"),
-    "ours": Variant("ours", "quick", {}),
-    "ours-without-model": Variant("ours without model", "quick", {"model.model_ratio": 0.0}),
-    "best": Variant("ours, all steps", "best", {}, None),
+    "ours": Variant("unjam residual", "quick", {}),
+    "ours-without-model": Variant("unjam residual without model", "quick", {"model.model_ratio": 0.0}),
+    "best": Variant("unjam residual, all steps", "best", {}, None),
     **BEST_VARIANTS,
     **{
         f"best-road-model-{name}": replace(
@@ -132,10 +132,10 @@ VARIANTS: dict[str, Variant] = {
     **reduced_step_variants("eight", 6_000, 612_000, horizon=1500),
     **ON_RAMP_VARIANTS,
     "ramp-road-model": replace(ON_RAMP_VARIANTS["ramp-road-model"], changes=WEAK_EXPERT, steps=28_800),
-    "ramp-alternating": Variant("ours, alternating updates", "best", {}, None),
-    "ramp-long": Variant("ours, on the expert tuned with the larger budget", "best", LONG_TRAINING, 4_608_000),
-    "ramp-small": Variant("ours, few steps in small iterations", "best", SMALL_ITERATIONS, 86_400),
-    "best-in-batches": Variant("ours, all steps", "best", {"backend": "batch"}, None),
+    "ramp-alternating": Variant("unjam residual, alternating updates", "best", {}, None),
+    "ramp-long": Variant("unjam residual, expert tuned with the larger budget", "best", LONG_TRAINING, 4_608_000),
+    "ramp-small": Variant("unjam residual, few steps in small iterations", "best", SMALL_ITERATIONS, 86_400),
+    "best-in-batches": Variant("unjam residual, all steps", "best", {"backend": "batch"}, None),
     "first-150-seconds": Variant("residual", "best", FIRST_150_SECONDS, None),
     "rings": Variant("residual", "rings", TWO_EPISODES_PER_ROAD, None),
     "shared-rings": Variant("residual", "shared-rings", TWO_EPISODES_PER_ROAD, None),

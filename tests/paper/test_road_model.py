@@ -15,14 +15,13 @@ def test_returns_are_compared_after_multiples_of_the_steps(tmp_path: Path) -> No
     curves = dict(zip(compared_variants("best"), (modelled, few, double, many), strict=True))
     (tmp_path / "curves.json").write_text(json.dumps({"ring": curves}))
     table = road_model_study("ring", "best").tables["efficiency"](tmp_path).set_index("")
-    assert table.loc["ours, few steps and road model", "750,000"] == "2125"
-    assert table.loc["ours, few steps", "1,500,000"] == "–"
-    assert table.loc["ours, all steps", "380,000"] == "–"  # before the first validation
-    assert table.loc["with the model, difference to “ours, few steps” after as many", "380,000"] == "+31"
-    assert table.loc["with the model, difference to “ours, double steps” after 2 times as many", "750,000"] == "+26"
-    assert table.loc["with the model, difference to “ours, all steps” after 3 times as many", "750,000"].startswith(
-        "+7"
-    )
+    assert table.loc["unjam residual, few steps and road model", "750,000"] == "2125"
+    assert table.loc["unjam residual, few steps", "1,500,000"] == "–"
+    assert table.loc["unjam residual, all steps", "380,000"] == "–"  # before the first validation
+    prefix = "with the model, difference to “unjam residual"
+    assert table.loc[f"{prefix}, few steps” after as many", "380,000"] == "+31"
+    assert table.loc[f"{prefix}, double steps” after 2 times as many", "750,000"] == "+26"
+    assert table.loc[f"{prefix}, all steps” after 3 times as many", "750,000"].startswith("+7")
 
 
 def test_on_the_on_ramp_both_sizes_of_iterations_are_compared_with_the_model(tmp_path: Path) -> None:
@@ -37,5 +36,5 @@ def test_on_the_on_ramp_both_sizes_of_iterations_are_compared_with_the_model(tmp
     differences = table["28,800"].tail(6)
     assert list(differences) == ["+310", "+210", "+170", "+260", "+160", "+110"]
     assert differences.index[5] == (
-        "with the model, difference to “ours, few steps in small iterations” after 3 times as many"
+        "with the model, difference to “unjam residual, few steps in small iterations” after 3 times as many"
     )

@@ -89,6 +89,8 @@ def test_targets_and_packages_of_the_readme_exist() -> None:
     targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     others = [words for words in COMMANDS if words[0] != "unjam"]
+    assert others.pop(0)[:2] == ["git", "clone"]
+    assert others.pop(0) == ["cd", "unjam"]
     assert [words[0] for words in others].count("make") == 2
     for program, target, *arguments in others:
         if program == "make":
@@ -98,6 +100,10 @@ def test_targets_and_packages_of_the_readme_exist() -> None:
             named = re.fullmatch(r"\.(?:\[(\w+)\])?", arguments[0])
             assert named is not None
             assert named[1] is None or named[1] in extras
+
+
+def test_the_readme_has_at_most_600_words_with_its_commands() -> None:
+    assert len(README.split()) <= 600
 
 
 @pytest.mark.long
