@@ -27,15 +27,12 @@ from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.results_file import read_part
 from unjam_paper.study import NO_VALUE_TEXT, Study, Table
 
-CANDIDATES, CANDIDATE_SEEDS = 60, 3
-"""number of candidates, and of episodes of each"""
-FINAL_SEEDS = 20
-"""number of episodes with the best candidate and each simulation step"""
+CANDIDATES, CANDIDATE_SEEDS, FINAL_SEEDS = 60, 3, 20
+"""number of candidates, of episodes of each, and of episodes with the best one and each simulation step"""
 SIMULATION_STEPS = (0.5, 0.25)
 """[s]"""
 TRUCK_SHARE = 0.1
 CANDIDATES_PART, BEST_PART = "candidates", "best"
-
 CAPACITY_ROAD: dict[str, Any] = {
     "length": 4000.0,
     "ramps": [{"position": 3000.0, "inflow": 700.0, "off_peak_inflow": 250.0}],
@@ -162,20 +159,15 @@ def capacity_road(settings: Mapping[str, Any]) -> Motorway:
 def measure_traffic_candidate(number: int, workers: int) -> list[dict[str, Any]]:
     """Return the settings of a candidate with the facts of its episodes, as a list of one row."""
     settings = make_candidate(number)
-    return [{"settings": settings, "episodes": measure_facts(settings, {}, tuning_seeds(CANDIDATE_SEEDS), workers)}]
+    episodes = measure_scenario(capacity_road(settings), tuning_seeds(CANDIDATE_SEEDS), workers)
+    return [{"settings": settings, "episodes": episodes}]
 
 
 def measure_step(settings: Mapping[str, Any], step: float, workers: int) -> dict[str, Table]:
     """Return the facts of human traffic on test seeds with a simulation step [s], and a control step of 1 s."""
     changes = {"simulation_step": step, "steps_per_control_step": round(1.0 / step)}
-    return {"episodes": measure_facts(settings, changes, held_out_seeds(FINAL_SEEDS), workers)}
-
-
-def measure_facts(
-    settings: Mapping[str, Any], changes: Mapping[str, Any], seeds: Sequence[tuple[int, ...]], workers: int
-) -> Table:
-    """Return the facts of human traffic with these settings on the road with rising demand, one row for each seed."""
-    return measure_scenario(capacity_road({**settings, **changes}), seeds, workers)
+    road = capacity_road({**settings, **changes})
+    return {"episodes": measure_scenario(road, held_out_seeds(FINAL_SEEDS), workers)}
 
 
 def measure_scenario(scenario: Motorway, seeds: Sequence[tuple[int, ...]], workers: int) -> Table:
@@ -184,11 +176,8 @@ def measure_scenario(scenario: Motorway, seeds: Sequence[tuple[int, ...]], worke
     def facts_row(number: int, episode: Episode) -> dict[str, Any]:
         row = measure(episode)
         raise_failure([row])
-        return {
-            **asdict(measure_traffic(episode, scenario, ramp_number=-1)),
-            "delay": row["delay"],
-            "status": row["status"],
-        }
+        facts = asdict(measure_traffic(episode, scenario, ramp_number=-1))
+        return {**facts, "delay": row["delay"], "status": row["status"]}
 
     with WorkerPool(workers) as pool:
         return pool.run_and_map([EpisodeTask(scenario, Human(), seed) for seed in seeds], facts_row)
@@ -255,9 +244,9 @@ def _candidate_row(candidate: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def effects_table(folder: Path) -> pd.DataFrame:
-    """Return the change of each fact with each setting, by linear regression over the candidates but the first.
+    """Return the change of each fact per standard deviation of each setting, by regression over all candidates but one.
 
-    A change is that of one standard deviation of the setting among the candidates.
+    The first one is left out.
     """
     candidates = read_part(folder, CANDIDATES_PART)[1:]
     columns = {name: np.array([setting(each["settings"]) for each in candidates]) for name, setting in FACTORS.items()}

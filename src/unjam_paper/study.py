@@ -280,6 +280,14 @@ class DriverComparison:
         return next((reason or NO_VALUE_TEXT for reason in reasons), "yes")
 
 
+def group_rows(rows: Table, name: str) -> dict[Any, Table]:
+    """Return the rows by the value of an entry."""
+    groups: dict[Any, Table] = {}
+    for row in rows:
+        groups.setdefault(row[name], []).append(row)
+    return groups
+
+
 def mean_text(values: Floats, digits: int) -> str:
     """Return the mean of independent values with its 95 % CI."""
     return str(estimate_cell(estimate(values.ravel().tolist()), digits))
