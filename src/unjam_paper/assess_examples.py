@@ -75,7 +75,6 @@ def write_grid(folder: Path) -> Path:
 
 
 def _route(nodes: Sequence[tuple[int, int]]) -> str:
-    """Return the edges between successive nodes of the grid."""
     return " ".join(f"{x}{y}to{to_x}{to_y}" for (x, y), (to_x, to_y) in pairwise(nodes))
 
 
@@ -149,10 +148,9 @@ def assess_example(name: str, rate: float, max_episodes: int, precision: float, 
 
 
 def driver_rows(assessment: Assessment) -> list[dict[str, Any]]:
-    """Return a row for the human baseline, for ACC vehicles and for the controller.
+    """Return a row for the human baseline, for ACC vehicles and for the controller, with paired differences.
 
-    Differences are paired, with 95 % CI: `difference` to the human baseline and `difference_to_acc` [s],
-    `flow_difference` to the human baseline [veh/h].
+    `difference` and `flow_difference` are to the human baseline, `difference_to_acc` is to ACC vehicles [s, veh/h].
     """
     baseline = assessment.document["baseline"]
     time, flow = baseline["travel_time"]["mean"], baseline["outflow_veh_per_h"]["mean"]

@@ -32,10 +32,9 @@ FUEL_DRIVERS: dict[str, tuple[str, ...]] = {
     "ring-jammed": (HUMAN_LABEL, "pi", "unjam:best", "unjam:ring-jammed-best"),
     "figure-eight": (HUMAN_LABEL, "pi", "unjam:best", "unjam:figure-eight-best"),
 }
-FUEL_SEEDS = 20
+FUEL_SEEDS, SECONDS_PER_HOUR = 20, 3600.0
 IDLE_SPEED = 0.001
 """speed below which an engine counts as idle [m/s]"""
-SECONDS_PER_HOUR = 3600.0
 
 
 def idle_rate(episode: Episode) -> float:

@@ -95,7 +95,6 @@ def _loss(speed: Tensor, ahead: Tensor, is_counted: Tensor, step: float, limits:
 
 
 def _interpolation(count: int, knot_steps: int) -> Tensor:
-    """Return the matrix that interpolates `count` values linearly from those at every `knot_steps`-th of them."""
     numbers, knots = np.arange(count) / knot_steps, np.arange((count - 1) // knot_steps + 1)
     return torch.tensor(np.maximum(1.0 - np.abs(numbers[:, None] - knots), 0.0))
 

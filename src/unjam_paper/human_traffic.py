@@ -1,8 +1,7 @@
 """Human traffic on a motorway that matches facts: a search over how humans drive, and the comparison with the facts.
 
-Each candidate is a set of settings of the scenario. It drives on a road with one on-ramp, with a demand that rises
-until traffic breaks down and a jam has formed, and is compared with empirical targets. The candidate with the smallest
-deviation then drives on test seeds, with two simulation steps.
+Each candidate, a set of settings, drives on a road with one on-ramp whose demand rises until a jam has formed. That
+with the smallest deviation from empirical targets then drives on test seeds, with two simulation steps.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -221,7 +220,7 @@ def facts_table(folder: Path) -> pd.DataFrame:
 def traffic_candidates_table(folder: Path) -> pd.DataFrame:
     """Return the settings of all candidates and their facts, the smallest deviation first."""
     candidates = sorted(read_part(folder, CANDIDATES_PART), key=lambda each: total_deviation(each["episodes"]))
-    return pd.DataFrame([_candidate_row(each) for each in candidates])
+    return pd.DataFrame(map(_candidate_row, candidates))
 
 
 def _candidate_row(candidate: Mapping[str, Any]) -> dict[str, Any]:

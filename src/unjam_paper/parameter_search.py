@@ -49,21 +49,16 @@ class RowScores(NamedTuple):
     """[s], while the CAV is faster than 1 m/s"""
 
 
-def with_parameter_rows(driver: Driver, parameters: Mapping[str, Floats], roads: int) -> Driver:
-    """Return a driver with one value of each parameter for each candidate, every one of them on `roads` roads."""
-    made = copy(driver)
-    for name, values in parameters.items():
-        object.__setattr__(made, name, np.repeat(values, roads))
-    return made
-
-
 def measure_candidates(
     scenarios: Sequence[Recorded], driver: Driver, parameters: Mapping[str, Floats] | None = None
 ) -> RowScores:
     """Return the scores of a driver with each set of parameters; without them, of the driver itself."""
     roads, candidates = len(scenarios), len(next(iter(parameters.values()))) if parameters else 1
     world = RecordedBatch(list(scenarios) * candidates, [(0,)] * (roads * candidates), keep_record=False)
-    loop = start_batch_drive(world, with_parameter_rows(driver, parameters, roads) if parameters else driver)
+    driver = copy(driver)
+    for name, values in (parameters or {}).items():
+        object.__setattr__(driver, name, np.repeat(values, roads))
+    loop = start_batch_drive(world, driver)
     step, counted = scenarios[0].control_step, 1 + scenarios[0].vehicle_kinds[::-1].index("cav")
     before = world.speeds[:counted]
     totals = np.zeros((4, roads * candidates))
@@ -100,22 +95,17 @@ def search_parameters(
     best: dict[str, Any] = {"score": np.inf}
     history = list[dict[str, Any]]()
     for generation in range(budget.generations):
-        if generation == 0:
-            points = generator.random((budget.size, len(space)))
-        else:
-            points = np.clip(mean + spread * generator.standard_normal((budget.size, len(space))), 0.0, 1.0)
-        parameters = {
-            name: _scale(points[:, column], distribution) for column, (name, distribution) in enumerate(space.items())
-        }
+        draw = generator.standard_normal if generation else generator.random
+        points = draw((budget.size, len(space)))
+        if generation:
+            points = np.clip(mean + spread * points, 0.0, 1.0)
+        parameters = {name: _scale(column, space[name]) for name, column in zip(space, points.T, strict=True)}
         scores = measure_candidates(scenarios, driver, parameters)
         fuel = 100.0 * (scores.fuel / human.fuel - 1.0).mean(1)
         mean_gap, max_gap, time_gap = scores.mean_gap.mean(1), scores.max_gap.max(1), scores.min_time_gap.min(1)
-        total = (
-            fuel
-            + MEAN_GAP_PRICE * np.maximum(mean_gap - LIMITS.largest_mean_gap + MARGIN, 0.0)
-            + MAX_GAP_PRICE * np.maximum(max_gap - LIMITS.largest_gap + MARGIN, 0.0)
-            + TIME_GAP_PRICE * np.maximum(LIMITS.time_gap - time_gap, 0.0)
-        )
+        total = fuel + MEAN_GAP_PRICE * np.maximum(mean_gap - LIMITS.largest_mean_gap + MARGIN, 0.0)
+        total = total + MAX_GAP_PRICE * np.maximum(max_gap - LIMITS.largest_gap + MARGIN, 0.0)
+        total = total + TIME_GAP_PRICE * np.maximum(LIMITS.time_gap - time_gap, 0.0)
         order = np.argsort(total)
         elite = points[order[: round(ELITE_SHARE * budget.size)]]
         kept = KEPT_SHARE if generation else 0.0

@@ -83,7 +83,9 @@ TRANSFER_VARIANTS, TRANSFER_SOURCE, TRANSFER_EPISODES = ("proposed", "ours"), "r
 TRANSFER_ROADS: dict[str, dict[str, Any]] = {
     **{f"{count} vehicles": STUDY_ROADS[road] for count, road in ((5, "ring-5"), (11, "ring-11"), (22, "ring"))},
     "44 vehicles on 520 m": {
-        **{"scenario": "ring", "scenario_options.vehicles": 44, "scenario_options.length": [520, 520]}
+        **STUDY_ROADS["ring"],
+        "scenario_options.vehicles": 44,
+        "scenario_options.length": [520, 520],
     },
 }
 
@@ -95,26 +97,27 @@ def condition_rows(
 
     `controllers` are the trained controller and the tuned expert.
     """
-    names = dict(zip((HUMAN_LABEL, TUNED_EXPERT, TRAINED_LABEL), (HUMAN_LABEL, *reversed(controllers)), strict=True))
+    trained, tuned = controllers
+    names = {HUMAN_LABEL: HUMAN_LABEL, TUNED_EXPERT: tuned, TRAINED_LABEL: trained}
     options = {f"scenario_options.{key}": value for key, value in changes.items() if key != "impairments"}
     scenario = load_config(changes={**STUDY_ROADS[road], **options}).make_scenario()
     drivers = {label: partial(_impaired_driver, name, changes.get("impairments", {})) for label, name in names.items()}
     found = evaluate_drivers(scenario, drivers, episodes, workers)
-    rows: Table = []
-    for label, own in found.items():
-        row = {"road": road, "condition": condition, "driver": label}
-        row |= {"feasibility": overall_feasibility(own, found[HUMAN_LABEL])}
-        row |= estimate_metrics(own, ROBUSTNESS_METRICS)
-        gain = paired_difference(own, found[TUNED_EXPERT], "mean_speed")
-        rows.append({**row, "speed_gain_over_expert": asdict(gain)})
-    return rows
+    return [
+        {
+            **{"road": road, "condition": condition, "driver": label},
+            **{"feasibility": overall_feasibility(own, found[HUMAN_LABEL])},
+            **estimate_metrics(own, ROBUSTNESS_METRICS),
+            "speed_gain_over_expert": asdict(paired_difference(own, found[TUNED_EXPERT], "mean_speed")),
+        }
+        for label, own in found.items()
+    ]
 
 
 def _impaired_driver(name: str, impairments: Mapping[str, float], scenario: Scenario) -> Driver:
-    driver = make_driver(name, scenario.control_step)
-    if driver.is_native or not impairments:
-        return driver
-    return ImpairedDriver(driver, **impairments, time_step=scenario.control_step)
+    driver, step = make_driver(name, scenario.control_step), scenario.control_step
+    is_exact = driver.is_native or not impairments
+    return driver if is_exact else ImpairedDriver(driver, **impairments, time_step=step)
 
 
 def _robustness_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
@@ -171,14 +174,14 @@ def _figure_10_study(title: str, roads: tuple[str, ...]) -> Study:
 
 def _transfer_table(folder: Path) -> pd.DataFrame:
     """Return the mean speed by driver and traffic: the mean and the range over trainings."""
+
+    def mean_and_range(values: pd.Series) -> str:
+        return interval_text(asdict(Estimate(values.mean(), nan, nan, len(values), values.min(), values.max())), 2)
+
     rows = pd.json_normalize(read_part(folder, "transfer"))
     rows["trained as"] = rows["driver"].str.rstrip(" 0123456789")
-    speeds = rows.pivot_table("mean_speed.mean", "road", "trained as", _mean_and_range, sort=False)
+    speeds = rows.pivot_table("mean_speed.mean", "road", "trained as", mean_and_range, sort=False)
     return speeds.rename_axis(index="", columns=None).reset_index()
-
-
-def _mean_and_range(values: pd.Series) -> str:
-    return interval_text(asdict(Estimate(values.mean(), nan, nan, len(values), values.min(), values.max())), 2)
 
 
 ROBUSTNESS = Study(

@@ -175,10 +175,7 @@ class Study:
     """figures of its page by name, made from its results"""
 
     def run(self, study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-        """Measure the parts that have no current results, and write everything into the study's folder.
-
-        Parts may follow from the results of others: `make_parts` is asked again until it names no more.
-        """
+        """Measure parts without current results until there are no more, and write everything into `folder`."""
         parts: dict[str, StudyPart] = {}
         while (planned := self.make_parts(study_folder, seeds)) != parts:
             parts = planned
@@ -220,10 +217,7 @@ def evaluate_drivers(
 def evaluate_metrics(
     scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, metrics: Sequence[str], workers: int
 ) -> dict[str, Any]:
-    """Return the verdict on each driver and these metrics of its episodes on test seeds.
-
-    The human baseline, if it is one of the drivers, is `human`.
-    """
+    """Return the verdict on each driver, relative to `human`, and these metrics of its episodes on test seeds."""
     rows = evaluate_drivers(scenario, drivers, seeds, workers)
     verdicts = feasibility_by_driver(rows)
     return {
@@ -239,10 +233,7 @@ class DriverComparison:
     roads: Sequence[Mapping[str, Any]]
 
     def groups(self, trainings: Mapping[str, str]) -> dict[str, list[str]]:
-        """Return the drivers of each row of a table: all trainings `PREFIX SEED` in one, and the others alone.
-
-        `trainings` has the names of the rows of trainings by prefix.
-        """
+        """Return the drivers of each row of a table: all `trainings`, PREFIX SEED, in one with a name, others alone."""
         groups = {label: [label] for label in self.roads[0] if label.rpartition(" ")[0] not in trainings}
         for prefix, name in trainings.items():
             own = [label for label in self.roads[0] if label.rpartition(" ")[0] == prefix]

@@ -91,10 +91,7 @@ class BenchmarkResult:
         return found
 
     def mean_gain(self, part: str = "all roads") -> Estimate:
-        """Return the mean gain over the finished roads of one of `PARTS`, with its 95 % CI over roads and seeds.
-
-        Roads and seeds are crossed random effects (`estimate_crossed`). Raise `InputError` for an unknown part.
-        """
+        """Return the mean gain over the finished roads of one of `PARTS`, with its 95 % CI over roads and seeds."""
         if not isinstance(part, str) or part not in PARTS:
             raise unknown_name("part", part, PARTS)
         own = [seeds for name, (_, seeds, _) in self._gains.items() if FAMILY[name].part in PARTS[part]]
@@ -115,10 +112,7 @@ class BenchmarkResult:
         return {name: each.mean for name, (each, *_) in self._gains.items()}
 
     def road_rows(self) -> list[dict[str, Any]]:
-        """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend.
-
-        If all roads are finished, the means follow.
-        """
+        """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend; then the means."""
         rows: list[dict[str, Any]] = [
             {"road": name, "part": FAMILY[name].part, **_interval(each), "feasible": verdict}
             | {"backend": self.roads[name].backend, "expert": references()[name]["expert"]}
@@ -167,7 +161,6 @@ def to_columns(rows: gain.EpisodeRows) -> dict[str, list[Any]]:
 
 
 def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
-    """Return the rows of stored columns."""
     seeds, values = iter(FAMILY_TEST_SEEDS), zip(*columns.values(), strict=True)
     rows = (dict(zip(columns, row, strict=True)) for row in values)
     return [{"seed": next(seeds)} | {name: nan if each is None else each for name, each in row.items()} for row in rows]

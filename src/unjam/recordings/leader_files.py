@@ -76,11 +76,9 @@ def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, 
 
 
 def _follower_table(frame: pd.DataFrame, column: str, stem: str) -> pd.DataFrame:
-    """Return a table of speeds as one of trajectories with each recorded vehicle as the leader.
-
-    A column of vehicles without equal values has the numbers of the rows.
-    """
+    """Return a table of speeds as one of trajectories with each recorded vehicle as the leader."""
     names = [str(name) for name in frame.columns if alphanumeric(name) in VEHICLE_NAMES]
+    # A column without equal values has the numbers of the rows.
     names = [name for name in names if 1 < len(frame[[name]].drop_duplicates()) < len(frame)]
     vehicles = stem + "-" + join_row_values(frame, tuple(names)) if names else stem
     table = to_numeric(frame.loc[:, ["line", "time", column]], ["time", column])

@@ -23,10 +23,8 @@ COLUMN_ALIASES = {"t": "time", "v_foll": "speed", "v_lead": "leader_speed"}
 """alternative column names of plain tables"""
 VALUE_LIMITS = {"speed": (0.0, 70.0), "leader_speed": (0.0, 70.0), "gap": (0.0, 1000.0)}
 """smallest and largest allowed value of a column [m/s, m/s, m]; other values are errors, or have another unit"""
-TIME_STEP_TOLERANCE = 0.01
-"""largest relative difference between intervals of rows that are equal, and between time steps that are"""
-MISSING_ROW_INTERVAL = 1.5
-"""shortest interval in which a row is missing, relative to the usual one"""
+TIME_STEP_TOLERANCE, MISSING_ROW_INTERVAL = 0.01, 1.5
+"""largest relative difference between equal intervals, and smallest ratio to the usual one where a row is missing"""
 MAX_TIME_STEP = 1.5
 """longest time between two samples [s]: waves of a few seconds must be visible"""
 MIN_TRAJECTORY_SAMPLES = 3
@@ -117,7 +115,6 @@ def trajectories_of_table(frame: pd.DataFrame, path: Path, options: ReadOptions,
 
 
 def _convert_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of a plain table with `TABLE_COLUMNS` and any of `OPTIONAL_COLUMNS`."""
     frame = frame.rename(columns={other: name for other, name in COLUMN_ALIASES.items() if name not in frame})
     _check_columns(frame, TABLE_COLUMNS, path)
     if options.driver_columns and "driver" not in frame:
@@ -144,10 +141,7 @@ def _convert_reconstructed(frame: pd.DataFrame, path: Path, options: ReadOptions
 
 
 def _convert_highd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of a highD file.
-
-    Its x is the left end of a vehicle, and decreases over time for one direction of travel.
-    """
+    """Return the trajectories of a highD file: x is the left end of a vehicle, and decreases in one direction."""
     vehicles = _select_columns(frame, HIGHD_COLUMNS, VEHICLE_COLUMNS, path)
     # The direction is that of the whole lane, because a standing vehicle has none.
     is_forward = vehicles.groupby("lane")["speed"].transform("sum").to_numpy() >= 0
@@ -157,10 +151,7 @@ def _convert_highd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Rea
 
 
 def _convert_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of SUMO's FCD output: one for each combination of vehicle and leader.
-
-    Both may change their edge or lane meanwhile.
-    """
+    """Return the trajectories of SUMO's FCD output: one for each combination of vehicle and leader."""
     key = ("vehicle_id", "vehicle_leaderID")
     vehicles = _select_columns(frame, FCD_COLUMNS, TABLE_COLUMNS[1:], path)
     _check_columns(frame, key, path)
@@ -171,7 +162,6 @@ def _convert_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadR
 
 
 def _trajectories_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of a table with `VEHICLE_COLUMNS`, in which each row names the number of the leader."""
     low, high = MEDIAN_LENGTH_LIMITS
     median = float(np.nanmedian(vehicles["length"]))
     if not low <= median <= high:
@@ -197,10 +187,7 @@ def _trajectories_from_vehicles(vehicles: pd.DataFrame, path: Path, options: Rea
 
 
 def _reused_number_suffix(vehicles: pd.DataFrame) -> pd.Series:
-    """Return a suffix that distinguishes vehicles with the same number: "" for the first one, "2" for the second.
-
-    The vehicle numbers of NGSIM restart every 15 minutes.
-    """
+    """Return "" for the first vehicle with a number, "2" for the second: those of NGSIM restart every 15 minutes."""
     ordered = vehicles.sort_values(by="time", kind="stable")
     key = [ordered["site"], ordered["vehicle"]]
     is_new = ordered["time"].groupby(key, dropna=False).diff() > MAX_VEHICLE_ABSENCE
@@ -271,10 +258,7 @@ def _check_columns(frame: pd.DataFrame, required: Iterable[str], path: Path) -> 
 
 
 def join_row_values(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
-    """Return for each row the values of these columns, joined by hyphens.
-
-    Rows with equal values are joined only once, because a file may have millions of rows.
-    """
+    """Return for each row the values of these columns, joined by hyphens, equal ones only once for speed."""
     group = frame.groupby(list(columns), sort=False, observed=True, dropna=False).ngroup()
     first = frame[list(columns)].loc[~group.duplicated()]
     names = ["-".join(map(str, row)) for row in first.itertuples(index=False)]
@@ -282,9 +266,9 @@ def join_row_values(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
 
 
 def to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
-    """Return the table with these columns as numbers; other values become NaN, which makes their rows bad.
+    """Return the table with these columns as numbers, also with commas between thousands; other values become NaN.
 
-    A number may have commas between thousands. The column `not_numeric` has the first other value of each row.
+    The column `not_numeric` has the first other value of each row.
     """
     columns, not_numeric = dict[str, pd.Series](), pd.Series("", frame.index)
     for name in names:
@@ -329,8 +313,7 @@ def split_trajectories(
     has_missing = [each > MISSING_ROW_INTERVAL * np.median(each) for each in intervals]
     regular = [each[~missing] for each, missing in zip(intervals, has_missing, strict=True)]
     steps = _common_time_steps([float(each.mean()) for each in regular], [float(each.sum()) for each in regular])
-    trajectories, part_counts, short_count = list[FollowingTrajectory](), Counter[str](), len(good)
-    longest = 0.0
+    trajectories, part_counts, short_count, longest = list[FollowingTrajectory](), Counter[str](), len(good), 0.0
     for rows, missing, step in zip(groups, has_missing, steps, strict=True):
         for first, last in pairwise([0, *(np.flatnonzero(missing) + 1).tolist(), len(rows)]):
             seconds = (last - first - 1) * step
@@ -400,10 +383,7 @@ def _common_time_steps(steps: Sequence[float], seconds: Sequence[float]) -> list
 
 
 def _at_even_times(rows: pd.DataFrame, step: float) -> list[Floats]:
-    """Return speed, leader speed and gap of rows at equal intervals.
-
-    Rows at equal intervals with rounded time stamps are unchanged; between others values are interpolated.
-    """
+    """Return speed, leader speed and gap of rows at equal intervals, interpolated unless only times are rounded."""
     times, *values = (rows[name].to_numpy(np.float64) for name in TABLE_COLUMNS[1:])
     times = times - times[0]
     if np.all(np.abs(np.diff(times) - step) <= TIME_STEP_TOLERANCE * step):
@@ -418,7 +398,6 @@ def _at_even_times(rows: pd.DataFrame, step: float) -> list[Floats]:
 
 
 def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:
-    """Return whether each row is bad, shape (rows,), and the first reason of each line with bad rows."""
     reasons: dict[int, str] = {}
     is_bad = np.zeros(len(frame), bool)
     for name in TABLE_COLUMNS[1:]:
