@@ -1,7 +1,4 @@
-"""Time until traffic settles after a change: a wave arrives, human drivers change, or a CAV switches off.
-
-Rings are simulated in batches, which equal SUMO except for rounding. Drivers are not informed of the change.
-"""
+"""Time until traffic settles after a change that drivers are not informed of, on rings in batches."""
 
 from dataclasses import replace
 from functools import partial

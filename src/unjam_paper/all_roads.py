@@ -1,8 +1,6 @@
 """Gain of drivers on the training roads and the unseen roads of the family, and of joint trainings on many roads.
 
-On each road a gain of 0 is the human baseline, and 1 is the best tuned expert of this road, which is selected on other
-seeds than the test seeds. In the studies of joint trainings, rings are simulated in batches, which equal SUMO except
-for rounding.
+On each road a gain of 0 is the human baseline, and 1 is its best tuned expert, selected on other seeds.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

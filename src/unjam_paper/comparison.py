@@ -262,10 +262,7 @@ FIGURE_5 = Study(
 
 
 def paper_exact_study(road: str) -> Study:
-    """Return the study of the exact settings of the paper on a road (preset `paper-exact`).
-
-    All steps are made; the iteration at which the convergence rule of the paper ends the training is computed.
-    """
+    """Return the study of the exact settings of the paper; where its convergence rule ends a training is computed."""
     suffix = {"merge": "-million", "ring": "-filtered", "figure-eight": "-filtered"}.get(road, "")
     variants = (f"trpo-exact{suffix}", f"proposed-exact{suffix}")
     study = comparison_study(f"exact settings of the paper, on {road}", variants, road)

@@ -73,10 +73,7 @@ def evaluate_harm(rows: Sequence[dict[str, Any]], acc_rows: Sequence[dict[str, A
 
 
 def has_breakdown(episode: Episode, road: OpenTestRoad) -> bool:
-    """Return whether a section is slow for `BREAKDOWN_SECONDS` while vehicles flow through it.
-
-    It is never so on a road with signals, where queues at red lights would count.
-    """
+    """Return whether a section is slow for `BREAKDOWN_SECONDS` while vehicles flow through it; never with signals."""
     if road.has_signals:
         return False
     snapshot_step = episode.snapshot_stride * episode.control_step

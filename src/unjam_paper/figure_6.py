@@ -1,9 +1,7 @@
 """Fig. 6 of the paper: whether a car-following model helps a network to learn car following, on synthetic data.
 
 A network alone (`vanilla`) and one that learns the residual of the paper's IDM (`knowledge`) are trained on shares of
-the four-regime data set, and tested on the same unseen trajectories. The paper does not say which driver generated its
-data. Here it is either a driver with other parameters than the paper's IDM (`other`), or the paper's IDM (`same`), so
-that the base is the truth.
+the four-regime data set, of an IDM with other parameters (`other`), or of the paper's IDM itself (`same`).
 """
 
 from collections.abc import Sequence
@@ -125,8 +123,7 @@ def split_rows(driver: str, split: SplitKind) -> DataSplit:
 def measure_fit(fit: FourRegimeFit, workers: int = 1) -> dict[str, Any]:
     """Return the errors of a fit on the test rows [m/s2], and its losses.
 
-    `error` is the error to the data, noise included; `driver_error` is the error to the mean acceleration of the driver
-    that generated them; `noise` is the error of that mean to the data.
+    `error` is that to the data, `driver_error` that to their driver's mean acceleration, `noise` that of this mean.
     """
     started = perf_counter()
     rows = split_rows(fit.driver, fit.split)

@@ -45,10 +45,7 @@ class PlanLimits:
 
 
 def plan_speeds(leader_speeds: Sequence[Floats], start_gaps: Sequence[float], step: float, limits: PlanLimits) -> Any:
-    """Return the planned speeds behind each of n leaders in all steps [m/s], arrays of their shapes (T,).
-
-    All vehicles start, and end, with the speed of their leader.
-    """
+    """Return the planned speeds behind each of n leaders, with their speeds at both ends [m/s], shapes (T,)."""
     counts, knot_steps = [len(each) for each in leader_speeds], round(KNOT_SECONDS / step)
     longest = knot_steps * (max(counts) // knot_steps + 1) + 1
     padded = np.stack([np.pad(each, (0, longest - len(each)), "edge") for each in leader_speeds], 1)

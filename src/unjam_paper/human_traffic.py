@@ -15,16 +15,14 @@ import pandas as pd
 
 from unjam.drivers import Human
 from unjam.measures.metric_table import estimate_cell
-from unjam.measures.metrics import measure
 from unjam.measures.statistics import estimate
 from unjam.measures.traffic_facts import TrafficFacts, measure_traffic
 from unjam.scenarios import Motorway, make_scenario
 from unjam.seeds import held_out_seeds, tuning_seeds
-from unjam.training.evaluate import raise_failure
 from unjam.worlds.record import Episode
-from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.results_file import read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, Table
+from unjam_paper.study import NO_VALUE_TEXT, Study, Table, measure_episodes
 
 CANDIDATES, CANDIDATE_SEEDS, FINAL_SEEDS = 60, 3, 20
 """number of candidates, of episodes of each, and of episodes with the best one and each simulation step"""
@@ -172,14 +170,11 @@ def measure_step(settings: Mapping[str, Any], step: float, workers: int) -> dict
 def measure_scenario(scenario: Motorway, seeds: Sequence[tuple[int, ...]], workers: int) -> Table:
     """Return the facts at the last ramp of a motorway with human drivers only, one row for each seed."""
 
-    def facts_row(number: int, episode: Episode) -> dict[str, Any]:
-        row = measure(episode)
-        raise_failure([row])
+    def facts_row(number: int, episode: Episode, row: dict[str, Any]) -> dict[str, Any]:
         facts = asdict(measure_traffic(episode, scenario, ramp_number=-1))
         return {**facts, "delay": row["delay"], "status": row["status"]}
 
-    with WorkerPool(workers) as pool:
-        return pool.run_and_map([EpisodeTask(scenario, Human(), seed) for seed in seeds], facts_row)
+    return measure_episodes([EpisodeTask(scenario, Human(), seed) for seed in seeds], workers, facts_row)
 
 
 def mean_facts(rows: Table) -> dict[str, float]:
@@ -243,10 +238,7 @@ def _candidate_row(candidate: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def effects_table(folder: Path) -> pd.DataFrame:
-    """Return the change of each fact per standard deviation of each setting, by regression over all candidates but one.
-
-    The first one is left out.
-    """
+    """Return the change of each fact per standard deviation of each setting, by regression without candidate 0."""
     candidates = read_part(folder, CANDIDATES_PART)[1:]
     columns = {name: np.array([setting(each["settings"]) for each in candidates]) for name, setting in FACTORS.items()}
     standardized = np.array([(values - values.mean()) / values.std() for values in columns.values()])

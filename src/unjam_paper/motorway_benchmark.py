@@ -17,20 +17,18 @@ from unjam.controller import make_driver
 from unjam.measures.effect import FLOW_METRIC, TIME_METRIC
 from unjam.measures.feasibility import HARD_BRAKING_METRIC, overall_feasibility
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
-from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, estimate, linearized_ratio, pair_rows, regress, relative_difference
 from unjam.measures.traffic_facts import measure_traffic
 from unjam.reports.results import replace_null
 from unjam.scenarios import Motorway
 from unjam.seeds import held_out_seeds, tuning_seeds
-from unjam.training.evaluate import raise_failure
 from unjam.worlds.record import Episode
-from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.do_no_harm import HARM_METRICS
 from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF, EnsembleSetting
 from unjam_paper.motorway_methods import CANDIDATE_SEED, CANDIDATES_PER_METHOD, METHODS, Candidate
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, measure_episodes
 
 HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
 SENSING_PART, SENSITIVITY_PART, PACKAGED_PART = "sensing", "sensitivity", "packaged"
@@ -102,9 +100,7 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Table:
         for scenario, (_, candidate, _, seed) in zip(scenarios, jobs, strict=True)
     ]
 
-    def episode_row(number: int, episode: Episode) -> dict[str, Any]:
-        row = measure(episode)
-        raise_failure([row])
+    def episode_row(number: int, episode: Episode, row: dict[str, Any]) -> dict[str, Any]:
         setting, _, rate, _ = jobs[number]
         demand = episode.backlog[-1] + len(episode.vehicle_ids)
         return {
@@ -114,8 +110,7 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Table:
             "breakdown_time": measure_traffic(episode, scenarios[number], ramp_number=-1).breakdown_time,
         }
 
-    with WorkerPool(workers) as pool:
-        return pool.run_and_map(tasks, episode_row)
+    return measure_episodes(tasks, workers, episode_row)
 
 
 def measure_human(number: int, workers: int) -> Table:
@@ -274,10 +269,7 @@ def candidates_table(folder: Path) -> pd.DataFrame:
 
 
 def parameter_effects_table(folder: Path) -> pd.DataFrame:
-    """Return the change of the mean delay of human traffic per standard deviation of each parameter, by regression.
-
-    Over all episodes on settings with a breakdown, without the candidates with default parameters.
-    """
+    """Return the relative change of delay per standard deviation of each parameter, by regression over all episodes."""
     human = read_part(folder, HUMAN_PART)
     times = {
         number: float(np.mean([row[TIME_METRIC] for row in human if row["setting"] == number]))

@@ -1,7 +1,4 @@
-"""Search of a controller's parameters on recorded roads, where many candidates drive at once.
-
-The cross-entropy method: each generation is drawn around the best candidates of the last one.
-"""
+"""Search of a controller's parameters on recorded roads by the cross-entropy method; many candidates drive at once."""
 
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -86,10 +83,7 @@ def search_parameters(
     seed: int,
     budget: SearchBudget,
 ) -> list[dict[str, Any]]:
-    """Return the best candidate so far after each generation: its parameters, fuel relative to human drivers [%], gaps.
-
-    Scores count the fuel, and what exceeds the limits.
-    """
+    """Return the best candidate after each generation: its parameters, fuel relative to human drivers [%], gaps."""
     generator = np.random.default_rng(seed)
     mean, spread = np.full(len(space), 0.5), np.full(len(space), 0.35)
     best: dict[str, Any] = {"score": np.inf}

@@ -75,11 +75,7 @@ class StudyPlan:
 
 
 def make_plan(names: Sequence[str], seeds: int, study_folder: StudyFolder) -> StudyPlan:
-    """Return the work that remains.
-
-    Raises:
-        InputError: an unknown study, or the folder has such a training with other settings.
-    """
+    """Return the work that remains; `InputError` for an unknown study, or such a training with other settings."""
     studies = find_studies(names)
     runs = list(dict.fromkeys(run for study in studies.values() for run in study.make_runs(seeds)))
     for run in runs:
@@ -121,11 +117,8 @@ def run_plan(
 ) -> list[Path]:
     """Run what is missing, `workers` trainings at once, write the studies, and return their folders.
 
-    The results file of each study is written next to its folder. A stopped study is continued: trainings from their
-    last checkpoint. With `ray` they run on a cluster with a shared folder.
-
-    Raises:
-        UnjamError: a training failed; the others are finished.
+    The results file of each study is written next to its folder. A stopped study is continued, trainings from their
+    last checkpoint. With `ray` they run on a cluster with a shared folder. Raise `UnjamError` after all if one failed.
     """
     studies = plan.study_folder
     make_folder(studies.folder)

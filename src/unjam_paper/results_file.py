@@ -69,11 +69,7 @@ def collect_results(folder: Path) -> Path:
 
 
 def read_part(path: Path, name: str) -> Any:
-    """Return one part of a study, from its results file or from its working folder.
-
-    Raises:
-        KeyError, FileNotFoundError: there is no such part.
-    """
+    """Return one part of a study, from its results file or its folder; `KeyError` or `FileNotFoundError` without it."""
     if path.is_dir():
         return json.loads((path / f"{name}.json").read_text(encoding="utf-8"))
     return _by_rows(json.loads(path.read_text(encoding="utf-8"))[name])

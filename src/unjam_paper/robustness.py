@@ -1,7 +1,4 @@
-"""Controllers with roads, human drivers and sensors that differ from those of the training.
-
-Two studies: packaged controllers with single changes (`robustness`), and other numbers of vehicles (Figure 10).
-"""
+"""Controllers on roads, among humans or with sensors that differ from training, and other numbers of vehicles."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -93,10 +90,7 @@ TRANSFER_ROADS: dict[str, dict[str, Any]] = {
 def condition_rows(
     road: str, condition: str, changes: Mapping[str, Any], controllers: tuple[str, str], episodes: int, workers: int
 ) -> Table:
-    """Return a row for each driver under a condition: human baseline, tuned expert and trained controller.
-
-    `controllers` are the trained controller and the tuned expert.
-    """
+    """Return a row for the human baseline and for both `controllers`, the trained one and the tuned expert."""
     trained, tuned = controllers
     names = {HUMAN_LABEL: HUMAN_LABEL, TUNED_EXPERT: tuned, TRAINED_LABEL: trained}
     options = {f"scenario_options.{key}": value for key, value in changes.items() if key != "impairments"}

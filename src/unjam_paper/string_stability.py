@@ -1,7 +1,6 @@
-"""What string stability costs on rings: experts tuned with several limits on their string gain.
+"""What string stability costs on rings: experts of usual cars, tuned with several limits on their string gain.
 
-CAVs have the actuator of a usual car. Without a limit, controllers that calm a ring amplify oscillations that are
-slower than a lap and cannot arise there, but on a motorway.
+Without a limit, they amplify oscillations that are slower than a lap and cannot arise there, but on a motorway.
 """
 
 import tempfile

@@ -19,15 +19,16 @@ from unjam.files import atomic_write, make_folder
 from unjam.manifest import manifest, without_folders
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import estimate_cell, with_no_break_spaces
+from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, estimate, estimate_on_shared_seeds, estimate_over_trainings, format_ci
 from unjam.reports.results import EVALUATION_FILE, read_progress, read_rows
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig, load_config
-from unjam.training.evaluate import TRAINED_LABEL, evaluate, raise_failures
+from unjam.training.evaluate import TRAINED_LABEL, evaluate, raise_failure, raise_failures
 from unjam.training.run_folder import read_config
-from unjam.worlds.record import Floats
-from unjam.worlds.worker_pool import WorkerPool
+from unjam.worlds.record import Episode, Floats
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.results_file import CONTROLLERS, StudyPart, measure_parts, write_figure, write_part
 from unjam_paper.variants import VARIANTS
 
@@ -198,6 +199,20 @@ def write_manifest(folder: Path, **metadata: Any) -> None:
         about = json.loads(file.read_text(encoding="utf-8"))
         about["resumptions"] = [*about.get("resumptions", []), resumption]
     write_part(folder, "manifest", {**about, **metadata})
+
+
+def measure_episodes(
+    tasks: Sequence[EpisodeTask], workers: int, make_row: Callable[[int, Episode, dict[str, Any]], dict[str, Any]]
+) -> Table:
+    """Return a row for each task, made from its number, episode and metrics; raise the first failure."""
+
+    def measured_row(number: int, episode: Episode) -> dict[str, Any]:
+        metrics = measure(episode)
+        raise_failure([metrics])
+        return make_row(number, episode, metrics)
+
+    with WorkerPool(workers) as pool:
+        return pool.run_and_map(tasks, measured_row)
 
 
 def evaluate_drivers(

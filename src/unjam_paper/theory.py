@@ -1,7 +1,6 @@
 """Measurable quantities of the theorems of the paper, and the cost of training (Figure 8).
 
-Theorem A1 is about untrained policies, A2 about convergence, A3 about the model and its bound. The cost of all variants
-is measured side by side in one run.
+Theorem A1 is about untrained policies, A2 about convergence, A3 about the model and its bound.
 """
 
 import tempfile

@@ -1,8 +1,4 @@
-"""The policy of a file of Stable-Baselines3, without unpickling: only its JSON and its weights are read.
-
-`PPO.load` and its siblings unpickle parts of the file, which can run any code. Here these parts are ignored, and the
-network is rebuilt from the names of its weights.
-"""
+"""The policy of a file of Stable-Baselines3 from its JSON and its weights alone: unpickling can run any code."""
 
 import io
 import json

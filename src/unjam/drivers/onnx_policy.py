@@ -74,9 +74,7 @@ class OnnxPolicy:
         return values[:, 0] if len(tensor.shape or ()) == 1 else values
 
 
-@lru_cache(maxsize=16)
-def _cached_session(graph: bytes) -> Any:
-    return open_session(graph)
+_cached_session = lru_cache(maxsize=16)(open_session)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,7 @@
 """The safety filter, and the actuator of a vehicle with its delay and lag.
 
-The filter prevents contact and keeps the time gap above a minimum. It passes an acceleration if the vehicle can
-afterwards still stop behind a leader that brakes at the assumed maximum, and keep its time gap behind a leader that
-brakes hard; otherwise it brakes as hard as necessary.
-`docs/safety.md` states the assumptions and proves both properties for the discrete steps of the simulator.
+The filter passes an acceleration if the vehicle can afterwards still stop behind a leader that brakes at the assumed
+maximum, and keep its time gap behind one that brakes hard. `docs/safety.md` has the assumptions and the proof.
 """
 
 import sys

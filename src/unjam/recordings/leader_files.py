@@ -35,11 +35,7 @@ RARE_SHARE = 1e-3
 
 
 def read_leaders(path: Path) -> list[LeaderRecording]:
-    """Return the recordings in a file, which is read once: of tables with leaders, those of the leaders.
-
-    Raises:
-        InputError: the file is missing, has no speeds or implausible ones, or a row is bad.
-    """
+    """Return the recordings in a file, of leaders if it has some; `InputError` if it is missing or implausible."""
     return list(_read_leaders(path, file_stamp(path)))
 
 

@@ -97,12 +97,9 @@ class ReadResult:
 
 
 def read_trajectories(path: Path, format: str = "", options: ReadOptions | None = None) -> ReadResult:
-    """Return the trajectories of a file, see `tables.read_table`.
+    """Return the trajectories of a file in a format of `FILE_FORMATS`; empty: it is detected from the columns.
 
-    `format` is a name in `FILE_FORMATS`; empty: it is detected from the columns.
-
-    Raises:
-        InputError: the file is missing or has another format, its units are wrong, or a row is bad.
+    Raise `InputError` if the file is missing or has another format, its units are wrong, or a row is bad.
     """
     if format and format not in FILE_FORMATS:
         raise unknown_name("format", format, FILE_FORMATS)
@@ -293,10 +290,8 @@ def split_trajectories(
     """Return the trajectories of a table with the columns `line`, `TABLE_COLUMNS` and any of `OPTIONAL_COLUMNS`.
 
     A trajectory consists of rows of one pair, between which none is missing. Its time step is that of its pair. Rows
-    may be in any order. `skipped_rows` has the numbers of rows that were skipped before, by reason.
-
-    Raises:
-        InputError: a row is bad, or no trajectory remains.
+    may be in any order. `skipped_rows` has the numbers of rows that were skipped before, by reason. Raise `InputError`
+    if a row is bad, or no trajectory remains.
     """
     (is_bad, bad_rows), skipped_rows = _find_bad_rows(frame), skipped_rows or {}
     bad_count = int(np.sum(is_bad))

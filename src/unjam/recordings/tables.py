@@ -51,8 +51,7 @@ ALLOWED_FILES = "CSV with a line for each row, Parquet, or SUMO's FCD output"
 def read_table(path: Path) -> pd.DataFrame:
     """Return the table of a file with a column `line`; its `attrs` have the lines above the header, by first word.
 
-    Raises:
-        InputError: the file is missing or cannot be read, or is no table.
+    Raise `InputError` if the file is missing or cannot be read, or is no table.
     """
     if not path.is_file():
         raise InputError(f"data: {str(path)!r} does not exist")
