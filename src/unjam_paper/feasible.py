@@ -66,7 +66,6 @@ PACER_LONG_TUNED = (
 )
 """result of `unjam tune figure-eight --expert pacer --max-string-gain 0 --reward eq16 --steps 4860000`, without
 parameters that have no effect; with 600,000 steps it is `unjam:figure-eight-tuned`"""
-OTHER_ROAD_LABEL = "residual trained on the other road"
 PACER_TUNED_LABEL, PACER_GENTLE_LABEL = "pacer, tuned", "pacer, tuned, gentle"
 PACER_LONG_LABEL = "pacer, tuned, training budget"
 FEASIBILITY_STUDY_METRICS = (
@@ -150,10 +149,6 @@ class EvaluationRoad:
     """the return that the trainings maximize"""
 
 
-def _make_ring(warmup: int, length: int) -> Ring:
-    return Ring(length=(length, length), warmup=warmup)
-
-
 def _limit_leader(ring: Ring) -> Driver:
     return FollowerStopper(desired_speed=ring.limit_speed(ring.length[0]), gaps=(0.5, 1.0, 1.5), time_constant=3.0)
 
@@ -167,13 +162,13 @@ RING_DRIVERS: dict[str, DriverSource] = {
 FEASIBLE_ROADS = {
     "ring": EvaluationRoad(
         sizes=(220, 230, 240, 250, 260, 270),
-        make_scenario=partial(_make_ring, 0),
+        make_scenario=lambda length: Ring(length=(length, length), warmup=0),
         drivers=RING_DRIVERS | CEILING,
         baselines=(PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL),
     ),
     "ring-jammed": EvaluationRoad(
         sizes=(220, 230, 240, 250, 260, 270),
-        make_scenario=partial(_make_ring, LONG_WARM_UP),
+        make_scenario=lambda length: Ring(length=(length, length), warmup=LONG_WARM_UP),
         drivers={**RING_DRIVERS, GAP_PI_JAMMED_LONG_LABEL: GAP_PI_JAMMED_LONG_TUNED, **CEILING},
         baselines=(GAP_PI_LABEL, GAP_PI_JAMMED_LABEL, GAP_PI_JAMMED_LONG_LABEL),
     ),
@@ -197,7 +192,7 @@ def _feasible_parts(roads: Sequence[str], variant: str, study_folder: StudyFolde
         road, runs = FEASIBLE_ROADS[name], planned_runs([name], [variant], seeds)
         trained = {f"training {run.seed}": run for run in runs}
         for other in set(roads) - {name}:
-            trained[OTHER_ROAD_LABEL] = PlannedRun(other, variant, 0)
+            trained["residual trained on the other road"] = PlannedRun(other, variant, 0)
         drivers = road.drivers | {label: study_folder.run_folder(run) for label, run in trained.items()}
         for size in road.sizes:
             arguments = road.make_scenario(size), drivers, SEEDS_PER_SIZE, FEASIBILITY_STUDY_METRICS
@@ -306,10 +301,9 @@ def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
 
 def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     """Return the parts of the study `envelope`."""
-    closed = tuple(CONTROLLER_ROADS)
-    parts: dict[str, StudyPart] = {
-        f"{WORST_PART}/{driver}": (_certify_worst_cases, (driver, road)) for driver, road in CONTROLLER_ROADS.items()
-    }
+    closed, parts = tuple(CONTROLLER_ROADS), dict[str, StudyPart]()
+    for driver, road in CONTROLLER_ROADS.items():
+        parts[f"{WORST_PART}/{driver}"] = _certify_worst_cases, (driver, road)
     tests: tuple[tuple[str, Iterator[tuple[str, Scenario]], tuple[str, ...], int], ...] = (
         ("rings", envelope_rings(), closed, ENVELOPE_SEEDS),
         ("figure-eights", envelope_figure_eights(), closed, ENVELOPE_SEEDS),
@@ -321,8 +315,8 @@ def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart
     )
     for part, roads, controllers, count in tests:
         drivers = {driver: driver for driver in (HUMAN_LABEL, *controllers)}
-        for name, road in roads:
-            parts[f"{part}/{name}"] = evaluate_metrics, (road, drivers, count, ENVELOPE_METRICS)
+        for name, scenario in roads:
+            parts[f"{part}/{name}"] = evaluate_metrics, (scenario, drivers, count, ENVELOPE_METRICS)
     return parts
 
 

@@ -350,23 +350,20 @@ def drivers_table(part: str, folder: Path) -> pd.DataFrame:
     """Return fuel, gaps, lost time and flow of the drivers behind drives, compared with human drivers."""
     results = DriveResults(read_part(folder, part))
     tuned = next(label for label in results.groups() if label.partition(":")[0] == TUNED_METHOD)
-    return pd.DataFrame(_driver_row(results, label, own, tuned) for label, own in results.groups().items())
-
-
-def _driver_row(results: DriveResults, label: str, own: Table, tuned: str) -> dict[str, Any]:
-    reasons = [row["feasibility"] for row in own if row["feasibility"] and row["feasibility"] != FEASIBLE]
-    gap, gap_95, largest = (results.values(label, f"cav_{name}") for name in ("mean_gap", "gap_95", "max_gap"))
-    return {
-        "driver": _short_name(label),
-        "fuel of the platoon [%]": results.change_text(label, "fuel_by_power"),
-        f"difference to {TUNED_METHOD} [points]": results.change_text(label, "fuel_by_power", baseline=tuned),
-        "fuel of the CAV [%]": results.change_text(label, "cav_fuel_by_power"),
-        "gap: mean / 95 % / largest [m]": f"{gap.mean():.0f} / {gap_95.mean():.0f} / {largest.max():.0f}",
-        "smallest time gap [s]": f"{results.values(label, 'min_time_gap').min():.2f}",
-        "lost time [s]": results.change_text(label, "time_behind_leader", is_relative=False),
-        "flow [%]": results.change_text(label, "outflow_veh_per_h"),
-        "feasible": reasons[0] if reasons else "yes",
-    }
+    table: Table = []
+    for label, own in results.groups().items():
+        reasons = (row["feasibility"] for row in own if row["feasibility"] not in (None, "", FEASIBLE))
+        gap, gap_95, largest = (results.values(label, f"cav_{name}") for name in ("mean_gap", "gap_95", "max_gap"))
+        cells = {"driver": _short_name(label), "fuel of the platoon [%]": results.change_text(label, "fuel_by_power")}
+        difference = results.change_text(label, "fuel_by_power", baseline=tuned)
+        cells[f"difference to {TUNED_METHOD} [points]"] = difference
+        cells["fuel of the CAV [%]"] = results.change_text(label, "cav_fuel_by_power")
+        cells["gap: mean / 95 % / largest [m]"] = f"{gap.mean():.0f} / {gap_95.mean():.0f} / {largest.max():.0f}"
+        cells["smallest time gap [s]"] = f"{results.values(label, 'min_time_gap').min():.2f}"
+        cells["lost time [s]"] = results.change_text(label, "time_behind_leader", is_relative=False)
+        cells["flow [%]"] = results.change_text(label, "outflow_veh_per_h")
+        table.append({**cells, "feasible": next(reasons, "yes")})
+    return pd.DataFrame(table)
 
 
 def waves_table(folder: Path) -> pd.DataFrame:

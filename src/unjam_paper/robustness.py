@@ -114,17 +114,6 @@ def _impaired_driver(name: str, impairments: Mapping[str, float], scenario: Scen
     return driver if is_exact else ImpairedDriver(driver, **impairments, time_step=step)
 
 
-def _robustness_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
-    return {
-        f"robustness/{road}, {condition}": (
-            condition_rows,
-            (road, condition, changes, ROAD_CONTROLLERS[road], CONDITION_EPISODES),
-        )
-        for road, conditions in ROAD_CONDITIONS.items()
-        for condition, changes in conditions.items()
-    }
-
-
 def _robustness_table(road: str, folder: Path) -> pd.DataFrame:
     """Return the mean speed of all vehicles by condition and driver, and the gain of training."""
     table: dict[str, dict[str, str]] = {}
@@ -180,7 +169,14 @@ def _transfer_table(folder: Path) -> pd.DataFrame:
 
 ROBUSTNESS = Study(
     title="packaged controllers with roads, human drivers and sensors that differ from training",
-    make_parts=_robustness_parts,
+    make_parts=lambda study_folder, seeds: {
+        f"robustness/{road}, {name}": (
+            condition_rows,
+            (road, name, changes, ROAD_CONTROLLERS[road], CONDITION_EPISODES),
+        )
+        for road, conditions in ROAD_CONDITIONS.items()
+        for name, changes in conditions.items()
+    },
     minutes=20.0,
     tables={road: partial(_robustness_table, road) for road in ROAD_CONDITIONS},
 )

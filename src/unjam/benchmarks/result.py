@@ -24,13 +24,10 @@ from unjam.road_family import FAMILY
 if TYPE_CHECKING:  # imported late, so that commands start quickly
     import pandas as pd
 
-FILE_FORMAT = 1
+FILE_FORMAT, DIGITS, MAX_LABEL_CHARACTERS = 1, 7, 500
+"""version of files; significant digits of stored metrics; maximum length of the name of a driver"""
 MAX_FILE_BYTES = 4 * 2**20
 """maximum size of a file; one with all roads has 200 kB"""
-MAX_LABEL_CHARACTERS = 500
-"""of the name of a driver"""
-DIGITS = 7
-"""significant digits of stored metrics"""
 MAX_RELATIVE_DIFFERENCE = 1e-4
 """allowed relative difference to reference values of the human baseline"""
 TRAINING_STEPS_UNIT = "environment steps: control steps in the simulator"

@@ -21,12 +21,9 @@ GATHERED_LAP_FRACTION, BROKEN_LAP_FRACTION = 0.5, 0.45
 """free shares of the lap ahead: from the first on, all have gathered behind; below the second, their queue is broken"""
 MIN_PACE = 1.0
 """minimum speed of a pacer [m/s]; at standstill no queue would form"""
-MAX_JAM_DISTANCE = 60.0
-"""distance to a jam from which it waits [m]"""
-FREE_ROAD_GAP = 99.0
-"""gap from which the road counts as free [m]"""
-MAX_OVERRUN = 50.0
-"""distance after `last_position` at which it stops waiting [m]"""
+MAX_JAM_DISTANCE, FREE_ROAD_GAP, MAX_OVERRUN = 60.0, 99.0, 50.0
+"""distance to a jam from which a jam absorber waits, gap from which the road counts as free, and distance after
+`last_position` at which it stops waiting [m]"""
 UNBOUNDED_ACCELERATION = 100.0
 """acceleration above that of any ACC, which does not limit the vehicle [m/s2]"""
 MIN_REPORTED_CONGESTION = 0.5

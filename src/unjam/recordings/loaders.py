@@ -25,10 +25,8 @@ VALUE_LIMITS = {"speed": (0.0, 70.0), "leader_speed": (0.0, 70.0), "gap": (0.0, 
 """smallest and largest allowed value of a column [m/s, m/s, m]; other values are errors, or have another unit"""
 TIME_STEP_TOLERANCE, MISSING_ROW_INTERVAL = 0.01, 1.5
 """largest relative difference between equal intervals, and smallest ratio to the usual one where a row is missing"""
-MAX_TIME_STEP = 1.5
-"""longest time between two samples [s]: waves of a few seconds must be visible"""
-MIN_TRAJECTORY_SAMPLES = 3
-"""fewest samples of a trajectory: the interval between two single rows is no time step"""
+MAX_TIME_STEP, MIN_TRAJECTORY_SAMPLES = 1.5, 3
+"""longest time between two samples, to see waves of a few seconds [s], and fewest samples of a trajectory"""
 UNIT_RATIO_LIMITS = (2 / 3, 1.5)
 """smallest and largest ratio of quantities that are equal where the units of all columns fit each other"""
 CHANGE_SECONDS, MIN_GAP_CHANGE, MIN_CORRELATION = 5.0, 1.0, 0.7
@@ -47,10 +45,8 @@ RECONSTRUCTED_COLUMNS = ("vehicleid", "frameid", "localy", "vehiclelength", "mea
 """names of `VEHICLE_COLUMNS` in the reconstructed NGSIM I-80 data (Montanino and Punzo 2015), without underscores"""
 HIGHD_COLUMNS = ("id", "frame", "x", "width", "xVelocity", "laneId", "precedingId")
 """names of `VEHICLE_COLUMNS` in the tracks of highD (Krajewski et al. 2018)"""
-HIGHD_FRAME_RATE = 25.0
-"""frames per second of highD [1/s]"""
-MAX_VEHICLE_ABSENCE = 60.0
-"""longest absence of a vehicle number [s]; after a longer one the number belongs to another vehicle"""
+HIGHD_FRAME_RATE, MAX_VEHICLE_ABSENCE = 25.0, 60.0
+"""frames per second of highD [1/s], and longest absence of a vehicle, after which its number is that of another [s]"""
 FCD_COLUMNS = ("timestep_time", "vehicle_speed", "vehicle_leaderSpeed", "vehicle_leaderGap")
 """names of `TABLE_COLUMNS[1:]` in SUMO's FCD output as CSV, which contains leaders with the option
 --fcd-output.max-leader-distance"""

@@ -17,8 +17,8 @@ from unjam.errors import InputError
 from unjam.sandbox import limit_memory_growth
 from unjam.sumo_files.reader import BrokenFileError, XmlAttributes, parse_xml
 
-HEAD_BYTES = 1 << 16
-"""first bytes of a file, from which its form is detected before a table is parsed; no line of a table is longer"""
+HEAD_BYTES, HEAD_LINES = 1 << 16, 20
+"""first bytes, from which the form of a file is detected (no line is longer), and lines, among which its header is"""
 MAX_TEXT_BYTES, MAX_CELLS, MAX_FCD_VEHICLES = 1 << 30, 1 << 27, 1 << 23
 """maximum size of a table: bytes of text (uncompressed, each cell of Parquet counted), cells, and `vehicle` elements of
 FCD output as XML; each takes about five times as much memory"""
@@ -26,8 +26,6 @@ MAX_BINARY_LENGTH = 16
 """longest value of a column of equally long binary values in Parquet that is read [bytes], as decimal numbers have"""
 MAX_PARQUET_MEMORY = 8 << 30
 """maximum memory that a Parquet file takes while it is read [bytes]"""
-HEAD_LINES = 20
-"""first lines of a table, among which its header is"""
 RECONSTRUCTED_COLUMN_ORDER = (
     *("vehicleid", "frameid", "laneid", "localy", "meanspeed"),
     *("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid"),
