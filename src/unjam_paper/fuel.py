@@ -22,7 +22,7 @@ from unjam.seeds import held_out_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.results_file import read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, Table, measure_episodes
+from unjam_paper.study import NO_VALUE_TEXT, Study, Table, measure_tasks
 
 EMISSION_CLASSES = {"HBEFA4": "HBEFA4/PC_petrol_Euro-6ab", "PHEMlight": "PHEMlight/PC_G_EU4"}
 """emission classes of SUMO, by model"""
@@ -56,7 +56,7 @@ def measure_fuel(road: str, emission_class: str, drivers: Sequence[str], workers
         metrics = {name: row[name] for name in ("seed", "mean_speed", FUEL_METRIC)}
         return {"driver": drivers[number // FUEL_SEEDS], **metrics, "idle_rate": idle_rate(episode)}
 
-    return measure_episodes(tasks, workers, episode_row)
+    return measure_tasks(tasks, workers, episode_row)
 
 
 def fuel_table(road: str, folder: Path) -> pd.DataFrame:

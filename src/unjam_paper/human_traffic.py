@@ -22,7 +22,7 @@ from unjam.seeds import held_out_seeds, tuning_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.results_file import read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, Table, measure_episodes
+from unjam_paper.study import NO_VALUE_TEXT, Study, Table, measure_tasks
 
 CANDIDATES, CANDIDATE_SEEDS, FINAL_SEEDS = 60, 3, 20
 """number of candidates, of episodes of each, and of episodes with the best one and each simulation step"""
@@ -174,7 +174,7 @@ def measure_scenario(scenario: Motorway, seeds: Sequence[tuple[int, ...]], worke
         facts = asdict(measure_traffic(episode, scenario, ramp_number=-1))
         return {**facts, "delay": row["delay"], "status": row["status"]}
 
-    return measure_episodes([EpisodeTask(scenario, Human(), seed) for seed in seeds], workers, facts_row)
+    return measure_tasks([EpisodeTask(scenario, Human(), seed) for seed in seeds], workers, facts_row)
 
 
 def mean_facts(rows: Table) -> dict[str, float]:

@@ -28,7 +28,7 @@ from unjam_paper.do_no_harm import HARM_METRICS
 from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF, EnsembleSetting
 from unjam_paper.motorway_methods import CANDIDATE_SEED, CANDIDATES_PER_METHOD, METHODS, Candidate
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, measure_episodes
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, measure_tasks
 
 HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
 SENSING_PART, SENSITIVITY_PART, PACKAGED_PART = "sensing", "sensitivity", "packaged"
@@ -110,7 +110,7 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Table:
             "breakdown_time": measure_traffic(episode, scenarios[number], ramp_number=-1).breakdown_time,
         }
 
-    return measure_episodes(tasks, workers, episode_row)
+    return measure_tasks(tasks, workers, episode_row)
 
 
 def measure_human(number: int, workers: int) -> Table:

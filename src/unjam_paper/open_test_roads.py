@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -95,10 +95,8 @@ class OpenTestRoad:
         return max(speed / (CAR_LENGTH + equilibrium_gap(speed, humans)) for speed in speeds)
 
 
-def _make_road(
-    demand: float | tuple[float, ...], *sections: RoadSection, **changes: float | str | IDMParameters
-) -> OpenTestRoad:
-    return OpenTestRoad(sections, demand if isinstance(demand, tuple) else (demand,), **changes)  # pyright: ignore[reportArgumentType]
+def _make_road(demand: float | tuple[float, ...], *sections: RoadSection, **changes: Any) -> OpenTestRoad:
+    return OpenTestRoad(sections, demand if isinstance(demand, tuple) else (demand,), **changes)
 
 
 OVERLOAD_DEMAND = (1.1, 1.1, 1.1, 0.5)

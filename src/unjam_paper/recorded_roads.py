@@ -239,9 +239,8 @@ def make_recorded_parts(study_folder: StudyFolder, seeds: int) -> dict[str, Stud
     if not all(run.controller.is_file() for run in runs):
         return parts
     names = (HUMAN_LABEL, STOPPER, PUBLISHED_LABEL, *tuned)
-    for (part, month), name in product(
-        DRIVES_PARTS.items(), (*names, PLAN_LABEL, *(str(run.controller) for run in runs))
-    ):
+    drivers = (*names, PLAN_LABEL, *(str(run.controller) for run in runs))
+    for (part, month), name in product(DRIVES_PARTS.items(), drivers):
         parts[f"{part}/{_entry(name)}"] = measure_driver, (root, month, STANDARD_SETTING, name)
     for name in names:
         parts[f"{SUMO_FUEL_PART}/{_entry(name)}"] = measure_fuel_in_sumo, (root, TEST_MONTH, name)
@@ -289,9 +288,8 @@ class PlannedResidual:
 
 def planned_residuals(folder: Path, drives: str, expert: str, seeds: int) -> list[PlannedResidual]:
     """Return the trainings with and without the model, ordered by seed."""
-    return [
-        PlannedResidual(str(folder), drives, expert, label, seed) for seed, label in product(range(seeds), MODEL_RATIOS)
-    ]
+    planned = product(range(seeds), MODEL_RATIOS)
+    return [PlannedResidual(str(folder), drives, expert, label, seed) for seed, label in planned]
 
 
 def train_residual(run: PlannedResidual, workers: int) -> Table:

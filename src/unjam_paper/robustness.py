@@ -133,9 +133,7 @@ def transfer_rows(road: str, drivers: Mapping[str, str], workers: int) -> Table:
     """Return the metrics of drivers on a road with another number of vehicles than in training."""
     scenario = load_config(changes=TRANSFER_ROADS[road]).make_scenario()
     found = evaluate_drivers(scenario, drivers, TRANSFER_EPISODES, workers)
-    return [
-        {"road": road, "driver": label, **estimate_metrics(rows, COMPARISON_METRICS)} for label, rows in found.items()
-    ]
+    return [{"road": road, "driver": name, **estimate_metrics(own, COMPARISON_METRICS)} for name, own in found.items()]
 
 
 def _transfer_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:

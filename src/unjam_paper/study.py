@@ -201,7 +201,7 @@ def write_manifest(folder: Path, **metadata: Any) -> None:
     write_part(folder, "manifest", {**about, **metadata})
 
 
-def measure_episodes(
+def measure_tasks(
     tasks: Sequence[EpisodeTask], workers: int, make_row: Callable[[int, Episode, dict[str, Any]], dict[str, Any]]
 ) -> Table:
     """Return a row for each task, made from its number, episode and metrics; raise the first failure."""

@@ -103,9 +103,8 @@ def random_state(generator: np.random.Generator, rows: int, optional_fields: boo
     near = LocalState(speeds[0], speeds[1], gaps[0], speeds[2], gaps[1], position, np.full(rows, 230.0))
     if not optional_fields:
         return near
-    fields = dict(
-        zip(("lane_speeds", "road_speeds"), generator.uniform(0.0, 30.0, (2, rows, SECTIONS_AHEAD)), strict=True)
-    )
+    lane_speeds, road_speeds = generator.uniform(0.0, 30.0, (2, rows, SECTIONS_AHEAD))
+    fields = {"lane_speeds": lane_speeds, "road_speeds": road_speeds}
     fields["allowed_speed"] = generator.uniform(20.0, 30.0, rows)
     fields["distance_to_merge"] = generator.uniform(-500.0, 2000.0, rows)
     fields["adjacent_gaps"] = generator.uniform(-5.0, 60.0, (rows, len(ADJACENT_POSITIONS)))

@@ -124,8 +124,7 @@ class MeasuredVehicles(NamedTuple):
 
     def select(self, mask: NDArray[np.bool_]) -> "MeasuredVehicles":
         """Return some of the vehicles."""
-        roads = np.broadcast_to(self.roads, mask.shape)[mask]
-        return MeasuredVehicles(self.lanes[mask], self.positions[mask], self.speeds[mask], self.are_cavs[mask], roads)
+        return MeasuredVehicles(*(np.broadcast_to(values, mask.shape)[mask] for values in self))
 
 
 class RoadSections:

@@ -106,9 +106,7 @@ class MixedDriver(CompositeDriver):
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time gap by the driver of each CAV."""
-        return self._select(
-            memory, (driver.time_gaps(state, memory[key]) for key, driver in self.inner_drivers.items())
-        )
+        return self._select(memory, (each.time_gaps(state, memory[key]) for key, each in self.inner_drivers.items()))
 
     def _select(self, memory: Memory, answers: Iterable[Array | None]) -> Array | None:
         """Return the answer by the driver of each CAV, NaN for those without; None if there is no answer."""

@@ -233,13 +233,11 @@ def alphanumeric(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", str(name).lower())
 
 
-def _select_columns(
-    frame: pd.DataFrame, names: tuple[str, ...], new_names: tuple[str, ...], path: Path
-) -> pd.DataFrame:
+def _select_columns(frame: pd.DataFrame, names: tuple[str, ...], labels: tuple[str, ...], path: Path) -> pd.DataFrame:
     """Return the column `line`, and these columns as numbers under new names."""
     _check_columns(frame, names, path)
     numbers = to_numeric(frame.loc[:, ["line", *names]], names)
-    return numbers.rename(columns=dict(zip(names, new_names, strict=True)))
+    return numbers.rename(columns=dict(zip(names, labels, strict=True)))
 
 
 def _check_columns(frame: pd.DataFrame, required: Iterable[str], path: Path) -> None:
@@ -323,12 +321,11 @@ def split_trajectories(
             part_counts[pair] += 1
             name = pair if part_counts[pair] == 1 else f"{pair}/{part_counts[pair]}"
             trajectories.append(FollowingTrajectory(name, driver or pair, step, speed, leader_speed, gap, kind, split))
+    limit = f"{options.min_seconds:g} s"
     if not trajectories:
-        raise InputError(
-            f"{path.name}: no trajectory lasts {options.min_seconds:g} s; the longest lasts {longest:.3g} s"
-        )
+        raise InputError(f"{path.name}: no trajectory lasts {limit}; the longest lasts {longest:.3g} s")
     _check_units(trajectories, path)
-    reasons = {**skipped_rows, f"trajectories shorter than {options.min_seconds:g} s": short_count}
+    reasons = {**skipped_rows, f"trajectories shorter than {limit}": short_count}
     return ReadResult(trajectories, len(frame) + sum(skipped_rows.values()), bad_rows, reasons)
 
 

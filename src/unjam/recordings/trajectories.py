@@ -214,9 +214,8 @@ def trajectories_behind_cavs(
         cuts = np.flatnonzero(np.r_[True, is_other | is_missing[1:] | is_missing[:-1], True])
         for first, last in pairwise(cuts):
             if (last - first) * control_step >= MIN_TRAJECTORY_SECONDS:
-                speed, leader_speed, gap = (
-                    np.asarray(each[first:last], np.float64) for each in (behind, own, states.follower_gap)
-                )
+                columns = (behind, own, states.follower_gap)
+                speed, leader_speed, gap = (np.asarray(each[first:last], np.float64) for each in columns)
                 name = f"{number}-{first}"
                 trajectories.append(FollowingTrajectory(name, name, control_step, speed, leader_speed, gap))
     return trajectories
