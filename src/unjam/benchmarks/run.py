@@ -1,8 +1,8 @@
 """Run a benchmark: the human baseline and a driver on the test seeds of each road of a suite."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -102,8 +102,13 @@ def benchmark(
         training_steps=_recorded_steps(label) or training_steps,
         manifest={**origin, "command": without_folders(origin["command"]), "backend": backend},
     )
-    path = None if out is None else Path(out)
-    with _locked_result(path), WorkerPool(workers or os.cpu_count() or 1) as pool:
+    path, lock = None if out is None else Path(out), nullcontext()
+    if path is not None:
+        if path.is_symlink():
+            raise invalid_value("out", str(path), "a file, and no link")
+        make_folder(path.parent)
+        lock = lock_file(path.with_name(f".{path.name}.lock"), f"out: {str(path)!r}")
+    with lock, WorkerPool(workers or os.cpu_count() or 1) as pool:
         if path is not None and os.path.lexists(path):
             result = _stored_result(path, result)
             progress(f"{len(result.roads)} of {len(scenarios)} roads are in {path.name}, and are not driven again")
@@ -132,18 +137,6 @@ def _check_roads(roads: Sequence[str], suite: Suite) -> Sequence[str]:
         if name not in suite.roads:
             raise unknown_name(f"roads of {suite.name}", name, suite.roads)
     return names or suite.roads
-
-
-@contextmanager
-def _locked_result(path: Path | None) -> Iterator[None]:
-    if path is None:
-        yield
-        return
-    if path.is_symlink():
-        raise invalid_value("out", str(path), "a file, and no link")
-    make_folder(path.parent)
-    with lock_file(path.with_name(f".{path.name}.lock"), f"out: {str(path)!r}"):
-        yield
 
 
 def _make_drivers(
