@@ -226,9 +226,7 @@ class AdvisorySpeed(FormulaDriver):
     """
 
     name: ClassVar[str] = "advisory-speed"
-    own_requirements: ClassVar[Requirements] = Requirements(
-        required_fields=frozenset({"distance_to_merge"}), used_fields=frozenset({"distance_to_merge"})
-    )
+    own_requirements: ClassVar[Requirements] = Requirements(required_fields=frozenset({"distance_to_merge"}))
 
     advised_speed: Positive = 19.4
     """[m/s]"""
