@@ -124,7 +124,8 @@ class MeasuredVehicles(NamedTuple):
 
     def select(self, mask: NDArray[np.bool_]) -> "MeasuredVehicles":
         """Return some of the vehicles."""
-        return MeasuredVehicles(*(np.broadcast_to(values, mask.shape)[mask] for values in self))
+        roads = np.broadcast_to(self.roads, mask.shape)[mask]
+        return MeasuredVehicles(self.lanes[mask], self.positions[mask], self.speeds[mask], self.are_cavs[mask], roads)
 
 
 class RoadSections:
