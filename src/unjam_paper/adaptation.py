@@ -1,7 +1,4 @@
-"""Time until traffic settles after a change: a wave arrives, human drivers change, or a CAV switches off.
-
-Rings are simulated in batches, which equal SUMO except for rounding. Drivers are not informed of the change.
-"""
+"""Time until traffic settles after a change that drivers are not informed of, on rings in batches."""
 
 from dataclasses import replace
 from functools import partial
@@ -33,8 +30,8 @@ from unjam_paper.study import NO_VALUE_TEXT, Study, mean_text
 ADAPTATION_EPISODES = 20
 STEPS_PER_SECOND = 10
 CHANGE_STEP, END_STEP = 3000, 7200
+"""control steps of the change and of the end"""
 CHANGE_SECOND = CHANGE_STEP // STEPS_PER_SECOND
-"""time of the change [s]; `CHANGE_STEP` and `END_STEP` are the control steps of the change and of the end"""
 WAVE_BRAKING, WAVE_SPEED, WAVE_STEPS = 2.0, 0.5, 200
 """a vehicle causes a wave by this braking [m/s2] down to this speed [m/s], for this number of control steps"""
 SMOOTHING_SECONDS, FINAL_SECONDS = 10, 60
@@ -124,10 +121,9 @@ def read_speeds(folder: Path, name: str, label: str) -> dict[str, Floats]:
 
 
 def settling_times(speeds: Floats, limits: Floats) -> Floats:
-    """Return the time from the change until the mean speed has settled [s], shape (episodes,); NaN if it does not.
+    """Return the time until the mean of ten seconds stays above `SETTLED_SHARE` of the limit [s]; NaN if it does not.
 
-    It has settled when its average over ten seconds stays at or above `SETTLED_SHARE` of the limit until the end, for
-    at least a minute.
+    It must stay there for at least a minute; shape (episodes,).
     """
     times = []
     for values, limit in zip(speeds, limits, strict=True):

@@ -1,8 +1,6 @@
 """Gain of drivers on the training roads and the unseen roads of the family, and of joint trainings on many roads.
 
-On each road a gain of 0 is the human baseline, and 1 is the best tuned expert of this road, which is selected on other
-seeds than the test seeds. In the studies of joint trainings, rings are simulated in batches, which equal SUMO except
-for rounding.
+On each road a gain of 0 is the human baseline, and 1 is its best tuned expert, selected on other seeds.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -83,11 +81,8 @@ TABLE_PARTS = {"training": ("training",), "unseen": UNSEEN_PARTS}
 PI_ON_ALL_LABEL, JAM_AHEAD_ON_ALL_LABEL = "PI, tuned on all roads", "jam-ahead, tuned on all roads"
 PI_ON_RINGS_LABEL = "PI, tuned on the rings"
 SINGLE_CONTROLLERS: dict[str, str] = {
-    "unjam:best": "unjam:best",
-    PI_ON_ALL_LABEL: PI_TUNED_ON_ALL,
-    "gap PI, tuned on all roads": GAP_PI_TUNED_ON_ALL,
-    JAM_AHEAD_ON_ALL_LABEL: JAM_AHEAD_TUNED_ON_ALL,
-    PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS,
+    **{"unjam:best": "unjam:best", PI_ON_ALL_LABEL: PI_TUNED_ON_ALL, "gap PI, tuned on all roads": GAP_PI_TUNED_ON_ALL},
+    **{JAM_AHEAD_ON_ALL_LABEL: JAM_AHEAD_TUNED_ON_ALL, PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS},
 }
 """controllers for all roads: one expert, or one file with several"""
 CLOSED_ROAD_CONTROLLERS = ("unjam:ring-best", "unjam:ring-jammed-best", "unjam:figure-eight-best")
@@ -109,22 +104,18 @@ RING_BASELINES = {
 SHARED_RING_BASELINES = {SHARED_RINGS_EXPERT: SHARED_RINGS_EXPERT, RINGS_EXPERT: RINGS_EXPERT}
 ALL_ROADS_BASELINES = {label: FAMILY_DRIVERS[label] for label in ("unjam:best", PI_ON_RINGS_LABEL, "jam-ahead")}
 """drivers that are evaluated together with the trained ones; the first is the expert for these roads"""
-SHARED_RING_ROADS = {
-    **family_roads(SHARED_RINGS_GROUP),
-    **{
-        name: FamilyRoad("ring", options, "axis")
-        for name, options in {
-            "ring-88-grown-6-cavs": ring_options(88, 6, LONG_WARM_UP),
-            "ring-44-aggressive-3-cavs": ring_options(44, 3, LONG_WARM_UP, humans=AGGRESSIVE_IDM),
-            "ring-44-delayed-4-cavs": ring_options(44, 4, LONG_WARM_UP, actuator=ACTUATOR_LATENCY),
-            "ring-55-dense-4-cavs": ring_options(55, 4, LONG_WARM_UP, (9.1, 9.8)),
-            "ring-66-wide-4-cavs": ring_options(66, 4, LONG_WARM_UP, (13.0, 16.0)),
-            "ring-44-no-warm-up-3-cavs": ring_options(44, 3, 0),
-            "ring-33-growing-2-cavs": ring_options(33, 2, SHORT_WARM_UP),
-            "ring-66-growing-4-cavs": ring_options(66, 4, SHORT_WARM_UP),
-        }.items()
-    },
+UNSEEN_SHARED_RINGS = {
+    "ring-88-grown-6-cavs": ring_options(88, 6, LONG_WARM_UP),
+    "ring-44-aggressive-3-cavs": ring_options(44, 3, LONG_WARM_UP, humans=AGGRESSIVE_IDM),
+    "ring-44-delayed-4-cavs": ring_options(44, 4, LONG_WARM_UP, actuator=ACTUATOR_LATENCY),
+    "ring-55-dense-4-cavs": ring_options(55, 4, LONG_WARM_UP, (9.1, 9.8)),
+    "ring-66-wide-4-cavs": ring_options(66, 4, LONG_WARM_UP, (13.0, 16.0)),
+    "ring-44-no-warm-up-3-cavs": ring_options(44, 3, 0),
+    "ring-33-growing-2-cavs": ring_options(33, 2, SHORT_WARM_UP),
+    "ring-66-growing-4-cavs": ring_options(66, 4, SHORT_WARM_UP),
 }
+SHARED_RING_ROADS = family_roads(SHARED_RINGS_GROUP)
+SHARED_RING_ROADS |= {name: FamilyRoad("ring", options, "axis") for name, options in UNSEEN_SHARED_RINGS.items()}
 """rings that several CAVs share: those of the family, and further unseen ones"""
 FRESH_TEST_SEEDS = held_out_seeds(20, 1000)
 """test seeds that were not used in the decision which rings get an expert of their own"""
@@ -143,13 +134,11 @@ def road_parts(
     in_batches: bool,
 ) -> dict[str, StudyPart]:
     """Return a part for each road, with the drivers that are evaluated on it."""
-    return {
-        f"{number:02d}": (
-            measure_road,
-            (name, road, FAMILY_EXPERTS[GROUP_BY_SCENARIO[road.scenario]], drivers_on(road), test_seeds, in_batches),
-        )
-        for number, (name, road) in enumerate(roads.items())
-    }
+    parts: dict[str, StudyPart] = {}
+    for number, (name, road) in enumerate(roads.items()):
+        experts = FAMILY_EXPERTS[GROUP_BY_SCENARIO[road.scenario]]
+        parts[f"{number:02d}"] = measure_road, (name, road, experts, drivers_on(road), test_seeds, in_batches)
+    return parts
 
 
 def _is_motorway(road: FamilyRoad) -> bool:
@@ -165,10 +154,7 @@ def measure_road(
     in_batches: bool,
     workers: int,
 ) -> dict[str, Any]:
-    """Return the metrics of all drivers on a road on the test seeds; its best expert is selected on other seeds.
-
-    With `in_batches` the episodes are simulated in batches where these are supported.
-    """
+    """Return the metrics of all drivers on a road on the test seeds; its best expert is selected on other seeds."""
     scenario = make_scenario(road.scenario, road.options)
     candidates = {driver: driver for driver in (HUMAN_LABEL, *experts)}
     with WorkerPool(workers) as pool:
@@ -181,18 +167,15 @@ def measure_road(
 
 def best_feasible_driver(rows: Mapping[str, EpisodeRows]) -> str:
     """Return the best driver of those that are feasible in every episode; `human` if none is."""
-    baseline = rows[HUMAN_LABEL]
-    feasible = [
-        label for label, own in rows.items() if label == HUMAN_LABEL or overall_feasibility(own, baseline) == FEASIBLE
-    ]
+    verdicts = {label: overall_feasibility(own, rows[HUMAN_LABEL]) for label, own in rows.items()}
+    feasible = [label for label, verdict in verdicts.items() if label == HUMAN_LABEL or verdict == FEASIBLE]
     return max(feasible, key=lambda label: float(np.mean([gain.performance(row) for row in rows[label]])))
 
 
 def road_gains(folder: Path, parts: Sequence[str] = ("training", *UNSEEN_PARTS)) -> dict[str, dict[str, Any]]:
     """Return for each road its part, its best expert, and for each label the gain, the speeds and the verdict.
 
-    `has_potential_gain` is whether the best expert is better than the human baseline by more than a negligible amount.
-    Speeds are means of whole episodes by seed [m/s].
+    `has_potential_gain`: the best expert is not negligibly better than the human baseline. Speeds are by seed [m/s].
     """
     roads: dict[str, dict[str, Any]] = {}
     for number, results in read_parts(folder).items():
@@ -213,10 +196,7 @@ def road_gains(folder: Path, parts: Sequence[str] = ("training", *UNSEEN_PARTS))
 
 
 def suite_references(path: Path) -> dict[str, Any]:
-    """Return the reference values of benchmark suites, from the results file of this study.
-
-    By road: the best expert, and the performance of the human baseline and of this expert by test seed.
-    """
+    """Return by road the best expert, and the performance of it and of human drivers by test seed, for benchmarks."""
     parts = read_parts(path)
     manifest, origin = parts["manifest"], ("unjam", "commit", "started")
     references: dict[str, Any] = {}
@@ -273,11 +253,6 @@ def _mean_gain(by_road: Iterable[Floats]) -> str:
     return format_difference(estimate([float(np.mean(values)) for values in by_road]), 2)
 
 
-def _seed_cell(values: Floats) -> str:
-    """Return the mean over drivers and seeds with its 95 % CI; values have the shape (drivers, seeds)."""
-    return format_difference(estimate_on_shared_seeds(values), 2)
-
-
 def all_roads_figure(folder: Path) -> Figure:
     """Return a map of the gains, roads by drivers."""
     roads = road_gains(folder)
@@ -315,10 +290,7 @@ def joint_training_study(
     roads: Mapping[str, FamilyRoad] | None = None,
     test_seeds: Seeds = FAMILY_TEST_SEEDS,
 ) -> Study:
-    """Return the study of variants, each with its maximum number of trainings.
-
-    They are trained on the training roads of a group of the family, and evaluated on all its roads, or on `roads`.
-    """
+    """Return the study of variants, each with its maximum number of trainings, on all roads of a group, or `roads`."""
 
     def make_runs(seeds: int) -> list[PlannedRun]:
         return [PlannedRun(group, name, seed) for name, limit in variants.items() for seed in range(min(seeds, limit))]
@@ -336,11 +308,7 @@ def joint_training_study(
 
 
 def joint_controller(road: FamilyRoad, run: PlannedRun, study_folder: StudyFolder) -> Path:
-    """Return the folder of a training's controller for a road.
-
-    One network drives all roads, but limits and control step are those of a type of road: the controller of the first
-    training road of the same type.
-    """
+    """Return the folder of a training's controller for a road: that of the first training road of the same type."""
     group = GROUP_BY_SCENARIO[road.scenario]
     configs = run.config.task_configs().items()
     name = next(name for name, config in configs if GROUP_BY_SCENARIO[config.scenario] == group)
@@ -350,10 +318,7 @@ def joint_controller(road: FamilyRoad, run: PlannedRun, study_folder: StudyFolde
 def joint_training_table(
     labels: Sequence[str], parts: Sequence[str], baselines: Mapping[str, str], folder: Path
 ) -> pd.DataFrame:
-    """Return the gain of each driver on each road, and the difference of trainings to the expert for such roads.
-
-    Confidence intervals of several trainings take into account that they share the seeds.
-    """
+    """Return the gain of each driver on each road, and the difference of trainings to the expert for such roads."""
     roads = road_gains(folder, parts)
     drivers = next(iter(roads.values()))["gains"]
     expert = next(iter(baselines))
@@ -369,6 +334,9 @@ def joint_training_table(
             for label, group in groups.items()
         }
 
+    def cell(values: Floats) -> str:
+        return format_difference(estimate_on_shared_seeds(values), 2)
+
     gains, speeds = values_by_label("by_seed"), values_by_label("speeds")
     columns = dict(gains)
     pairs = [(label, expert) for label in labels]
@@ -377,15 +345,11 @@ def joint_training_table(
     for one, other in pairs:
         columns[f"{one}, difference to {other}"] = gains[one] - gains[other]
         columns[f"{one}, mean speed, difference to {other} [m/s]"] = speeds[one] - speeds[other]
-    rows = [
-        {
-            "road": name,
-            "best expert": road["best"].removeprefix("unjam:"),
-            **{column: _seed_cell(values[number]) for column, values in columns.items()},
-        }
-        for number, (name, road) in enumerate(roads.items())
-    ]
-    rows.append({"road": "mean", **{column: _seed_cell(values.mean(0)) for column, values in columns.items()}})
+    rows: list[dict[str, str]] = []
+    for number, (name, road) in enumerate(roads.items()):
+        cells = {column: cell(values[number]) for column, values in columns.items()}
+        rows.append({"road": name, "best expert": road["best"].removeprefix("unjam:"), **cells})
+    rows.append({"road": "mean", **{column: cell(values.mean(0)) for column, values in columns.items()}})
     worst, infeasible = {"road": "worst"}, {"road": "infeasible"}
     for label, group in groups.items():
         worst[label] = f"{gains[label].mean((1, 2)).min():+.2f}"

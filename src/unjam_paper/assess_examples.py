@@ -33,19 +33,14 @@ from unjam_paper.results_file import read_part
 from unjam_paper.study import NO_VALUE_TEXT, Study
 
 EXAMPLES_PART = "roads"
-MAX_EPISODES = 51
-"""maximum number of episodes per road: with the default controllers ten test seeds are left for the comparison"""
-PRECISION = 0.02
-"""half-width of the CI of travel time that is sufficient, relative to it"""
-BLOCK_LENGTH, SIGNALS = 250.0, 3
-"""distance between two signals of the grid [m], and signals in each direction"""
-GRID_FLOW, TURNING_FLOW = 300.0, 60.0
-"""flow on each straight route through the grid, and on each that turns [veh/h]"""
+MAX_EPISODES, PRECISION = 51, 0.02
+"""episodes per road, which leave ten test seeds to the comparison; sufficient half-width of the CI of travel time"""
+BLOCK_LENGTH, SIGNALS, GRID_FLOW, TURNING_FLOW = 250.0, 3, 300.0, 60.0
+"""distance of signals [m], signals in each direction, flow on each straight route and on each that turns [veh/h]"""
 MOTORWAY_FLOW, RAMP_FLOW = 3000.0, 500.0
 """flow on the motorway with SUMO's default vehicles, and on its ramp [veh/h]"""
 ON_RAMP_DEMAND = replace(ON_RAMP, peak=(100.0, 700.0), horizon=int(EPISODE_SECONDS))
-DEMAND_SEED = 1
-"""the built-in scenario that is exported, and the seed of its demand"""
+"""the built-in scenario that is exported"""
 Example = tuple[Callable[[Path], Path], float]
 """writes the files of a road into a folder and returns the configuration; and the penetration rate of its assessment"""
 
@@ -75,7 +70,6 @@ def write_grid(folder: Path) -> Path:
 
 
 def _route(nodes: Sequence[tuple[int, int]]) -> str:
-    """Return the edges between successive nodes of the grid."""
     return " ".join(f"{x}{y}to{to_x}{to_y}" for (x, y), (to_x, to_y) in pairwise(nodes))
 
 
@@ -103,7 +97,7 @@ def _default_traffic(routes: Mapping[str, float]) -> list[str]:
 
 def write_on_ramp(folder: Path) -> Path:
     """Write the built-in scenario `on-ramp` as a user network, with its vehicle types and one drawn demand."""
-    road = ON_RAMP_DEMAND.draw(np.random.default_rng(DEMAND_SEED))
+    road = ON_RAMP_DEMAND.draw(np.random.default_rng(1))
     shutil.copy(network_file(road.network), folder / "road.net.xml")
     files = sumo_inputs(ON_RAMP_DEMAND, road)
     cav_type = f'id="{CAV_TYPE_TEMPLATE.format("")}'  # unjam adds the types of CAVs
@@ -149,10 +143,9 @@ def assess_example(name: str, rate: float, max_episodes: int, precision: float, 
 
 
 def driver_rows(assessment: Assessment) -> list[dict[str, Any]]:
-    """Return a row for the human baseline, for ACC vehicles and for the controller.
+    """Return a row for the human baseline, for ACC vehicles and for the controller, with paired differences.
 
-    Differences are paired, with 95 % CI: `difference` to the human baseline and `difference_to_acc` [s],
-    `flow_difference` to the human baseline [veh/h].
+    `difference` and `flow_difference` are to the human baseline, `difference_to_acc` is to ACC vehicles [s, veh/h].
     """
     baseline = assessment.document["baseline"]
     time, flow = baseline["travel_time"]["mean"], baseline["outflow_veh_per_h"]["mean"]

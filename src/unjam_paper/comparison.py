@@ -1,8 +1,7 @@
-"""Comparisons of learners: Tables 1 and 2 and Figures 4, 5, 7 and 9 of the paper, and its exact settings.
+"""Comparisons of learners: Tables 1 and 2, Figures 4, 5, 7 and 9 of the paper, its exact settings, and road models.
 
 A table has the convention of the paper with the numbers of the paper, and that of unjam: test seeds, paired differences
-and confidence intervals. Curves are the mean and the range over trainings of a variant. Other studies of comparisons
-are about the environment steps that a model of the whole road saves.
+and confidence intervals. Curves are the mean and the range over trainings of a variant.
 """
 
 from collections.abc import Sequence
@@ -132,11 +131,10 @@ def comparison_rows(study_folder: StudyFolder, road: str, variants: Sequence[str
         row |= {"best_expert": label == best, "feasibility": verdicts[label]}
         row |= estimate_metrics(found, COMPARISON_METRICS)
         row["gain_over_best_expert"] = asdict(statistics.paired_difference(found, references[best], metric))
-        convention = {
-            key: _mean_and_std([row[name] for row in found if np.isfinite(row[name])])
-            for key, (name, _) in PAPER_COLUMNS.items()
+        values = {
+            key: [each[name] for each in found if np.isfinite(each[name])] for key, (name, _) in PAPER_COLUMNS.items()
         }
-        rows.append({**row, "paper_convention": convention})
+        rows.append({**row, "paper_convention": {key: _mean_and_std(each) for key, each in values.items()}})
     trained = study_folder.trained_runs(road, variants, seeds)
     return [*rows, *(_variant_row(road, variant, runs, references) for variant, runs in trained.items())]
 
@@ -154,12 +152,10 @@ def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows
         row[name] = asdict(statistics.estimate_over_trainings(values, TRIMMED_SHARE, METRICS[name].bounds))
     differences = statistics.paired_differences([run.rows for run in runs], reference_rows[best], metric)
     validated = [gains for run in runs if (gains := validation_gains(run.progress))]
-    convention = {
-        key: _mean_and_std([run.final_training_mean(name) for run in runs]) for key, (_, name) in PAPER_COLUMNS.items()
-    }
+    final = {key: [run.final_training_mean(name) for run in runs] for key, (_, name) in PAPER_COLUMNS.items()}
     return {
         **row,
-        "paper_convention": convention,
+        "paper_convention": {key: _mean_and_std(each) for key, each in final.items()},
         "gain_reference": {"expert": best, "metric": metric},
         "gain_over_best_expert": asdict(statistics.estimate_crossed(differences)),
         "probability_of_improvement": asdict(statistics.probability_of_improvement(differences)),
@@ -182,8 +178,14 @@ def _mean_and_std(values: Sequence[float]) -> dict[str, float]:
 def training_curves(study_folder: StudyFolder, road: str, variants: Sequence[str], seeds: int) -> dict[str, Any]:
     """Return the curves of a road by variant: the steps, and each quantity at these steps, one list per seed.
 
-    Returns of another reward than that of the first variant and quantities that were not measured are left out.
+    Returns of another reward than that of the first variant and what was not measured are left out.
     """
+
+    def resample(progress: Table, name: str) -> list[float]:
+        known = [(row["environment_steps"], row[name]) for row in progress if row[name] is not None]
+        steps, values = np.array(known, float).T
+        return np.interp(grid, steps, values).round(4).tolist()
+
     curves: dict[str, Any] = {}
     reward = PlannedRun(road, variants[0], 0).config.reward
     for variant, runs in study_folder.trained_runs(road, variants, seeds).items():
@@ -194,14 +196,8 @@ def training_curves(study_folder: StudyFolder, road: str, variants: Sequence[str
         has_same_reward = PlannedRun(road, variant, 0).config.reward == reward
         for name in (*RETURN_COLUMNS, *SPEED_COLUMNS) if has_same_reward else SPEED_COLUMNS:
             if any(row[name] is not None for row in runs[0].progress):
-                curves[variant][name] = [_resample(grid, run.progress, name) for run in runs]
+                curves[variant][name] = [resample(run.progress, name) for run in runs]
     return curves
-
-
-def _resample(grid: np.ndarray, progress: Table, name: str) -> list[float]:
-    known = [(row["environment_steps"], row[name]) for row in progress if row[name] is not None]
-    steps, values = np.array(known, float).T
-    return np.interp(grid, steps, values).round(4).tolist()
 
 
 def _checkpoint_table(road: str, folder: Path) -> pd.DataFrame:
@@ -221,10 +217,7 @@ def _checkpoint_table(road: str, folder: Path) -> pd.DataFrame:
 
 @rc_context(PLOT_STYLE)
 def curve_figure(road: str, curves: dict[str, Any], reference_rows: dict[str, Table], metric: str = "return") -> Figure:
-    """Draw return and speed in training against environment steps, from `training_curves`.
-
-    Reference drivers are horizontal lines at the mean of `metric`.
-    """
+    """Draw return and speed in training against environment steps; reference drivers are lines at their means."""
     figure = new_figure(3.1)
     for (name, label), axes in zip(CURVE_LABELS.items(), figure.subplots(1, len(CURVE_LABELS)), strict=True):
         for (variant, curve), color in zip(curves.items(), LINE_COLORS[1:], strict=False):
@@ -269,31 +262,23 @@ FIGURE_5 = Study(
 
 
 def paper_exact_study(road: str) -> Study:
-    """Return the study of the exact settings of the paper on a road (preset `paper-exact`).
-
-    All steps are made; the iteration at which the convergence rule of the paper ends the training is computed.
-    """
+    """Return the study of the exact settings of the paper; where its convergence rule ends a training is computed."""
     suffix = {"merge": "-million", "ring": "-filtered", "figure-eight": "-filtered"}.get(road, "")
     variants = (f"trpo-exact{suffix}", f"proposed-exact{suffix}")
     study = comparison_study(f"exact settings of the paper, on {road}", variants, road)
 
     def write(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
         study.write(study_folder, seeds, folder)
-        facts = {
-            variant: [
-                {
-                    "converged": paper_convergence(run.progress),
-                    "eps_m": transition_model_errors(run.progress),
-                    "last": run.final_training_mean("return_mean"),
-                    "test_return": float(np.mean([row["return"] for row in run.rows])),
-                }
-                for run in runs
-            ]
-            for variant, runs in study_folder.trained_runs(road, variants, seeds).items()
-        }
-        write_part(folder, "paper-exact", facts)
+        trained = study_folder.trained_runs(road, variants, seeds)
+        write_part(folder, "paper-exact", {name: list(map(_paper_exact_facts, runs)) for name, runs in trained.items()})
 
     return replace(study, write=write, tables={"paper-exact": _paper_exact_table})
+
+
+def _paper_exact_facts(run: TrainedRun) -> dict[str, Any]:
+    facts = {"converged": paper_convergence(run.progress), "eps_m": transition_model_errors(run.progress)}
+    facts["last"] = run.final_training_mean("return_mean")
+    return {**facts, "test_return": float(np.mean([row["return"] for row in run.rows]))}
 
 
 def paper_convergence(progress: Table) -> dict[str, float] | None:
@@ -351,10 +336,7 @@ def compared_variants(prefix: str) -> tuple[str, ...]:
 
 
 def efficiency_table(road: str, variants: Sequence[str], step_counts: Sequence[int], folder: Path) -> pd.DataFrame:
-    """Return the validation returns after numbers of environment steps, and the differences to the first variant.
-
-    The first variant is the one with the model.
-    """
+    """Return the validation returns after environment steps, and the differences of the first variant to the others."""
     curves, (modeled, *others) = read_part(folder, "curves")[road], variants
     returns = {name: partial(_returns_after, PlannedRun(road, name, 0).config, curves[name]) for name in variants}
     rows = [

@@ -40,10 +40,8 @@ MAX_TIME_INCREASE = {False: 0.005, True: 0.02}
 """upper limit for the CI of the travel time, relative to the ACC alone, without and with a breakdown"""
 MIN_FLOW_CHANGE = -0.01
 """lower limit for the CI of the flow, relative to the ACC alone"""
-BREAKDOWN_SPEED_SHARE, BREAKDOWN_SECONDS = 0.6, 120.0
-"""a breakdown: mean speed below this share of the free-flow speed for this time [s]"""
-MIN_FLOW_SHARE = 0.2
-"""minimum flow in a breakdown as a share of the capacity: a few slow vehicles are no breakdown"""
+BREAKDOWN_SPEED_SHARE, BREAKDOWN_SECONDS, MIN_FLOW_SHARE = 0.6, 120.0, 0.2
+"""a breakdown: mean speed below this share of the free-flow speed for this time [s], at this share of the capacity"""
 SECTION_LENGTH, SECTION_SECONDS = 250.0, 30.0
 """length [m] and time [s] over which mean speeds are taken"""
 RESULTS_PART = "do-no-harm"
@@ -68,19 +66,14 @@ def evaluate_harm(rows: Sequence[dict[str, Any]], acc_rows: Sequence[dict[str, A
     """Return the paired differences to the ACC alone and the verdict."""
     time, flow = (relative_difference(rows, acc_rows, name) for name in (TIME_METRIC, FLOW_METRIC))
     limit = MAX_TIME_INCREASE[breakdown]
-    verdict = UNDECIDED
     if time.high < limit and flow.low > MIN_FLOW_CHANGE:
-        verdict = NO_HARM
-    elif time.low > limit or flow.high < MIN_FLOW_CHANGE:
-        verdict = HARM
-    return HarmVerdict(time, flow, verdict)
+        return HarmVerdict(time, flow, NO_HARM)
+    is_harm = time.low > limit or flow.high < MIN_FLOW_CHANGE
+    return HarmVerdict(time, flow, HARM if is_harm else UNDECIDED)
 
 
 def has_breakdown(episode: Episode, road: OpenTestRoad) -> bool:
-    """Return whether a section is slow for `BREAKDOWN_SECONDS` while vehicles flow through it.
-
-    It is never so on a road with signals, where queues at red lights would count.
-    """
+    """Return whether a section is slow for `BREAKDOWN_SECONDS` while vehicles flow through it; never with signals."""
     if road.has_signals:
         return False
     snapshot_step = episode.snapshot_stride * episode.control_step
@@ -160,21 +153,15 @@ def harm_table(folder: Path) -> pd.DataFrame:
         rows = {label: list(map(replace_null, each)) for label, each in results["rows"].items()}
         acc, own = (rows[_rate_label(driver, rate)] for driver in (ACC_BASELINE, TESTED_CONTROLLER))
         verdict, breakdowns = _evaluate_rate(rows, rate), [row["breakdown"] for row in rows[HUMAN_LABEL]]
-        table.append(
-            {
-                "road": name,
-                "demand [veh/h]": " → ".join(f"{share * road.capacity:,.0f}" for share in road.demand),
-                "CAVs": f"{100 * rate:g} %",
-                "breakdown": "signals" if road.has_signals else f"{sum(breakdowns)} of {len(breakdowns)} seeds",
-                "human baseline [s]": f"{metric_estimate(rows[HUMAN_LABEL], TIME_METRIC).mean:.1f}",
-                "ACC alone [s]": f"{metric_estimate(acc, TIME_METRIC).mean:.1f}",
-                "travel time, difference to the ACC": _percent_text(verdict.time),
-                "flow, difference to the ACC": _percent_text(verdict.flow),
-                "seeds": verdict.time.count,
-                "feasible": overall_feasibility(own, rows[HUMAN_LABEL]),
-                "verdict": verdict.verdict,
-            }
-        )
+        demand = " → ".join(f"{share * road.capacity:,.0f}" for share in road.demand)
+        row = {"road": name, "demand [veh/h]": demand, "CAVs": f"{100 * rate:g} %"}
+        row["breakdown"] = "signals" if road.has_signals else f"{sum(breakdowns)} of {len(breakdowns)} seeds"
+        row["human baseline [s]"] = f"{metric_estimate(rows[HUMAN_LABEL], TIME_METRIC).mean:.1f}"
+        row["ACC alone [s]"] = f"{metric_estimate(acc, TIME_METRIC).mean:.1f}"
+        row["travel time, difference to the ACC"] = _percent_text(verdict.time)
+        row |= {"flow, difference to the ACC": _percent_text(verdict.flow), "seeds": verdict.time.count}
+        row |= {"feasible": overall_feasibility(own, rows[HUMAN_LABEL]), "verdict": verdict.verdict}
+        table.append(row)
     return pd.DataFrame(table)
 
 

@@ -1,11 +1,7 @@
 """Feasible controllers: their gain over tuned experts, and their feasibility far from their training roads.
 
-Residuals are compared with tuned experts on closed roads of every size and on the on-ramp: all drivers on the same test
-seeds, with confidence intervals that take into account that trainings share them.
-
-The study `envelope` takes packaged controllers to rings with 5 to 44 vehicles, shorter and longer than in training,
-jammed or not, with one to three CAVs; to smaller and larger figure eights; to the rings and a motorway lane without
-SUMO's safety checks; and to the default ring with actuation delay, lag and sensor errors.
+Residuals are compared with tuned experts on the same test seeds, on closed roads of every size and on the on-ramp. The
+study `envelope` takes packaged controllers to other sizes, roads without SUMO's safety checks, and impaired vehicles.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -69,9 +65,7 @@ PACER_LONG_TUNED = (
     "pacer:use_tuned=true,gathering_speed=1.96,gathering_gap=0.319,regathering_gap=0.1595,time_constant=0.0966"
 )
 """result of `unjam tune figure-eight --expert pacer --max-string-gain 0 --reward eq16 --steps 4860000`, without
-parameters that have no
-effect; with 600,000 steps it is `unjam:figure-eight-tuned`"""
-OTHER_ROAD_LABEL = "residual trained on the other road"
+parameters that have no effect; with 600,000 steps it is `unjam:figure-eight-tuned`"""
 PACER_TUNED_LABEL, PACER_GENTLE_LABEL = "pacer, tuned", "pacer, tuned, gentle"
 PACER_LONG_LABEL = "pacer, tuned, training budget"
 FEASIBILITY_STUDY_METRICS = (
@@ -120,6 +114,7 @@ LANE_CONDITIONS: dict[str, dict[str, Any]] = {
     "a full lane, half of all automated": {"inflow": 2400.0, "off_peak_inflow": 2000.0, "penetration_rate": 0.5},
 }
 """demand on one lane of a motorway without cut-ins"""
+SENSED = ("gap_error", "speed_error")
 IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "at once, exact": {},
     "lag 0.2 s": {"actuator": Actuator(lag=0.2)},
@@ -129,8 +124,8 @@ IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "lag 0.3 s, delay 0.2 s": {"actuator": Actuator(lag=0.3, delay=0.2)},
     **{
         label: {
-            "sensors": Sensors(gap_error=error, speed_error=error),
-            "safety": SafetyFilter(gap_error=error, speed_error=error),
+            "sensors": Sensors(**dict.fromkeys(SENSED, error)),
+            "safety": SafetyFilter(**dict.fromkeys(SENSED, error)),
         }
         for label, error in {"gap and speed off by up to 0.3": 0.3, "off by up to 1.0": 1.0}.items()
     },
@@ -154,10 +149,6 @@ class EvaluationRoad:
     """the return that the trainings maximize"""
 
 
-def _make_ring(warmup: int, length: int) -> Ring:
-    return Ring(length=(length, length), warmup=warmup)
-
-
 def _limit_leader(ring: Ring) -> Driver:
     return FollowerStopper(desired_speed=ring.limit_speed(ring.length[0]), gaps=(0.5, 1.0, 1.5), time_constant=3.0)
 
@@ -171,13 +162,13 @@ RING_DRIVERS: dict[str, DriverSource] = {
 FEASIBLE_ROADS = {
     "ring": EvaluationRoad(
         sizes=(220, 230, 240, 250, 260, 270),
-        make_scenario=partial(_make_ring, 0),
+        make_scenario=lambda length: Ring(length=(length, length), warmup=0),
         drivers=RING_DRIVERS | CEILING,
         baselines=(PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL),
     ),
     "ring-jammed": EvaluationRoad(
         sizes=(220, 230, 240, 250, 260, 270),
-        make_scenario=partial(_make_ring, LONG_WARM_UP),
+        make_scenario=lambda length: Ring(length=(length, length), warmup=LONG_WARM_UP),
         drivers={**RING_DRIVERS, GAP_PI_JAMMED_LONG_LABEL: GAP_PI_JAMMED_LONG_TUNED, **CEILING},
         baselines=(GAP_PI_LABEL, GAP_PI_JAMMED_LABEL, GAP_PI_JAMMED_LONG_LABEL),
     ),
@@ -201,7 +192,7 @@ def _feasible_parts(roads: Sequence[str], variant: str, study_folder: StudyFolde
         road, runs = FEASIBLE_ROADS[name], planned_runs([name], [variant], seeds)
         trained = {f"training {run.seed}": run for run in runs}
         for other in set(roads) - {name}:
-            trained[OTHER_ROAD_LABEL] = PlannedRun(other, variant, 0)
+            trained["residual trained on the other road"] = PlannedRun(other, variant, 0)
         drivers = road.drivers | {label: study_folder.run_folder(run) for label, run in trained.items()}
         for size in road.sizes:
             arguments = road.make_scenario(size), drivers, SEEDS_PER_SIZE, FEASIBILITY_STUDY_METRICS
@@ -214,12 +205,9 @@ def feasible_table(road: str, folder: Path) -> pd.DataFrame:
     comparison, about = DriverComparison([*read_part(folder, road).values()]), FEASIBLE_ROADS[road]
     rows = []
     for label, group in comparison.groups({"training": "residual"}).items():
-        differences = {
-            f"difference to {baseline}": comparison.difference(group, baseline, about.metric, 0)
-            for baseline in about.baselines
-            if baseline in comparison.roads[0]
-        }
-        row = {"driver": label, "return": comparison.mean(group, about.metric, 0), **differences}
+        row = {"driver": label, "return": comparison.mean(group, about.metric, 0)}
+        for baseline in (each for each in about.baselines if each in comparison.roads[0]):
+            row[f"difference to {baseline}"] = comparison.difference(group, baseline, about.metric, 0)
         row["mean speed [m/s]"] = comparison.mean(group, "mean_speed", 2)
         row["difference to human baseline [m/s]"] = comparison.difference(group, HUMAN_LABEL, "mean_speed", 2)
         row["flow [veh/h]"] = comparison.mean(group, "outflow_veh_per_h", 0)
@@ -232,7 +220,6 @@ def feasible_table(road: str, folder: Path) -> pd.DataFrame:
 
 
 def _dissolution_text(times: Floats) -> str:
-    """Return after how long waves dissolved, and in which share of the episodes if not in all."""
     share = np.isfinite(times).mean()
     return NO_VALUE_TEXT if not share else f"{np.nanmean(times):.1f}" + (f" ({share:.0%})" if share < 1.0 else "")
 
@@ -314,10 +301,9 @@ def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
 
 def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     """Return the parts of the study `envelope`."""
-    closed = tuple(CONTROLLER_ROADS)
-    parts: dict[str, StudyPart] = {
-        f"{WORST_PART}/{driver}": (_certify_worst_cases, (driver, road)) for driver, road in CONTROLLER_ROADS.items()
-    }
+    closed, parts = tuple(CONTROLLER_ROADS), dict[str, StudyPart]()
+    for driver, road in CONTROLLER_ROADS.items():
+        parts[f"{WORST_PART}/{driver}"] = _certify_worst_cases, (driver, road)
     tests: tuple[tuple[str, Iterator[tuple[str, Scenario]], tuple[str, ...], int], ...] = (
         ("rings", envelope_rings(), closed, ENVELOPE_SEEDS),
         ("figure-eights", envelope_figure_eights(), closed, ENVELOPE_SEEDS),
@@ -329,13 +315,12 @@ def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart
     )
     for part, roads, controllers, count in tests:
         drivers = {driver: driver for driver in (HUMAN_LABEL, *controllers)}
-        for name, road in roads:
-            parts[f"{part}/{name}"] = evaluate_metrics, (road, drivers, count, ENVELOPE_METRICS)
+        for name, scenario in roads:
+            parts[f"{part}/{name}"] = evaluate_metrics, (scenario, drivers, count, ENVELOPE_METRICS)
     return parts
 
 
 def _certify_worst_cases(controller: str, road: str, workers: int) -> dict[str, Any]:
-    """Return the worst cases that the certificate finds for a controller on its road."""
     with TemporaryDirectory() as folder:
         file = Path(folder, f"controller{SUFFIX}")
         export_controller(controller, file, scenario=road)
@@ -344,19 +329,13 @@ def _certify_worst_cases(controller: str, road: str, workers: int) -> dict[str, 
 
 def worst_table(folder: Path) -> pd.DataFrame:
     """Return how close each controller came to leaders that brake to a stop and to leaders found by a search."""
-    return pd.DataFrame(
-        {
-            "controller": controller,
-            "road": CONTROLLER_ROADS[controller],
-            "stops": f"{worst['leader_stops']:,}",
-            "steps": f"{worst['steps']:,}",
-            "contacts": worst["contacts"],
-            "min gap [m]": f"{worst['min_gap']:.2f}",
-            "min time gap [s]": f"{worst['min_time_gap']:.2f}",
-            "max braking [m/s²]": f"{worst['max_braking']:.1f}",
-        }
-        for controller, worst in read_part(folder, WORST_PART).items()
-    )
+    rows: list[dict[str, Any]] = []
+    for controller, worst in read_part(folder, WORST_PART).items():
+        row = {"controller": controller, "road": CONTROLLER_ROADS[controller], "stops": f"{worst['leader_stops']:,}"}
+        row |= {"steps": f"{worst['steps']:,}", "contacts": worst["contacts"], "min gap [m]": f"{worst['min_gap']:.2f}"}
+        row["min time gap [s]"] = f"{worst['min_time_gap']:.2f}"
+        rows.append({**row, "max braking [m/s²]": f"{worst['max_braking']:.1f}"})
+    return pd.DataFrame(rows)
 
 
 def domain_table(part: str, folder: Path) -> pd.DataFrame:
@@ -367,15 +346,10 @@ def domain_table(part: str, folder: Path) -> pd.DataFrame:
         speeds = (comparison.values([label], "mean_speed").mean((1, 2)) for label in (driver, HUMAN_LABEL))
         gains = np.subtract(*speeds)
         least = int(np.argmin(gains))
-        rows.append(
-            {
-                "controller": driver,
-                "feasible on": f"{comparison.verdicts([driver]).count(FEASIBLE)} of {len(roads)} roads",
-                **_safety_cells(comparison, driver),
-                "mean difference to human baseline [m/s]": f"{gains.mean():+.2f}",
-                "smallest difference [m/s]": f"{gains[least]:+.2f} ({list(roads)[least]})",
-            }
-        )
+        feasible = f"{comparison.verdicts([driver]).count(FEASIBLE)} of {len(roads)} roads"
+        row = {"controller": driver, "feasible on": feasible, **_safety_cells(comparison, driver)}
+        row["mean difference to human baseline [m/s]"] = f"{gains.mean():+.2f}"
+        rows.append({**row, "smallest difference [m/s]": f"{gains[least]:+.2f} ({list(roads)[least]})"})
     return pd.DataFrame(rows)
 
 

@@ -1,9 +1,7 @@
 """Fig. 6 of the paper: whether a car-following model helps a network to learn car following, on synthetic data.
 
 A network alone (`vanilla`) and one that learns the residual of the paper's IDM (`knowledge`) are trained on shares of
-the four-regime data set, and tested on the same unseen trajectories. The paper does not say which driver generated its
-data. Here it is either a driver with other parameters than the paper's IDM (`other`), or the paper's IDM (`same`), so
-that the base is the truth.
+the four-regime data set, of an IDM with other parameters (`other`), or of the paper's IDM itself (`same`).
 """
 
 from collections.abc import Sequence
@@ -125,8 +123,7 @@ def split_rows(driver: str, split: SplitKind) -> DataSplit:
 def measure_fit(fit: FourRegimeFit, workers: int = 1) -> dict[str, Any]:
     """Return the errors of a fit on the test rows [m/s2], and its losses.
 
-    `error` is the error to the data, noise included; `driver_error` is the error to the mean acceleration of the driver
-    that generated them; `noise` is the error of that mean to the data.
+    `error` is that to the data, `driver_error` that to their driver's mean acceleration, `noise` that of this mean.
     """
     started = perf_counter()
     rows = split_rows(fit.driver, fit.split)
@@ -135,24 +132,15 @@ def measure_fit(fit: FourRegimeFit, workers: int = 1) -> dict[str, Any]:
     training = rows.training.select(generator.permutation(len(rows.training))[:count])
     predict = _predict_nearest if fit.network == NEAREST_ROW else _predict_learned
     predicted, facts = predict(fit, training, rows)
-    average = average_acceleration(rows.test, DATA_SETTINGS[fit.driver])
-    return {
-        **asdict(fit),
-        "rows": count,
-        "overlap": rows.overlap,
-        "error": _rms(predicted - rows.test.acceleration),
-        "driver_error": _rms(predicted - average),
-        "noise": _rms(average - rows.test.acceleration),
-        "seconds": perf_counter() - started,
-        **facts,
-    }
+    average, data = average_acceleration(rows.test, DATA_SETTINGS[fit.driver]), rows.test.acceleration
+    differences = {"error": predicted - data, "driver_error": predicted - average, "noise": average - data}
+    errors = {name: float(np.sqrt(np.square(values).mean())) for name, values in differences.items()}
+    seconds = perf_counter() - started
+    return {**asdict(fit), "rows": count, "overlap": rows.overlap, **errors, "seconds": seconds, **facts}
 
 
 def average_acceleration(rows: FollowingSamples, settings: FourRegimesSettings) -> Floats:
-    """Return the mean acceleration of the driver of the data in each row, over the noise [m/s2].
-
-    It is that of its IDM except near standstill: no vehicle drives backwards, so noise can only start it.
-    """
+    """Return the mean acceleration of the driver of the data over the noise, which cannot move it backwards [m/s2]."""
     from scipy.stats import norm
 
     gap = clamp_min(rows.gap, MIN_REGIME_GAP)
@@ -185,17 +173,12 @@ def _predict_nearest(fit: FourRegimeFit, training: FollowingSamples, rows: DataS
     return training.acceleration[np.asarray(nearest, np.int64)], {}
 
 
-def _rms(error: Floats) -> float:
-    return float(np.sqrt(np.square(error).mean()))
-
-
 def _write_figure_6(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
-    """Write the rows, with the losses of fits to all data only."""
-    stored = [
-        {key: value for key, value in row.items() if row["size"] == 1.0 or not key.endswith("_loss")}
-        for row in read_part(folder, "figure-6").values()
-    ]
-    write_part(folder, "figure-6", {"rows": stored})
+    rows = list(read_part(folder, "figure-6").values())
+    for row in (row for row in rows if row["size"] != 1.0):
+        for name in ("training_loss", "validation_loss"):
+            row.pop(name, None)
+    write_part(folder, "figure-6", {"rows": rows})
 
 
 @rc_context(PLOT_STYLE)

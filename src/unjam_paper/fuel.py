@@ -15,15 +15,14 @@ import pandas as pd
 from unjam.controller import make_driver
 from unjam.measures.effect import FUEL_METRIC
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
-from unjam.measures.metrics import GASOLINE_DENSITY, measure
+from unjam.measures.metrics import GASOLINE_DENSITY
 from unjam.measures.statistics import metric_estimate, paired_difference
 from unjam.scenarios import make_scenario
 from unjam.seeds import held_out_seeds
-from unjam.training.evaluate import raise_failure
 from unjam.worlds.record import Episode
-from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.results_file import read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, Table
+from unjam_paper.study import NO_VALUE_TEXT, Study, Table, measure_tasks
 
 EMISSION_CLASSES = {"HBEFA4": "HBEFA4/PC_petrol_Euro-6ab", "PHEMlight": "PHEMlight/PC_G_EU4"}
 """emission classes of SUMO, by model"""
@@ -32,10 +31,9 @@ FUEL_DRIVERS: dict[str, tuple[str, ...]] = {
     "ring-jammed": (HUMAN_LABEL, "pi", "unjam:best", "unjam:ring-jammed-best"),
     "figure-eight": (HUMAN_LABEL, "pi", "unjam:best", "unjam:figure-eight-best"),
 }
-FUEL_SEEDS = 20
+FUEL_SEEDS, SECONDS_PER_HOUR = 20, 3600.0
 IDLE_SPEED = 0.001
 """speed below which an engine counts as idle [m/s]"""
-SECONDS_PER_HOUR = 3600.0
 
 
 def idle_rate(episode: Episode) -> float:
@@ -54,15 +52,11 @@ def measure_fuel(road: str, emission_class: str, drivers: Sequence[str], workers
         for seed in held_out_seeds(FUEL_SEEDS)
     ]
 
-    def episode_row(number: int, episode: Episode) -> dict[str, Any]:
-        row = measure(episode)
-        raise_failure([row])
-        driver = drivers[number // FUEL_SEEDS]
+    def episode_row(number: int, episode: Episode, row: dict[str, Any]) -> dict[str, Any]:
         metrics = {name: row[name] for name in ("seed", "mean_speed", FUEL_METRIC)}
-        return {"driver": driver, **metrics, "idle_rate": idle_rate(episode)}
+        return {"driver": drivers[number // FUEL_SEEDS], **metrics, "idle_rate": idle_rate(episode)}
 
-    with WorkerPool(workers) as pool:
-        return pool.run_and_map(tasks, episode_row)
+    return measure_tasks(tasks, workers, episode_row)
 
 
 def fuel_table(road: str, folder: Path) -> pd.DataFrame:

@@ -45,10 +45,7 @@ class PlanLimits:
 
 
 def plan_speeds(leader_speeds: Sequence[Floats], start_gaps: Sequence[float], step: float, limits: PlanLimits) -> Any:
-    """Return the planned speeds behind each of n leaders in all steps [m/s], arrays of their shapes (T,).
-
-    All vehicles start, and end, with the speed of their leader.
-    """
+    """Return the planned speeds behind each of n leaders, with their speeds at both ends [m/s], shapes (T,)."""
     counts, knot_steps = [len(each) for each in leader_speeds], round(KNOT_SECONDS / step)
     longest = knot_steps * (max(counts) // knot_steps + 1) + 1
     padded = np.stack([np.pad(each, (0, longest - len(each)), "edge") for each in leader_speeds], 1)
@@ -95,7 +92,6 @@ def _loss(speed: Tensor, ahead: Tensor, is_counted: Tensor, step: float, limits:
 
 
 def _interpolation(count: int, knot_steps: int) -> Tensor:
-    """Return the matrix that interpolates `count` values linearly from those at every `knot_steps`-th of them."""
     numbers, knots = np.arange(count) / knot_steps, np.arange((count - 1) // knot_steps + 1)
     return torch.tensor(np.maximum(1.0 - np.abs(numbers[:, None] - knots), 0.0))
 

@@ -1,8 +1,7 @@
 """Human traffic on a motorway that matches facts: a search over how humans drive, and the comparison with the facts.
 
-Each candidate is a set of settings of the scenario. It drives on a road with one on-ramp, with a demand that rises
-until traffic breaks down and a jam has formed, and is compared with empirical targets. The candidate with the smallest
-deviation then drives on test seeds, with two simulation steps.
+Each candidate, a set of settings, drives on a road with one on-ramp whose demand rises until a jam has formed. That
+with the smallest deviation from empirical targets then drives on test seeds, with two simulation steps.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,26 +15,21 @@ import pandas as pd
 
 from unjam.drivers import Human
 from unjam.measures.metric_table import estimate_cell
-from unjam.measures.metrics import measure
 from unjam.measures.statistics import estimate
 from unjam.measures.traffic_facts import TrafficFacts, measure_traffic
 from unjam.scenarios import Motorway, make_scenario
 from unjam.seeds import held_out_seeds, tuning_seeds
-from unjam.training.evaluate import raise_failure
 from unjam.worlds.record import Episode
-from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.results_file import read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, Table
+from unjam_paper.study import NO_VALUE_TEXT, Study, Table, measure_tasks
 
-CANDIDATES, CANDIDATE_SEEDS = 60, 3
-"""number of candidates, and of episodes of each"""
-FINAL_SEEDS = 20
-"""number of episodes with the best candidate and each simulation step"""
+CANDIDATES, CANDIDATE_SEEDS, FINAL_SEEDS = 60, 3, 20
+"""number of candidates, of episodes of each, and of episodes with the best one and each simulation step"""
 SIMULATION_STEPS = (0.5, 0.25)
 """[s]"""
 TRUCK_SHARE = 0.1
 CANDIDATES_PART, BEST_PART = "candidates", "best"
-
 CAPACITY_ROAD: dict[str, Any] = {
     "length": 4000.0,
     "ramps": [{"position": 3000.0, "inflow": 700.0, "off_peak_inflow": 250.0}],
@@ -162,36 +156,25 @@ def capacity_road(settings: Mapping[str, Any]) -> Motorway:
 def measure_traffic_candidate(number: int, workers: int) -> list[dict[str, Any]]:
     """Return the settings of a candidate with the facts of its episodes, as a list of one row."""
     settings = make_candidate(number)
-    return [{"settings": settings, "episodes": measure_facts(settings, {}, tuning_seeds(CANDIDATE_SEEDS), workers)}]
+    episodes = measure_scenario(capacity_road(settings), tuning_seeds(CANDIDATE_SEEDS), workers)
+    return [{"settings": settings, "episodes": episodes}]
 
 
 def measure_step(settings: Mapping[str, Any], step: float, workers: int) -> dict[str, Table]:
     """Return the facts of human traffic on test seeds with a simulation step [s], and a control step of 1 s."""
     changes = {"simulation_step": step, "steps_per_control_step": round(1.0 / step)}
-    return {"episodes": measure_facts(settings, changes, held_out_seeds(FINAL_SEEDS), workers)}
-
-
-def measure_facts(
-    settings: Mapping[str, Any], changes: Mapping[str, Any], seeds: Sequence[tuple[int, ...]], workers: int
-) -> Table:
-    """Return the facts of human traffic with these settings on the road with rising demand, one row for each seed."""
-    return measure_scenario(capacity_road({**settings, **changes}), seeds, workers)
+    road = capacity_road({**settings, **changes})
+    return {"episodes": measure_scenario(road, held_out_seeds(FINAL_SEEDS), workers)}
 
 
 def measure_scenario(scenario: Motorway, seeds: Sequence[tuple[int, ...]], workers: int) -> Table:
     """Return the facts at the last ramp of a motorway with human drivers only, one row for each seed."""
 
-    def facts_row(number: int, episode: Episode) -> dict[str, Any]:
-        row = measure(episode)
-        raise_failure([row])
-        return {
-            **asdict(measure_traffic(episode, scenario, ramp_number=-1)),
-            "delay": row["delay"],
-            "status": row["status"],
-        }
+    def facts_row(number: int, episode: Episode, row: dict[str, Any]) -> dict[str, Any]:
+        facts = asdict(measure_traffic(episode, scenario, ramp_number=-1))
+        return {**facts, "delay": row["delay"], "status": row["status"]}
 
-    with WorkerPool(workers) as pool:
-        return pool.run_and_map([EpisodeTask(scenario, Human(), seed) for seed in seeds], facts_row)
+    return measure_tasks([EpisodeTask(scenario, Human(), seed) for seed in seeds], workers, facts_row)
 
 
 def mean_facts(rows: Table) -> dict[str, float]:
@@ -232,7 +215,7 @@ def facts_table(folder: Path) -> pd.DataFrame:
 def traffic_candidates_table(folder: Path) -> pd.DataFrame:
     """Return the settings of all candidates and their facts, the smallest deviation first."""
     candidates = sorted(read_part(folder, CANDIDATES_PART), key=lambda each: total_deviation(each["episodes"]))
-    return pd.DataFrame([_candidate_row(each) for each in candidates])
+    return pd.DataFrame(map(_candidate_row, candidates))
 
 
 def _candidate_row(candidate: Mapping[str, Any]) -> dict[str, Any]:
@@ -255,10 +238,7 @@ def _candidate_row(candidate: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def effects_table(folder: Path) -> pd.DataFrame:
-    """Return the change of each fact with each setting, by linear regression over the candidates but the first.
-
-    A change is that of one standard deviation of the setting among the candidates.
-    """
+    """Return the change of each fact per standard deviation of each setting, by regression without candidate 0."""
     candidates = read_part(folder, CANDIDATES_PART)[1:]
     columns = {name: np.array([setting(each["settings"]) for each in candidates]) for name, setting in FACTORS.items()}
     standardized = np.array([(values - values.mean()) / values.std() for values in columns.values()])

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -165,25 +165,18 @@ def make_value_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPa
 
 def value_table(folder: Path) -> pd.DataFrame:
     """Return what the CAV saves on the test drives by distance and latency, and the difference to no information."""
-    rows = read_part(folder, TEST_DRIVES_PART)
+    rows, table = read_part(folder, TEST_DRIVES_PART), list[dict[str, str]]()
     by_case = {(row["between"], row["latency"]): np.array(row["by_drive"]) for row in rows}
-    return pd.DataFrame(
-        _value_row(row, by_case[row["between"], None], by_case[row["between"], PLAN_LABEL]) for row in rows
-    )
-
-
-def _value_row(row: dict[str, Any], without: Floats, plan: Floats) -> dict[str, str]:
-    changes, cell = np.array(row["by_drive"]), partial(estimate_cell, digits=2, sign="+")
-    latency, names = row["latency"], {None: "nothing received", PLAN_LABEL: PLAN_LABEL}
-    difference = NO_VALUE_TEXT if latency is None else str(cell(estimate((changes - without).tolist())))
-    return {
-        "vehicles between": str(row["between"]),
-        "latency [s]": names.get(latency) or f"{latency:g}",
-        "fuel [%]": str(cell(estimate(changes.tolist()))),
-        "difference to nothing received": difference,
-        "share of the plan's saving": f"{changes.mean() / plan.mean():.2f}",
-        "gap: mean / largest [m]": f"{row['mean_gap']:.0f} / {row['max_gap']:.0f}",
-    }
+    names, cell = {None: "nothing received", PLAN_LABEL: PLAN_LABEL}, partial(estimate_cell, digits=2, sign="+")
+    for (between, latency), changes in by_case.items():
+        cells = {"vehicles between": str(between), "latency [s]": names.get(latency) or f"{latency:g}"}
+        cells["fuel [%]"] = str(cell(estimate(changes.tolist())))
+        difference = cell(estimate((changes - by_case[between, None]).tolist()))
+        cells["difference to nothing received"] = NO_VALUE_TEXT if latency is None else str(difference)
+        cells["share of the plan's saving"] = f"{changes.mean() / by_case[between, PLAN_LABEL].mean():.2f}"
+        table.append(cells)
+    gaps = [f"{row['mean_gap']:.0f} / {row['max_gap']:.0f}" for row in rows]
+    return pd.DataFrame(table).assign(**{"gap: mean / largest [m]": gaps})
 
 
 INFORMATION_AHEAD = Study(

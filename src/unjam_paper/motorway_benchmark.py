@@ -4,63 +4,53 @@ Each candidate of a method first drives a few episodes, on settings with a break
 best of them then drive on all settings of this half, and the best of these in both rounds is the tuned one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import cycle, product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from unjam.controller import make_driver
-from unjam.measures.metric_table import HUMAN_LABEL
-from unjam.measures.metrics import measure
+from unjam.measures.effect import FLOW_METRIC, TIME_METRIC
+from unjam.measures.feasibility import HARD_BRAKING_METRIC, overall_feasibility
+from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
+from unjam.measures.statistics import Estimate, estimate, linearized_ratio, pair_rows, regress, relative_difference
 from unjam.measures.traffic_facts import measure_traffic
+from unjam.reports.results import replace_null
 from unjam.scenarios import Motorway
 from unjam.seeds import held_out_seeds, tuning_seeds
-from unjam.training.evaluate import raise_failure
 from unjam.worlds.record import Episode
-from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
+from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.do_no_harm import HARM_METRICS
 from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF, EnsembleSetting
 from unjam_paper.motorway_methods import CANDIDATE_SEED, CANDIDATES_PER_METHOD, METHODS, Candidate
-from unjam_paper.motorway_tables import (
-    ACC_ALONE,
-    BENCHMARK_RATES,
-    CONTROLLER,
-    FINAL_PART,
-    HUMAN_PART,
-    OPPONENT,
-    PACKAGED_PART,
-    SENSING_PART,
-    SENSITIVITY_PART,
-    TEST_HUMAN_PART,
-    TEST_PART,
-    TUNING_PART,
-    candidates_table,
-    comparison_table,
-    delay_change,
-    no_harm_table,
-    packaged_table,
-    parameter_effects_table,
-    sensing_table,
-    sensitivity_table,
-    settings_with_breakdown,
-    summary_table,
-)
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import Study, StudyFolder, Table
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, measure_tasks
 
+HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
+SENSING_PART, SENSITIVITY_PART, PACKAGED_PART = "sensing", "sensitivity", "packaged"
+ACC_ALONE, CONTROLLER, OPPONENT = "ACC alone", "controller", "best opponent"
+"""what is compared on the test half, besides human traffic"""
+COMPARISONS = {
+    "delay, against human": (CONTROLLER, HUMAN_LABEL),
+    "delay, against ACC alone": (CONTROLLER, ACC_ALONE),
+    "delay, against best opponent": (CONTROLLER, OPPONENT),
+    "ACC alone, against human": (ACC_ALONE, HUMAN_LABEL),
+    "best opponent, against human": (OPPONENT, HUMAN_LABEL),
+}
+"""pairs of drivers with the delays that are compared, by heading"""
+BENCHMARK_RATES = (0.05, 0.1)
+"""penetration rates with which methods are tuned and compared"""
 STUDY_NAME = "motorway-benchmark"
 CONTROLLER_METHOD = "jam-ahead"
 TEST_SETTINGS = range(SETTINGS_PER_HALF, len(SETTINGS))
-TEST_SEEDS, HARM_SEEDS = 20, 10
-"""number of episodes of each driver on a setting of the test half with and without a breakdown"""
-HUMAN_SEEDS = 5
-"""number of episodes of human traffic on each setting of the tuning half"""
-FIRST_EPISODES = 4
-"""number of episodes of each candidate in the first round, on as many settings"""
-FINALISTS = 4
-"""number of candidates of each method in the second round"""
+TEST_SEEDS, HARM_SEEDS, HUMAN_SEEDS = 20, 10, 5
+"""episodes on a setting of the test half with and without a breakdown; of human traffic on one of the tuning half"""
+FIRST_EPISODES, FINALISTS = 4, 4
+"""episodes of each candidate in the first round, on as many settings; candidates of each method in the second"""
 EPISODE_METRICS = (*HARM_METRICS, "vehicles", "human_braking_beyond_3_5")
 OTHER_SOURCES = ("vehicles", "detectors", "none")
 """sources of the speeds ahead, besides the CAVs of the main comparison"""
@@ -69,15 +59,13 @@ PACKAGED_LAW, PACKAGED_SOURCES = "unjam:on-ramp-tuned", ("cavs", "vehicles")
 SENSING_SEEDS, CHANGE_SEEDS = 8, 10
 CHANGED_SETTING = 18
 """the setting of which one assumption at a time is changed"""
+COOPERATION = ("lane_changing.cooperation", "lane_changing.speed_cooperation")
 CHANGES: dict[str, tuple[float, dict[str, Any]]] = {
     "nothing": (1.0, {}),
     **{
         f"cooperation of all human drivers {value:g}": (
             1.0,
-            {
-                **{f"lane_changing.{name}": (value, value) for name in ("cooperation", "speed_cooperation")},
-                "lane_changing.uncooperative_share": 0.0,
-            },
+            {**dict.fromkeys(COOPERATION, (value, value)), "lane_changing.uncooperative_share": 0.0},
         )
         for value in (1.0, 0.8, 0.5, 0.0)
     },
@@ -112,9 +100,7 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Table:
         for scenario, (_, candidate, _, seed) in zip(scenarios, jobs, strict=True)
     ]
 
-    def episode_row(number: int, episode: Episode) -> dict[str, Any]:
-        row = measure(episode)
-        raise_failure([row])
+    def episode_row(number: int, episode: Episode, row: dict[str, Any]) -> dict[str, Any]:
         setting, _, rate, _ = jobs[number]
         demand = episode.backlog[-1] + len(episode.vehicle_ids)
         return {
@@ -124,8 +110,7 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Table:
             "breakdown_time": measure_traffic(episode, scenarios[number], ramp_number=-1).breakdown_time,
         }
 
-    with WorkerPool(workers) as pool:
-        return pool.run_and_map(tasks, episode_row)
+    return measure_tasks(tasks, workers, episode_row)
 
 
 def measure_human(number: int, workers: int) -> Table:
@@ -134,10 +119,7 @@ def measure_human(number: int, workers: int) -> Table:
 
 
 def measure_candidate(method: str, number: int, settings: Sequence[int], workers: int) -> list[dict[str, Any]]:
-    """Return the first episodes of a candidate, on some of these settings, as a list of one row.
-
-    Candidates of different methods with the same number drive on the same settings, with the same seeds.
-    """
+    """Return the first episodes of a candidate as a list of one row; its number determines settings and seeds."""
     generator, seeds = np.random.default_rng([CANDIDATE_SEED, number]), tuning_seeds(HUMAN_SEEDS)
     numbers = generator.permutation(np.array(settings))[:FIRST_EPISODES].tolist()
     jobs = [
@@ -176,13 +158,11 @@ def measure_change(name: str, controller: Candidate, workers: int) -> dict[str, 
     demand_factor, changes = CHANGES[name]
     setting, seeds = SETTINGS[CHANGED_SETTING], held_out_seeds(CHANGE_SEEDS)
     setting = replace(setting, demand=demand_factor * setting.demand)
-    drivers = {HUMAN_LABEL: (HUMAN, 0.0), CONTROLLER: (controller, BENCHMARK_RATES[0])}
-    return {
-        label: run_jobs(
-            [(setting, replace(each, settings={**each.settings, **changes}), rate, seed) for seed in seeds], workers
-        )
-        for label, (each, rate) in drivers.items()
-    }
+    rows: dict[str, Table] = {}
+    for label, each, rate in ((HUMAN_LABEL, HUMAN, 0.0), (CONTROLLER, controller, BENCHMARK_RATES[0])):
+        changed = replace(each, settings={**each.settings, **changes})
+        rows[label] = run_jobs([(setting, changed, rate, seed) for seed in seeds], workers)
+    return rows
 
 
 def rank_candidates(rows: Table, human: Table, method: str) -> list[int]:
@@ -250,13 +230,200 @@ def tuned_drivers(first_rows: Table, finals: Table, human: Table) -> dict[str, C
     def change(row: dict[str, Any]) -> float:
         return delay_change([*first_episodes[row["method"], row["candidate"]], *row["episodes"]], human)
 
-    own = min((row for row in finals if row["method"] == CONTROLLER_METHOD), key=change)
-    other = min((row for row in finals if row["method"] != CONTROLLER_METHOD), key=change)
-    best = {
-        label: METHODS[row["method"]].candidate(row["candidate"])
-        for label, row in ((CONTROLLER, own), (OPPONENT, other))
+    tuned = {ACC_ALONE: METHODS["ACC"].candidate(0)}
+    for label, is_own in ((CONTROLLER, True), (OPPONENT, False)):
+        best = min((row for row in finals if (row["method"] == CONTROLLER_METHOD) == is_own), key=change)
+        tuned[label] = METHODS[best["method"]].candidate(best["candidate"])
+    return tuned
+
+
+def settings_with_breakdown(episodes: Table) -> list[int]:
+    """Return the numbers of the settings on which traffic breaks down in at least half of these episodes."""
+    by_setting = group_rows(episodes, "setting")
+    broken = {number: [row["breakdown_time"] is not None for row in rows] for number, rows in by_setting.items()}
+    return sorted(number for number, each in broken.items() if np.mean(each) >= 0.5)
+
+
+def delay_change(episodes: Table, human: Table) -> float:
+    """Return the sum of the changes of travel time relative to human traffic, over the sum of its delays."""
+    times = {(row["setting"], str(row["seed"])): row[TIME_METRIC] for row in human}
+    pairs = [(row, times[row["setting"], str(row["seed"])]) for row in episodes]
+    delay = sum(time - SETTINGS[row["setting"]].free_flow_time for row, time in pairs)
+    return sum(row[TIME_METRIC] - time for row, time in pairs) / delay
+
+
+def candidates_table(folder: Path) -> pd.DataFrame:
+    """Return the candidates of all methods and the change of delays in both rounds."""
+    human = read_part(folder, HUMAN_PART)
+    finals = {(row["method"], row["candidate"]): row for row in read_part(folder, FINAL_PART)}
+    table: Table = []
+    for row in read_part(folder, TUNING_PART):
+        candidate = METHODS[row["method"]].candidate(row["candidate"])
+        settings = ", ".join(f"{name} = {value}" for name, value in candidate.settings.items())
+        cells = {"method": row["method"]}
+        cells["parameters"] = "; ".join(filter(None, (candidate.driver.partition(":")[2], settings)))
+        for name, each in (("first round", row), ("second round", finals.get((row["method"], row["candidate"])))):
+            cells[name] = f"{100 * delay_change(each['episodes'], human):+.0f} %" if each else NO_VALUE_TEXT
+        table.append(cells)
+    return pd.DataFrame(table)
+
+
+def parameter_effects_table(folder: Path) -> pd.DataFrame:
+    """Return the relative change of delay per standard deviation of each parameter, by regression over all episodes."""
+    human = read_part(folder, HUMAN_PART)
+    times = {
+        number: float(np.mean([row[TIME_METRIC] for row in human if row["setting"] == number]))
+        for number in settings_with_breakdown(human)
     }
-    return {ACC_ALONE: METHODS["ACC"].candidate(0), **best}
+    delays = {number: time - SETTINGS[number].free_flow_time for number, time in times.items()}
+    rows = [row for part in (TUNING_PART, FINAL_PART) for row in read_part(folder, part) if row["candidate"]]
+    table: Table = []
+    for name, method in METHODS.items():
+        own = [(method.candidate(row["candidate"]).numbers, row["episodes"]) for row in rows if row["method"] == name]
+        samples = [(numbers, each) for numbers, episodes in own for each in episodes if each["setting"] in times]
+        if not samples:
+            continue
+        parameters = list(method.candidate(1).numbers)
+        values = np.array([[numbers[parameter] for parameter in parameters] for numbers, _ in samples])
+        changes = [(each[TIME_METRIC] - times[each["setting"]]) / delays[each["setting"]] for _, each in samples]
+        effects = regress(values, np.array(changes))
+        table += [
+            {"method": name, "parameter": parameter, "standard deviation": f"{spread:.3g}", "delay": _percent(effect)}
+            for parameter, spread, effect in zip(parameters, np.std(values, axis=0), effects, strict=True)
+        ]
+    return pd.DataFrame(table)
+
+
+def comparison_table(folder: Path) -> pd.DataFrame:
+    """Return the controller's changes of delay, relative to human traffic, on each setting with a breakdown."""
+    table: Table = []
+    for number, rate, rows in _test_rows(folder):
+        if OPPONENT not in rows:
+            continue
+        setting, human, own = SETTINGS[number], rows[HUMAN_LABEL], rows[CONTROLLER]
+        delay = estimate([row[TIME_METRIC] - setting.free_flow_time for row in human])
+        table.append(
+            {
+                "motorway": number,
+                "road": setting.road,
+                "demand": setting.demand,
+                "CAVs": f"{100 * rate:g} %",
+                "delay of human traffic [s]": str(estimate_cell(delay, 0)),
+                "of which unavoidable [s]": f"{setting.unavoidable_delay:.0f}",
+                "waiting at entrances [s]": f"{np.mean([row['waiting_at_entrances'] for row in human]):.0f}",
+                **{name: _percent(_delay_change(rows, *pair, number)) for name, pair in COMPARISONS.items()},
+                "flow": _percent(relative_difference(own, human, FLOW_METRIC)),
+                "hard braking of human drivers": _percent(relative_difference(own, human, HARD_BRAKING_METRIC)),
+                "feasible": overall_feasibility(own, human),
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def summary_table(folder: Path) -> pd.DataFrame:
+    """Return the mean changes over all settings with a breakdown; the intervals are over settings and their seeds."""
+    comparisons = [each for each in _test_rows(folder) if OPPONENT in each[2]]
+    table: Table = []
+    for rate in BENCHMARK_RATES if comparisons else ():
+        own = [(number, rows) for number, each, rows in comparisons if each == rate]
+        changes = {
+            name: [_delay_change(rows, *pair, number).mean for number, rows in own]
+            for name, pair in COMPARISONS.items()
+        }
+        flows = [relative_difference(rows[CONTROLLER], rows[HUMAN_LABEL], FLOW_METRIC).mean for _, rows in own]
+        table.append(
+            {
+                "CAVs": f"{100 * rate:g} %",
+                "motorways": len(own),
+                **{name: _percent(estimate(values)) for name, values in changes.items()},
+                "worst motorway, against human": f"{100 * max(changes['delay, against human'], default=np.nan):+.0f} %",
+                "flow": _percent(estimate(flows)),
+            }
+        )
+    return pd.DataFrame(table)
+
+
+def no_harm_table(folder: Path) -> pd.DataFrame:
+    """Return travel time and flow relative to the ACC alone, on the settings without a breakdown."""
+    table: Table = []
+    for number, rate, rows in _test_rows(folder):
+        if OPPONENT not in rows:
+            row = {"motorway": number, "road": SETTINGS[number].road, "demand": SETTINGS[number].demand}
+            row["CAVs"] = f"{100 * rate:g} %"
+            for name, metric in (("travel time", TIME_METRIC), ("flow", FLOW_METRIC)):
+                row[name] = _percent(relative_difference(rows[CONTROLLER], rows[ACC_ALONE], metric), 1)
+            table.append(row)
+    return pd.DataFrame(table)
+
+
+def sensing_table(folder: Path) -> pd.DataFrame:
+    """Return the change of delay against human traffic by the source of the speeds ahead, over the same settings."""
+    if not (sensing := _read_measured(folder, SENSING_PART)):
+        return pd.DataFrame()
+    human = list(map(replace_null, read_part(folder, TEST_HUMAN_PART)))
+    rows = [row for row in read_part(folder, TEST_PART) if row["driver"] == CONTROLLER]
+    names = ("setting", "seed", "penetration_rate")
+    driven = {str([row[name] for name in names]) for row in sensing}
+    same = [row for row in rows if str([row[name] for name in names]) in driven]
+    table: Table = []
+    for source in ("cavs", *dict.fromkeys(row["driver"] for row in sensing)):
+        own = same if source == "cavs" else [row for row in sensing if row["driver"] == source]
+        by_setting = [delay_change(rows, human) for _, rows in sorted(group_rows(own, "setting").items())]
+        change = _percent(estimate(by_setting))
+        table.append({"source": source, "motorways": len(by_setting), "delay, against human": change})
+    return pd.DataFrame(table)
+
+
+def sensitivity_table(folder: Path) -> pd.DataFrame:
+    """Return the change of travel time with the controller, with one changed assumption in each row."""
+    table: Table = []
+    for name, rows in _read_measured(folder, SENSITIVITY_PART).items():
+        pairs = pair_rows(rows[CONTROLLER], rows[HUMAN_LABEL])
+        gains = estimate([own[TIME_METRIC] - each[TIME_METRIC] for own, each in pairs])
+        human = estimate([each[TIME_METRIC] for _, each in pairs])
+        row = {"changed": name, "human traffic [s]": str(estimate_cell(human, 0))}
+        table.append(row | {"change [s]": str(estimate_cell(gains, 1, sign="+"))})
+    return pd.DataFrame(table)
+
+
+def packaged_table(folder: Path) -> pd.DataFrame:
+    """Return the change of delay with the packaged law for motorways, by the source of the speeds ahead."""
+    human, table = read_part(folder, HUMAN_PART), list[dict[str, str]]()
+    for source, own in group_rows(_read_measured(folder, PACKAGED_PART), "driver").items():
+        by_rate = group_rows(own, "penetration_rate").items()
+        changes = {rate: f"{100 * delay_change(each, human):+.0f} %" for rate, each in by_rate}
+        table.append({"source": source} | {f"delay, {100 * rate:g} % CAVs": text for rate, text in changes.items()})
+    return pd.DataFrame(table)
+
+
+def _read_measured(folder: Path, part: str) -> Any:
+    try:
+        return read_part(folder, part)
+    except (KeyError, FileNotFoundError):
+        return {}
+
+
+def _test_rows(folder: Path) -> Iterator[tuple[int, float, dict[str, Table]]]:
+    """Yield each setting and penetration rate of the test half with the rows of its drivers."""
+    if not (compared := _read_measured(folder, TEST_PART)):
+        return
+    rows = list(map(replace_null, [*read_part(folder, TEST_HUMAN_PART), *compared]))
+    for number, rate in product(sorted({row["setting"] for row in rows}), BENCHMARK_RATES):
+        own = [row for row in rows if row["setting"] == number and row["penetration_rate"] in (0.0, rate)]
+        yield number, rate, group_rows(own, "driver")
+
+
+def _delay_change(rows: dict[str, Table], driver: str, other: str, number: int) -> Estimate:
+    free, by_seed = SETTINGS[number].free_flow_time, {str(row["seed"]): row for row in rows[HUMAN_LABEL]}
+    pairs = pair_rows(rows[driver], rows[other])
+    changes = np.array([own[TIME_METRIC] - each[TIME_METRIC] for own, each in pairs])
+    delays = np.array([by_seed[str(own["seed"])][TIME_METRIC] - free for own, _ in pairs])
+    return estimate(linearized_ratio(changes, delays).tolist())
+
+
+def _percent(share: Estimate, digits: int = 0) -> str:
+    percent = Estimate(100 * share.mean, 100 * share.low, 100 * share.high, share.count)
+    return f"{estimate_cell(percent, digits, sign='+')} %"
 
 
 MOTORWAY_BENCHMARK = Study(
@@ -264,13 +431,8 @@ MOTORWAY_BENCHMARK = Study(
     make_parts=make_parts,
     minutes=100.0,
     tables={
-        "candidates": candidates_table,
-        "effects": parameter_effects_table,
-        "comparison": comparison_table,
-        "summary": summary_table,
-        "no-harm": no_harm_table,
-        "sensing": sensing_table,
-        "sensitivity": sensitivity_table,
-        "packaged": packaged_table,
+        **{"candidates": candidates_table, "effects": parameter_effects_table, "comparison": comparison_table},
+        **{"summary": summary_table, "no-harm": no_harm_table, "sensing": sensing_table},
+        **{"sensitivity": sensitivity_table, "packaged": packaged_table},
     },
 )

@@ -25,15 +25,11 @@ from unjam_paper.human_traffic import POPULATIONS, TARGETS, fact_values, measure
 from unjam_paper.results_file import read_part
 from unjam_paper.study import Study, Table
 
-SETTINGS_PER_HALF = 12
-DESIGN_SEED = 20261128
-"""seed of the random design"""
+SETTINGS_PER_HALF, DESIGN_SEED = 12, 20261128
 CAPACITY_SEEDS = 5
 """number of episodes in which the capacity of a setting is measured"""
-RAMP_SHARE = 0.15
-"""share of the ramps in the demand"""
-OFF_PEAK_SHARE = 0.6
-"""demand before and after the peak, as a share of capacity"""
+RAMP_SHARE, OFF_PEAK_SHARE = 0.15, 0.6
+"""share of the ramps in the demand; demand before and after the peak, as a share of capacity"""
 ROADS: dict[str, dict[str, Any]] = {
     "two lanes": {"ramps": [{"position": 3000.0}]},
     "three lanes": {"lanes": 3, "ramps": [{"position": 3000.0}]},
@@ -41,10 +37,8 @@ ROADS: dict[str, dict[str, Any]] = {
     "lane drop": {"ramps": [{**{"position": 2500.0, "merging_length": 500.0, "length": 2000.0}, "speed_limit": 27.78}]},
 }
 """a lane that closes is a long ramp at the speed of the motorway: vehicles leave it in its last 500 m"""
-CAPACITY_GUESS, MAX_DEMAND = 1900.0, 1.3
-"""flow of a lane, and demand relative to it, up to which the demand rises to measure capacity [veh/h]"""
-FREE_DEMAND = 0.2
-"""demand relative to `CAPACITY_GUESS` at which vehicles hardly hinder each other"""
+CAPACITY_GUESS, MAX_DEMAND, FREE_DEMAND = 1900.0, 1.3, 0.2
+"""flow of a lane [veh/h], and demands relative to it: the highest to measure capacity, and one that hardly hinders"""
 RISING_DEMAND = {"peak": (1800.0, 2400.0), "peak_rise": 1800.0, "horizon": 2400, "penetration_rate": 0.0}
 LEVELS: dict[str, Sequence[Any]] = {
     "road": (*("two lanes",) * 5, *("three lanes",) * 3, *("two ramps",) * 2, *("lane drop",) * 2),
@@ -126,17 +120,11 @@ class EnsembleSetting:
         # The closing lane carries what each other lane does.
         share = 1.0 / (lanes + 1) if self.road == "lane drop" else RAMP_SHARE / len(ramps)
 
-        def flows(share: float) -> dict[str, float]:
-            return {
-                "inflow": round(demand * share * capacity),
-                "off_peak_inflow": round(OFF_PEAK_SHARE * share * capacity),
-            }
-
-        settings = {
-            **self.traffic,
-            **flows(1.0 - share * len(ramps)),
-            "ramps": [{**ramp, **flows(share)} for ramp in ramps],
-        }
+        own, ramp_flows = (
+            {"inflow": round(demand * each * capacity), "off_peak_inflow": round(OFF_PEAK_SHARE * each * capacity)}
+            for each in (1.0 - share * len(ramps), share)
+        )
+        settings = {**self.traffic, **own, "ramps": [{**ramp, **ramp_flows} for ramp in ramps]}
         made = make_scenario("on-ramp", {**settings, **changes})
         assert isinstance(made, Motorway)
         return made
@@ -155,57 +143,13 @@ def _draw_settings() -> list[EnsembleSetting]:
 
 
 CAPACITIES: tuple[float, ...] = (
-    1926,
-    1806,
-    1627,
-    1694,
-    1836,
-    1758,
-    1757,
-    1644,
-    1766,
-    1721,
-    1670,
-    1579,
-    1710,
-    1657,
-    1717,
-    1655,
-    1742,
-    1744,
-    1781,
-    1736,
-    1787,
-    1612,
-    1507,
-    1877,
+    *(1926, 1806, 1627, 1694, 1836, 1758, 1757, 1644, 1766, 1721, 1670, 1579),
+    *(1710, 1657, 1717, 1655, 1742, 1744, 1781, 1736, 1787, 1612, 1507, 1877),
 )
 """flow before a breakdown of each setting: means of the part `capacity` [veh/h per lane]"""
 SETTING_FREE_FLOW_TIMES: tuple[float, ...] = (
-    132.2,
-    140.7,
-    133.9,
-    134.0,
-    184.4,
-    136.3,
-    141.2,
-    134.1,
-    136.5,
-    135.7,
-    183.9,
-    134.9,
-    137.1,
-    136.5,
-    137.1,
-    142.3,
-    143.1,
-    185.4,
-    132.1,
-    180.1,
-    131.8,
-    133.2,
-    132.5,
-    133.5,
+    *(132.2, 140.7, 133.9, 134.0, 184.4, 136.3, 141.2, 134.1, 136.5, 135.7, 183.9, 134.9),
+    *(137.1, 136.5, 137.1, 142.3, 143.1, 185.4, 132.1, 180.1, 131.8, 133.2, 132.5, 133.5),
 )
 """travel time of each setting at little demand: the part `free-flow` [s]"""
 SETTINGS = _draw_settings()
@@ -213,11 +157,7 @@ SETTINGS = _draw_settings()
 
 
 def measure_capacity(number: int, workers: int) -> dict[str, Table]:
-    """Return the facts of a setting with a demand that rises until traffic breaks down, one row for each seed.
-
-    The highest flow before the breakdown, or at any time if there is none, is what the demand of the setting is
-    relative to.
-    """
+    """Return the facts of a setting with a demand that rises until traffic breaks down, one row for each seed."""
     setting = SETTINGS[number]
     capacity = CAPACITY_GUESS * setting.traffic["lanes"]
     scenario = setting.scenario(capacity, MAX_DEMAND, **RISING_DEMAND)

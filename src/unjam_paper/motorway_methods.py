@@ -11,9 +11,7 @@ import numpy as np
 
 from unjam.parameters import split_parameters
 
-CANDIDATES_PER_METHOD = 18
-"""number of candidates of each method"""
-CANDIDATE_SEED = 20261129
+CANDIDATES_PER_METHOD, CANDIDATE_SEED = 18, 20261129
 Range = tuple[float, float] | Sequence[Any]
 """a range of numbers, or a list of values"""
 
@@ -65,7 +63,6 @@ class Method:
 
 
 def _draw(generator: np.random.Generator, values: Range) -> Any:
-    """Return a value of a range with three digits, or one of a list."""
     if isinstance(values, tuple):
         low, high = values
         return float(f"{generator.uniform(low, high):.3g}")

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,10 +15,8 @@ from unjam.worlds.sumo.networks import run_netconvert, xml_document, xml_element
 
 EPISODE_SECONDS, ROAD_SIMULATION_STEP = 900.0, 0.5
 """length of an episode, and simulation step [s]"""
-CAR_LENGTH, TRUCK_LENGTH = 4.8, 12.0
-"""lengths of vehicles [m]"""
-TRUCK_SPEED = 24.0
-"""speed limit of trucks [m/s]"""
+CAR_LENGTH, TRUCK_LENGTH, TRUCK_SPEED = 4.8, 12.0, 24.0
+"""lengths of vehicles [m]; speed limit of trucks [m/s]"""
 CROSSING_SHARE = 0.05
 """demand on each road that crosses at a signal, as a share of the demand on the main road"""
 SIDE_ROAD = (1, 20.0)
@@ -33,7 +31,7 @@ class RoadSection(NamedTuple):
     """A part of a road with the same lanes and speed limit; lanes begin and end on the right."""
 
     length: float
-    """length [m]"""
+    """[m]"""
     lanes: int
     speed: float
     """speed limit [m/s]"""
@@ -81,11 +79,8 @@ class OpenTestRoad:
     def free_speed(self, begin: float, end: float) -> float:
         """Return the free-flow speed of cars on the slowest section between two positions [m/s]."""
         ends = accumulate(section.length for section in self.sections)
-        limits = [
-            section.speed
-            for section, last in zip(self.sections, ends, strict=True)
-            if last > begin and last - section.length < end
-        ]
+        sections = [(last - each.length, last, each.speed) for each, last in zip(self.sections, ends, strict=True)]
+        limits = [speed for first, last, speed in sections if last > begin and first < end]
         return min(*limits, self.humans.desired_speed)
 
     @property
@@ -100,11 +95,8 @@ class OpenTestRoad:
         return max(speed / (CAR_LENGTH + equilibrium_gap(speed, humans)) for speed in speeds)
 
 
-def _make_road(
-    demand: float | tuple[float, ...], *sections: RoadSection, **changes: float | str | IDMParameters
-) -> OpenTestRoad:
-    """Return a road with these sections, and one demand or several."""
-    return OpenTestRoad(sections, demand if isinstance(demand, tuple) else (demand,), **changes)  # pyright: ignore[reportArgumentType]
+def _make_road(demand: float | tuple[float, ...], *sections: RoadSection, **changes: Any) -> OpenTestRoad:
+    return OpenTestRoad(sections, demand if isinstance(demand, tuple) else (demand,), **changes)
 
 
 OVERLOAD_DEMAND = (1.1, 1.1, 1.1, 0.5)
@@ -121,14 +113,8 @@ OPEN_TEST_ROADS: dict[str, OpenTestRoad] = {
     "no need of the limit": _make_road(0.7, RoadSection(4000, 3, 45)),
     "trucks": _make_road(0.75, RoadSection(4000, 2, 36), trucks=0.25),
     "curves": _make_road(
-        0.8,
-        *(
-            RoadSection(1300, 2, 36),
-            RoadSection(500, 2, 22, 35),
-            RoadSection(900, 2, 36, 35),
-            RoadSection(500, 2, 25, -40),
-        ),
-        RoadSection(1000, 2, 36, -40),
+        *(0.8, RoadSection(1300, 2, 36), RoadSection(500, 2, 22, 35), RoadSection(900, 2, 36, 35)),
+        *(RoadSection(500, 2, 25, -40), RoadSection(1000, 2, 36, -40)),
     ),
     "a lower limit ahead": _make_road(0.95, RoadSection(2500, 3, 40), RoadSection(1500, 3, 25)),
     "on-ramp with reserve": _make_road(
@@ -185,7 +171,6 @@ def write_road_files(road: OpenTestRoad, folder: Path) -> Path:
 
 
 def _flows(road: OpenTestRoad, shares: Mapping[str, float]) -> list[str]:
-    """Return the flows on routes with these shares of the demand, ordered by their begin."""
     kinds, parts = {"car": 1.0 - road.trucks, "truck": road.trucks}, len(road.demand)
     flows = list[tuple[float, str]]()
     for (route, share), part, kind in product(shares.items(), range(parts), kinds):
@@ -223,11 +208,10 @@ def write_network(
         ("edge", "edg", ("id", "from", "to", "numLanes", "speed", "priority"), [(*edge, 3) for edge in edges]),
         ("connection", "con", ("from", "to", "fromLane", "toLane"), connections),
     )
+    tables = {(tag, suffix): [dict(zip(names, row, strict=True)) for row in rows] for tag, suffix, names, rows in parts}
     inputs = {
-        (f"--{tag}-files", f"road.{suffix}.xml"): xml_document(
-            f"{tag}s", tag, [dict(zip(names, row, strict=True)) for row in rows]
-        )
-        for tag, suffix, names, rows in parts
+        (f"--{tag}-files", f"road.{suffix}.xml"): xml_document(f"{tag}s", tag, rows)
+        for (tag, suffix), rows in tables.items()
         if rows
     }
     run_netconvert(inputs, ["--no-turnarounds=true", *options], folder)

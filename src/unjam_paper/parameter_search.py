@@ -1,7 +1,4 @@
-"""Search of a controller's parameters on recorded roads, where many candidates drive at once.
-
-The cross-entropy method: each generation is drawn around the best candidates of the last one.
-"""
+"""Search of a controller's parameters on recorded roads by the cross-entropy method; many candidates drive at once."""
 
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -49,21 +46,16 @@ class RowScores(NamedTuple):
     """[s], while the CAV is faster than 1 m/s"""
 
 
-def with_parameter_rows(driver: Driver, parameters: Mapping[str, Floats], roads: int) -> Driver:
-    """Return a driver with one value of each parameter for each candidate, every one of them on `roads` roads."""
-    made = copy(driver)
-    for name, values in parameters.items():
-        object.__setattr__(made, name, np.repeat(values, roads))
-    return made
-
-
 def measure_candidates(
     scenarios: Sequence[Recorded], driver: Driver, parameters: Mapping[str, Floats] | None = None
 ) -> RowScores:
     """Return the scores of a driver with each set of parameters; without them, of the driver itself."""
     roads, candidates = len(scenarios), len(next(iter(parameters.values()))) if parameters else 1
     world = RecordedBatch(list(scenarios) * candidates, [(0,)] * (roads * candidates), keep_record=False)
-    loop = start_batch_drive(world, with_parameter_rows(driver, parameters, roads) if parameters else driver)
+    driver = copy(driver)
+    for name, values in (parameters or {}).items():
+        object.__setattr__(driver, name, np.repeat(values, roads))
+    loop = start_batch_drive(world, driver)
     step, counted = scenarios[0].control_step, 1 + scenarios[0].vehicle_kinds[::-1].index("cav")
     before = world.speeds[:counted]
     totals = np.zeros((4, roads * candidates))
@@ -92,22 +84,17 @@ def search_parameters(
     budget: SearchBudget,
     limits: PlanLimits = LIMITS,
 ) -> list[dict[str, Any]]:
-    """Return the best candidate so far after each generation: its parameters, fuel relative to human drivers [%], gaps.
-
-    Scores count the fuel, and what exceeds the limits.
-    """
+    """Return the best candidate after each generation: its parameters, fuel relative to human drivers [%], gaps."""
     generator = np.random.default_rng(seed)
     mean, spread = np.full(len(space), 0.5), np.full(len(space), 0.35)
     best: dict[str, Any] = {"score": np.inf}
     history = list[dict[str, Any]]()
     for generation in range(budget.generations):
-        if generation == 0:
-            points = generator.random((budget.size, len(space)))
-        else:
-            points = np.clip(mean + spread * generator.standard_normal((budget.size, len(space))), 0.0, 1.0)
-        parameters = {
-            name: _scale(points[:, column], distribution) for column, (name, distribution) in enumerate(space.items())
-        }
+        draw = generator.standard_normal if generation else generator.random
+        points = draw((budget.size, len(space)))
+        if generation:
+            points = np.clip(mean + spread * points, 0.0, 1.0)
+        parameters = {name: _scale(column, space[name]) for name, column in zip(space, points.T, strict=True)}
         scores = measure_candidates(scenarios, driver, parameters)
         fuel = 100.0 * (scores.fuel / human.fuel - 1.0).mean(1)
         mean_gap, max_gap, time_gap = scores.mean_gap.mean(1), scores.max_gap.max(1), scores.min_time_gap.min(1)

@@ -19,15 +19,18 @@ from unjam_paper.fuel_optimal_plan import PlanLimits
 from unjam_paper.parameter_search import SearchBudget, measure_candidates, search_parameters
 from unjam_paper.recorded_roads import (
     PUBLISHED_FILES,
+    SEARCH_PART,
     SEARCH_SEED,
     SEARCH_SPACES,
     STANDARD_SETTING,
+    TEST_DRIVES_PART,
     TEST_MONTH,
     TIME_STEP,
+    WAVE_METRICS,
+    DriveResults,
     measure_driver,
     recorded_drives,
 )
-from unjam_paper.recorded_tables import SEARCH_PART, TEST_DRIVES_PART, WAVE_METRICS, DriveResults
 from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
 

@@ -1,16 +1,20 @@
 """Controllers behind recorded vehicles: fuel that they save in a platoon, and the gaps that they need for it.
 
 The recordings are drives on I-24 (10.5281/zenodo.6366761). Those of March 2021 are for tuning and training; those of
-April are test drives, which choose nothing.
+April are test drives, which choose nothing. Residuals learn, with and without the model, what the tuned law does not
+know: their policy also sees means of the CAV's speed and gap over ten seconds to some minutes.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
+from shutil import copyfile, rmtree
 from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 from optuna.distributions import FloatDistribution
 
 from unjam.controller import make_driver
@@ -21,37 +25,43 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.smooth_acc import SmoothACC
 from unjam.errors import InputError
-from unjam.measures.metric_table import HUMAN_LABEL
-from unjam.measures.metrics import measure
-from unjam.physics.arrays import Array
+from unjam.files import make_folder
+from unjam.measures.feasibility import FEASIBLE
+from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
+from unjam.measures.metrics import METRICS, measure
+from unjam.measures.statistics import estimate_on_shared_seeds
+from unjam.physics.arrays import Array, Floats
+from unjam.reports.results import read_progress
 from unjam.scenarios import Recorded
 from unjam.scenarios.road import RecordedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import raise_failure
+from unjam.training.train import train
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.fuel_optimal_plan import PlanLimits, PlannedDriver, plan_speeds
 from unjam_paper.parameter_search import SearchBudget, measure_candidates, search_parameters
-from unjam_paper.recorded_residuals import planned_residuals, train_residual
-from unjam_paper.recorded_tables import (
-    DRIVE_SETTINGS,
-    RESIDUALS_PART,
-    SEARCH_PART,
-    STANDARD_SETTING,
-    SUMO_FUEL_PART,
-    TEST_DRIVES_PART,
-    TRAINING_DRIVES_PART,
-    WAVE_METRICS,
-    assumptions_table,
-    drivers_table,
-    residuals_table,
-    search_table,
-    waves_table,
-)
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import Study, StudyFolder, Table
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, trainings_text
 
+TUNED_METHOD = "smooth-acc"
+"""the law that residuals are added to"""
+SEARCH_PART, RESIDUALS_PART, SUMO_FUEL_PART = "search", "residuals", "in SUMO"
+TRAINING_DRIVES_PART, TEST_DRIVES_PART = "training drives", "test drives"
+STANDARD_SETTING = "as tuned"
+DRIVE_SETTINGS: dict[str, dict[str, Any]] = {
+    STANDARD_SETTING: {},
+    "20 human drivers behind the CAV": {"platoon": "cav human*20"},
+    "human drivers calibrated with NGSIM": {"population": "unjam:ngsim"},
+    "human drivers calibrated with AstaZero": {"population": "unjam:astazero"},
+    "human drivers without noise": {"noise": 0.0},
+    "CAV without delay and lag": {"actuator": Actuator()},
+    "CAV with a delay of 0.4 s and a lag of 0.6 s": {"actuator": Actuator(delay=0.4, lag=0.6)},
+}
+"""assumptions on which the saving may depend, each changed alone"""
+WAVE_METRICS = ("amplification_long", "amplification_medium", "amplification_short")
 RECORDED_STUDY = "recorded-roads"
 RECORDINGS_FOLDER = "recordings/i24"
 """the drives, in the folder of all studies"""
@@ -99,6 +109,20 @@ PLAN_LABEL = "plan that knows the recording"
 DRIVES_PARTS = {TRAINING_DRIVES_PART: TRAINING_MONTH, TEST_DRIVES_PART: TEST_MONTH}
 SETTING_METRICS = "fuel_by_power", "cav_mean_gap", "min_time_gap", "feasibility"
 SUMO_METRICS = ("fuel_ml_per_km", "fuel_by_power")
+STEPS_PER_ITERATION, TRAINING_STEPS = 400_000, 4_000_000
+"""environment steps; with the model, model steps are a part of them"""
+TRAINING_CHANGES: dict[str, Any] = {
+    **{"scenario": "recorded", "backend": "batch", "scenario_options.window": 200.0, "workers": 1},
+    **{"policy.history_features": True, "policy.authority": 0.15},
+    **{"policy.exploration_std": 0.03, "policy.learn_exploration_std": False},
+    **{"trpo.target_kl": 0.01, "trpo.critic_batch_size": 2_000},
+    **{"evaluation.validation_episodes": 64, "evaluation.validation_interval": 3},
+    **{"evaluation.episodes": 2, "evaluation.baselines": []},
+}
+"""the best of nine trials in validation, one training each with up to 12,000,000 steps; windows are drawn from the
+training drives"""
+MODEL_RATIOS = {"without model": 0.0, "with model": 1.0}
+"""model steps for each environment step, by the name of the residual"""
 
 
 @dataclass(frozen=True)
@@ -130,17 +154,13 @@ class PublishedController(Driver):
 
 def recorded_drives(folder: Path, month: str = TRAINING_MONTH) -> list[Recorded]:
     """Return a road for each drive of a month; raise `InputError` if the drives are missing."""
-    found = _drive_files(folder, month)
+    path = folder / RECORDINGS_FOLDER
+    found = sorted(path.glob(f"{month}*"))
     if not found:
-        path = folder / RECORDINGS_FOLDER
         raise InputError(
             f"{RECORDED_STUDY}: {path} has no drives of {month}; download them: https://doi.org/10.5281/zenodo.6366761"
         )
     return [Recorded(recordings=str(file)) for file in found]
-
-
-def _drive_files(folder: Path, month: str) -> list[Path]:
-    return sorted((folder / RECORDINGS_FOLDER).glob(f"{month}*"))
 
 
 def untuned_driver(method: str) -> Driver:
@@ -152,16 +172,14 @@ def tune_driver(folder: str, method: str, workers: int) -> Table:
     """Return the best candidates of a method after each generation, on the training drives."""
     scenarios = recorded_drives(Path(folder))
     human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
-    return search_parameters(
-        scenarios, untuned_driver(method), SEARCH_SPACES[method], human, SEARCH_SEED, SEARCH_BUDGET
-    )
+    driver, space = untuned_driver(method), SEARCH_SPACES[method]
+    return search_parameters(scenarios, driver, space, human, SEARCH_SEED, SEARCH_BUDGET)
 
 
 def tuned_name(rows: Table, method: str) -> str:
     """Return the tuned driver as on the command line."""
     fixed = {"set_speed": TUNED_SET_SPEED} if method == "acc" else {}
-    values = ",".join(f"{key}={value:g}" for key, value in {**fixed, **rows[-1]["parameters"]}.items())
-    return f"{method}:{values}"
+    return f"{method}:" + ",".join(f"{key}={value:g}" for key, value in {**fixed, **rows[-1]["parameters"]}.items())
 
 
 def measure_driver(folder: str, month: str, setting: str, name: str, workers: int) -> Table:
@@ -224,10 +242,9 @@ def make_recorded_parts(study_folder: StudyFolder, seeds: int) -> dict[str, Stud
     if not all(run.controller.is_file() for run in runs):
         return parts
     names = (HUMAN_LABEL, STOPPER, PUBLISHED_LABEL, *tuned)
-    residuals = tuple(str(run.controller) for run in runs)
-    for part, month in DRIVES_PARTS.items():
-        for name in (*names, PLAN_LABEL, *residuals):
-            parts[f"{part}/{_entry(name)}"] = measure_driver, (root, month, STANDARD_SETTING, name)
+    drivers = (*names, PLAN_LABEL, *(str(run.controller) for run in runs))
+    for (part, month), name in product(DRIVES_PARTS.items(), drivers):
+        parts[f"{part}/{_entry(name)}"] = measure_driver, (root, month, STANDARD_SETTING, name)
     for name in names:
         parts[f"{SUMO_FUEL_PART}/{_entry(name)}"] = measure_fuel_in_sumo, (root, TEST_MONTH, name)
         for setting in (each for each in DRIVE_SETTINGS if each != STANDARD_SETTING):
@@ -240,20 +257,181 @@ def _entry(name: str) -> str:
     return Path(name).stem if name.endswith(SUFFIX) else name.partition(":")[0]
 
 
+@dataclass(frozen=True)
+class PlannedResidual:
+    """A training on recorded drives."""
+
+    folder: str
+    """of all residuals of the study"""
+    drives: str
+    """pattern of the files of the training drives"""
+    expert: str
+    label: str
+    """a name in `MODEL_RATIOS`"""
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Its name among all residuals."""
+        return f"{self.label} {self.seed}"
+
+    @property
+    def controller(self) -> Path:
+        """The file of the trained controller."""
+        return Path(self.folder, f"{self.name}.unjam")
+
+    @property
+    def config(self) -> RunConfig:
+        """Its configuration: with the model, there are as many updates of the policy from fewer environment steps."""
+        ratio = MODEL_RATIOS[self.label]
+        changes = {"scenario_options.recordings": self.drives, "expert": self.expert, "seed": self.seed}
+        changes |= {"trpo.steps_per_iteration": round(STEPS_PER_ITERATION / (1.0 + ratio)), "model.model_ratio": ratio}
+        return load_config(changes=TRAINING_CHANGES | changes | {"steps": round(TRAINING_STEPS / (1.0 + ratio))})
+
+
+def planned_residuals(folder: Path, drives: str, expert: str, seeds: int) -> list[PlannedResidual]:
+    """Return the trainings with and without the model, ordered by seed."""
+    planned = product(range(seeds), MODEL_RATIOS)
+    return [PlannedResidual(str(folder), drives, expert, label, seed) for seed, label in planned]
+
+
+def train_residual(run: PlannedResidual, workers: int) -> Table:
+    """Train a residual, store its controller, and return its validations."""
+    folder = Path(run.folder, run.name)
+    rmtree(folder, ignore_errors=True)
+    make_folder(folder.parent)
+    result = train(run.config, folder)
+    rows = [row for row in read_progress(folder) if row["return_validation"] is not None]
+    copyfile(result.controller, run.controller)
+    rmtree(folder)
+    names = "environment_steps", "return_validation", "return_expert"
+    return [{"residual": run.label, "seed": run.seed, **{name: row[name] for name in names}} for row in rows]
+
+
+@dataclass(frozen=True)
+class DriveResults:
+    """The metrics of drivers behind the same drives; several trainings are one driver."""
+
+    rows: Table
+
+    def groups(self) -> dict[str, Table]:
+        """Return the rows of each driver, with those of all trainings together."""
+        groups: dict[str, Table] = {}
+        for row in self.rows:
+            label, _, seed = row["driver"].rpartition(" ")
+            trained = f"{TUNED_METHOD} and residual {label}"
+            groups.setdefault(trained if seed.isdigit() else row["driver"], []).append(row)
+        return groups
+
+    def values(self, label: str, metric: str) -> Floats:
+        """Return a metric of a driver, shape (trainings, drives)."""
+        own, count = self.groups()[label], len({row["drive"] for row in self.rows})
+        return np.array([row[metric] for row in own], np.float64).reshape(-1, count)
+
+    def change(self, label: str, metric: str, is_relative: bool = True, baseline: str = HUMAN_LABEL) -> Floats:
+        """Return the change from human drivers, minus that of another baseline, shape (trainings, drives)."""
+        human = self.values(HUMAN_LABEL, metric)
+        scale = human / 100.0 if is_relative else 1.0
+        return (self.values(label, metric) - self.values(baseline, metric)) / scale
+
+    def change_text(self, label: str, metric: str, is_relative: bool = True, baseline: str = HUMAN_LABEL) -> str:
+        """Return the mean change with its 95 % CI over drives and trainings; a dash for the baseline itself."""
+        if label in (HUMAN_LABEL, baseline):
+            return NO_VALUE_TEXT
+        values = self.change(label, metric, is_relative, baseline)
+        return str(estimate_cell(estimate_on_shared_seeds(values), 2, sign="+"))
+
+
+def _short_name(label: str) -> str:
+    method, _, parameters = label.partition(":")
+    return f"{method}, tuned" if parameters and method in SEARCH_SPACES else method
+
+
+def drivers_table(part: str, folder: Path) -> pd.DataFrame:
+    """Return fuel, gaps, lost time and flow of the drivers behind drives, compared with human drivers."""
+    results = DriveResults(read_part(folder, part))
+    tuned = next(label for label in results.groups() if label.partition(":")[0] == TUNED_METHOD)
+    table: Table = []
+    for label, own in results.groups().items():
+        reasons = (row["feasibility"] for row in own if row["feasibility"] not in (None, "", FEASIBLE))
+        gap, gap_95, largest = (results.values(label, f"cav_{name}") for name in ("mean_gap", "gap_95", "max_gap"))
+        cells = {"driver": _short_name(label), "fuel of the platoon [%]": results.change_text(label, "fuel_by_power")}
+        difference = results.change_text(label, "fuel_by_power", baseline=tuned)
+        cells[f"difference to {TUNED_METHOD} [points]"] = difference
+        cells["fuel of the CAV [%]"] = results.change_text(label, "cav_fuel_by_power")
+        cells["gap: mean / 95 % / largest [m]"] = f"{gap.mean():.0f} / {gap_95.mean():.0f} / {largest.max():.0f}"
+        cells["smallest time gap [s]"] = f"{results.values(label, 'min_time_gap').min():.2f}"
+        cells["lost time [s]"] = results.change_text(label, "time_behind_leader", is_relative=False)
+        cells["flow [%]"] = results.change_text(label, "outflow_veh_per_h")
+        table.append({**cells, "feasible": next(reasons, "yes")})
+    return pd.DataFrame(table)
+
+
+def waves_table(folder: Path) -> pd.DataFrame:
+    """Return by how much each driver's platoon amplifies waves, by their period, behind the test drives."""
+    results = DriveResults(read_part(folder, TEST_DRIVES_PART))
+    table: Table = []
+    for label in results.groups():
+        cells = {"driver": _short_name(label)}
+        cells |= {METRICS[name].label: f"{results.values(label, name).mean():.2f}" for name in WAVE_METRICS}
+        braking = results.values(label, "cav_max_braking").max()
+        cells["hardest braking [m/s²]"] = NO_VALUE_TEXT if label == HUMAN_LABEL else f"{braking:.1f}"
+        table.append({**cells, "mean jerk [m/s³]": f"{results.values(label, 'mean_abs_jerk').mean():.2f}"})
+    return pd.DataFrame(table)
+
+
+def assumptions_table(folder: Path) -> pd.DataFrame:
+    """Return the change of fuel by each driver under other assumptions, and by SUMO's emission model."""
+    in_sumo = DriveResults(read_part(folder, SUMO_FUEL_PART))
+    labels = [label for label in in_sumo.groups() if label != HUMAN_LABEL]
+
+    parts = {setting: TEST_DRIVES_PART if setting == STANDARD_SETTING else setting for setting in DRIVE_SETTINGS}
+    rows = [(name, DriveResults(read_part(folder, part)), "fuel_by_power") for name, part in parts.items()]
+    rows.append(("fuel by SUMO's emission model", in_sumo, "fuel_ml_per_km"))
+    return pd.DataFrame(
+        {"assumption": name, **{_short_name(label): results.change_text(label, metric) for label in labels}}
+        for name, results, metric in rows
+    )
+
+
+def residuals_table(folder: Path) -> pd.DataFrame:
+    """Return the gains of the trainings over their law on validation windows of the training drives."""
+    rows = read_part(folder, RESIDUALS_PART)
+    table: Table = []
+    for label in MODEL_RATIOS:
+        own = [row for row in rows if row["residual"] == label]
+        trainings = group_rows(own, "seed").values()
+        gains = [[row["return_validation"] - row["return_expert"] for row in each] for each in trainings]
+        steps = f"{max(row['environment_steps'] for row in own):,}"
+        cells = {"residual": label, "trainings": len(gains), "environment steps": steps}
+        cells["best gain in validation"] = trainings_text([max(each) for each in gains], 1, sign="+")
+        table.append({**cells, "last gain in validation": trainings_text([each[-1] for each in gains], 1, sign="+")})
+    return pd.DataFrame(table)
+
+
+def search_table(folder: Path) -> pd.DataFrame:
+    """Return the best candidate of each method after some generations of the search."""
+    return pd.DataFrame(
+        {
+            "method": method,
+            "generation": row["generation"] + 1,
+            "fuel of the platoon [%]": f"{row['fuel']:+.2f}",
+            "mean gap [m]": f"{row['mean_gap']:.0f}",
+            "largest gap [m]": f"{row['max_gap']:.0f}",
+        }
+        for method in SEARCH_SPACES
+        for row in read_part(folder, f"{SEARCH_PART} {method}")[4::5]
+    )
+
+
 RECORDED_ROADS = Study(
     title="controllers behind recorded vehicles: fuel of a platoon, and the gaps that it needs",
     make_parts=make_recorded_parts,
     minutes=180.0,
     tables={
-        **{
-            name: partial(drivers_table, part)
-            for name, part in (("drivers", TRAINING_DRIVES_PART), ("test", TEST_DRIVES_PART))
-        },
-        **{
-            "waves": waves_table,
-            "assumptions": assumptions_table,
-            "search": search_table,
-            "residuals": residuals_table,
-        },
+        "drivers": partial(drivers_table, TRAINING_DRIVES_PART),
+        "test": partial(drivers_table, TEST_DRIVES_PART),
+        **{"waves": waves_table, "assumptions": assumptions_table, "search": search_table},
+        "residuals": residuals_table,
     },
 )

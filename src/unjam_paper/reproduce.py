@@ -26,7 +26,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import evaluate, raise_failures, save_evaluation
-from unjam.training.executors import Executor, run_all, training_command
+from unjam.training.executors import CommandLine, Executor, run_all, training_command
 from unjam.training.run_folder import read_config
 from unjam.worlds.episode import can_drive
 from unjam.worlds.worker_pool import WorkerPool
@@ -75,11 +75,7 @@ class StudyPlan:
 
 
 def make_plan(names: Sequence[str], seeds: int, study_folder: StudyFolder) -> StudyPlan:
-    """Return the work that remains.
-
-    Raises:
-        InputError: an unknown study, or the folder has such a training with other settings.
-    """
+    """Return the work that remains; `InputError` for an unknown study, or such a training with other settings."""
     studies = find_studies(names)
     runs = list(dict.fromkeys(run for study in studies.values() for run in study.make_runs(seeds)))
     for run in runs:
@@ -121,24 +117,18 @@ def run_plan(
 ) -> list[Path]:
     """Run what is missing, `workers` trainings at once, write the studies, and return their folders.
 
-    The results file NAME.json is written next to the folder of each study. A stopped study is continued: trainings from
-    their last checkpoint. With `ray` trainings run on a cluster with a shared folder.
-
-    Raises:
-        UnjamError: a training failed; the others are finished.
+    The results file of each study is written next to its folder. A stopped study is continued, trainings from their
+    last checkpoint. With `ray` they run on a cluster with a shared folder. Raise `UnjamError` after all if one failed.
     """
     studies = plan.study_folder
     make_folder(studies.folder)
     for road in plan.roads:
         on_message(f"reference drivers: {road}")
         drive_references(road, studies, workers)
-    configs, logs = studies.folder / "configs", studies.folder / "logs"
-    commands = {
-        run.name: training_command(
-            *(run.config, studies.run_folder(run), configs / f"{run.name}.toml", logs / f"{run.name}.log")
-        )
-        for run in plan.runs
-    }
+    commands: dict[str, CommandLine] = {}
+    for run in plan.runs:
+        config, log = studies.folder / "configs" / f"{run.name}.toml", studies.folder / "logs" / f"{run.name}.log"
+        commands[run.name] = training_command(run.config, studies.run_folder(run), config, log)
     run_all(commands, workers, executor, on_message)
     for name in plan.names:
         study, folder = STUDIES[name], studies.folder / name
@@ -161,7 +151,6 @@ def drive_references(road: str, study_folder: StudyFolder, workers: int) -> None
 
 
 def _reference_drivers(road: str) -> tuple[RunConfig, Scenario, dict[str, Driver]]:
-    """Return the settings and the scenario of a road, and the reference drivers that can drive it, by label."""
     config = load_config(changes=STUDY_ROADS[road])
     scenario = config.make_scenario()
     names = {**REFERENCE_DRIVERS, **TUNED_REFERENCES.get(ORIGINAL_ROADS.get(road, road), {})}
@@ -194,7 +183,6 @@ def _has_current_references(road: str, study_folder: StudyFolder) -> bool:
 
 
 def _training_record(run: PlannedRun, study_folder: StudyFolder) -> dict[str, Any]:
-    """Return what is needed to repeat a training, and the digest of its network."""
     commit = json.loads((study_folder.run_folder(run) / "manifest.json").read_text(encoding="utf-8"))["commit"]
     driver = load_controller(study_folder.controller_folder(run))
     assert isinstance(driver, ResidualDriver)

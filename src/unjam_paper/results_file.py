@@ -1,12 +1,9 @@
 """Measure, write and read the parts of a study, and its results file: one JSON object with its manifest and each part.
 
-A part is measured once, and again if its arguments, or the controllers that they name, have changed.
-
-Tables of rows with the same keys are stored by columns, `{"columns": {NAME: [VALUES]}}`; a number or a text that is the
-same in all rows is stored once, `{NAME: VALUE}`, and numbers have eight digits. This takes a fifth of the space.
-Figures and controllers are separate files: NAME-FIGURE.png and NAME-controllers.zip. Commands, scripts and controller
-names in manifests are those of the commit that made the results, and may have the names before version 0.1
-(CONTRIBUTING.md).
+A part is measured once, and again if its arguments, or the controllers that they name, have changed. Tables of rows
+with the same keys are stored by columns, `{"columns": {NAME: [VALUES]}}`; what is the same in all rows is stored once,
+`{NAME: VALUE}`, and numbers have eight digits. Figures and controllers are separate files: NAME-FIGURE.png and
+NAME-controllers.zip. Names in manifests are those of the commit that made the results (CONTRIBUTING.md).
 """
 
 import json
@@ -47,7 +44,10 @@ def write_figure(folder: Path, name: str, figure: Figure) -> None:
 
 def write_results(path: Path, parts: Mapping[str, Any]) -> None:
     """Write a results file, one line for each part; NaN and infinities become null."""
-    lines = (f"{json.dumps(name)}: {_compact_json(part)}" for name, part in parts.items())
+    lines = list[str]()
+    for name, part in parts.items():
+        rounded = json.loads(to_json(_by_columns(part)), parse_float=lambda text: float(f"{float(text):.8g}"))
+        lines.append(f"{json.dumps(name)}: {json.dumps(rounded, separators=(',', ':'))}")
     atomic_write(path, "{\n" + ",\n".join(lines) + "\n}\n")
 
 
@@ -69,11 +69,7 @@ def collect_results(folder: Path) -> Path:
 
 
 def read_part(path: Path, name: str) -> Any:
-    """Return one part of a study, from its results file or from its working folder.
-
-    Raises:
-        KeyError, FileNotFoundError: there is no such part.
-    """
+    """Return one part of a study, from its results file or its folder; `KeyError` or `FileNotFoundError` without it."""
     if path.is_dir():
         return json.loads((path / f"{name}.json").read_text(encoding="utf-8"))
     return _by_rows(json.loads(path.read_text(encoding="utf-8"))[name])
@@ -87,7 +83,6 @@ def read_parts(path: Path) -> dict[str, Any]:
 
 
 def _zip_of(files: list[Path]) -> bytes:
-    """Return an archive that depends only on the names and the content of the files."""
     content = BytesIO()
     with ZipFile(content, "w") as archive:
         for file in files:
@@ -95,13 +90,7 @@ def _zip_of(files: list[Path]) -> bytes:
     return content.getvalue()
 
 
-def _compact_json(part: Any) -> str:
-    rounded = json.loads(to_json(_by_columns(part)), parse_float=lambda text: float(f"{float(text):.8g}"))
-    return json.dumps(rounded, separators=(",", ":"))
-
-
 def _by_columns(value: Any) -> Any:
-    """Return a JSON value with its tables of rows stored by columns."""
     if isinstance(value, Mapping):
         return {key: _by_columns(entry) for key, entry in value.items()}
     if not isinstance(value, (list, tuple)):
@@ -119,13 +108,11 @@ def _by_columns(value: Any) -> Any:
 
 def _is_constant(entries: list[Any]) -> bool:
     """Return whether all rows have the same number or text; 1, 1.0 and true differ."""
-    if isinstance(entries[0], (Mapping, list, tuple)):
-        return False
-    return len({(type(entry), str(entry)) for entry in entries}) == 1
+    is_plain = not isinstance(entries[0], (Mapping, list, tuple))
+    return is_plain and len({(type(entry), str(entry)) for entry in entries}) == 1
 
 
 def _by_rows(value: Any) -> Any:
-    """Return the value that `_by_columns` converted."""
     if isinstance(value, list):
         return [_by_rows(entry) for entry in value]
     if not isinstance(value, dict):

@@ -1,7 +1,4 @@
-"""Controllers with roads, human drivers and sensors that differ from those of the training.
-
-Two studies: packaged controllers with single changes (`robustness`), and other numbers of vehicles (Figure 10).
-"""
+"""Controllers on roads, among humans or with sensors that differ from training, and other numbers of vehicles."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -84,7 +81,9 @@ TRANSFER_VARIANTS, TRANSFER_SOURCE, TRANSFER_EPISODES = ("proposed", "ours"), "r
 TRANSFER_ROADS: dict[str, dict[str, Any]] = {
     **{f"{count} vehicles": STUDY_ROADS[road] for count, road in ((5, "ring-5"), (11, "ring-11"), (22, "ring"))},
     "44 vehicles on 520 m": {
-        **{"scenario": "ring", "scenario_options.vehicles": 44, "scenario_options.length": [520, 520]}
+        **STUDY_ROADS["ring"],
+        "scenario_options.vehicles": 44,
+        "scenario_options.length": [520, 520],
     },
 }
 
@@ -92,41 +91,28 @@ TRANSFER_ROADS: dict[str, dict[str, Any]] = {
 def condition_rows(
     road: str, condition: str, changes: Mapping[str, Any], controllers: tuple[str, str], episodes: int, workers: int
 ) -> Table:
-    """Return a row for each driver under a condition: human baseline, tuned expert and trained controller.
-
-    `controllers` are the trained controller and the tuned expert.
-    """
-    names = dict(zip((HUMAN_LABEL, TUNED_EXPERT, TRAINED_LABEL), (HUMAN_LABEL, *reversed(controllers)), strict=True))
+    """Return a row for the human baseline and for both `controllers`, the trained one and the tuned expert."""
+    trained, tuned = controllers
+    names = {HUMAN_LABEL: HUMAN_LABEL, TUNED_EXPERT: tuned, TRAINED_LABEL: trained}
     options = {f"scenario_options.{key}": value for key, value in changes.items() if key != "impairments"}
     scenario = load_config(changes={**STUDY_ROADS[road], **options}).make_scenario()
     drivers = {label: partial(_impaired_driver, name, changes.get("impairments", {})) for label, name in names.items()}
     found = evaluate_drivers(scenario, drivers, episodes, workers)
-    rows: Table = []
-    for label, own in found.items():
-        row = {"road": road, "condition": condition, "driver": label}
-        row |= {"feasibility": overall_feasibility(own, found[HUMAN_LABEL])}
-        row |= estimate_metrics(own, ROBUSTNESS_METRICS)
-        gain = paired_difference(own, found[TUNED_EXPERT], "mean_speed")
-        rows.append({**row, "speed_gain_over_expert": asdict(gain)})
-    return rows
+    return [
+        {
+            **{"road": road, "condition": condition, "driver": label},
+            **{"feasibility": overall_feasibility(own, found[HUMAN_LABEL])},
+            **estimate_metrics(own, ROBUSTNESS_METRICS),
+            "speed_gain_over_expert": asdict(paired_difference(own, found[TUNED_EXPERT], "mean_speed")),
+        }
+        for label, own in found.items()
+    ]
 
 
 def _impaired_driver(name: str, impairments: Mapping[str, float], scenario: Scenario) -> Driver:
-    driver = make_driver(name, scenario.control_step)
-    if driver.is_native or not impairments:
-        return driver
-    return ImpairedDriver(driver, **impairments, time_step=scenario.control_step)
-
-
-def _robustness_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
-    return {
-        f"robustness/{road}, {condition}": (
-            condition_rows,
-            (road, condition, changes, ROAD_CONTROLLERS[road], CONDITION_EPISODES),
-        )
-        for road, conditions in ROAD_CONDITIONS.items()
-        for condition, changes in conditions.items()
-    }
+    driver, step = make_driver(name, scenario.control_step), scenario.control_step
+    is_exact = driver.is_native or not impairments
+    return driver if is_exact else ImpairedDriver(driver, **impairments, time_step=step)
 
 
 def _robustness_table(road: str, folder: Path) -> pd.DataFrame:
@@ -148,9 +134,7 @@ def transfer_rows(road: str, drivers: Mapping[str, str], workers: int) -> Table:
     """Return the metrics of drivers on a road with another number of vehicles than in training."""
     scenario = load_config(changes=TRANSFER_ROADS[road]).make_scenario()
     found = evaluate_drivers(scenario, drivers, TRANSFER_EPISODES, workers)
-    return [
-        {"road": road, "driver": label, **estimate_metrics(rows, COMPARISON_METRICS)} for label, rows in found.items()
-    ]
+    return [{"road": road, "driver": name, **estimate_metrics(own, COMPARISON_METRICS)} for name, own in found.items()]
 
 
 def _transfer_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
@@ -172,20 +156,27 @@ def _figure_10_study(title: str, roads: tuple[str, ...]) -> Study:
 
 def _transfer_table(folder: Path) -> pd.DataFrame:
     """Return the mean speed by driver and traffic: the mean and the range over trainings."""
+
+    def mean_and_range(values: pd.Series) -> str:
+        return interval_text(asdict(Estimate(values.mean(), nan, nan, len(values), values.min(), values.max())), 2)
+
     rows = pd.json_normalize(read_part(folder, "transfer"))
     rows["trained as"] = rows["driver"].str.rstrip(" 0123456789")
-    speeds = rows.pivot_table("mean_speed.mean", "road", "trained as", _mean_and_range, sort=False)
+    speeds = rows.pivot_table("mean_speed.mean", "road", "trained as", mean_and_range, sort=False)
     labels = {variant: VARIANTS[variant].label for variant in TRANSFER_VARIANTS}
     return speeds.rename_axis(index="", columns=None).rename(columns=labels).reset_index()
 
 
-def _mean_and_range(values: pd.Series) -> str:
-    return interval_text(asdict(Estimate(values.mean(), nan, nan, len(values), values.min(), values.max())), 2)
-
-
 ROBUSTNESS = Study(
     title="packaged controllers with roads, human drivers and sensors that differ from training",
-    make_parts=_robustness_parts,
+    make_parts=lambda study_folder, seeds: {
+        f"robustness/{road}, {name}": (
+            condition_rows,
+            (road, name, changes, ROAD_CONTROLLERS[road], CONDITION_EPISODES),
+        )
+        for road, conditions in ROAD_CONDITIONS.items()
+        for name, changes in conditions.items()
+    },
     minutes=20.0,
     tables={road: partial(_robustness_table, road) for road in ROAD_CONDITIONS},
 )

@@ -1,7 +1,6 @@
-"""What string stability costs on rings: experts tuned with several limits on their string gain.
+"""What string stability costs on rings: experts of usual cars, tuned with several limits on their string gain.
 
-CAVs have the actuator of a usual car. Without a limit, controllers that calm a ring amplify oscillations that are
-slower than a lap and cannot arise there, but on a motorway.
+Without a limit, they amplify oscillations that are slower than a lap and cannot arise there, but on a motorway.
 """
 
 import tempfile
@@ -57,11 +56,8 @@ def measure_tuned(road: str, expert: str, limit: float, workers: int) -> Table:
     scenario = string_road(road)
     space = SMOOTH_ACC_SPACE if expert == "smooth-acc" else default_search_space(expert, scenario.control_step)
     with WorkerPool(workers) as pool, tempfile.TemporaryDirectory() as folder:
-        tuned = tune(
-            *({road: scenario}, expert, space, TUNING_STEPS, Path(folder, "tuned"), pool),
-            screen=True,
-            max_string_gain=limit,
-        )
+        out, options = Path(folder, "tuned"), {"screen": True, "max_string_gain": limit}
+        tuned = tune({road: scenario}, expert, space, TUNING_STEPS, out, pool, **options)
         driver = driver_from_name(tuned.best.driver, scenario.control_step)
         gain = find_operating_points({road: scenario}, pool)[road].string_gain(driver)
     episodes = measure_episodes(scenario, tuned.best.driver, workers)
@@ -76,9 +72,8 @@ def measure_episodes(scenario: Scenario, driver: str, workers: int) -> Table:
 
 def measure_human_baseline(road: str, workers: int) -> Table:
     """Return the test episodes of the human baseline."""
-    return [
-        {"expert": HUMAN_LABEL, "limit": 0.0, "episodes": measure_episodes(string_road(road), HUMAN_LABEL, workers)}
-    ]
+    episodes = measure_episodes(string_road(road), HUMAN_LABEL, workers)
+    return [{"expert": HUMAN_LABEL, "limit": 0.0, "episodes": episodes}]
 
 
 def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
@@ -91,22 +86,17 @@ def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
 def string_table(road: str, folder: Path) -> pd.DataFrame:
     """Return gain, return, mean speed and their differences to the human baseline, by expert and limit."""
     rows, human = tuned_rows(road, folder)
-    return pd.DataFrame(
-        {
-            "expert": row["expert"],
-            "largest gain allowed": f"{row['limit']:g}" if row["limit"] else "any",
-            "its gain": f"{row['gain']:.2f}",
-            "return": f"{metric_estimate(row['episodes'], 'return').mean:.0f}",
-            "return, difference to human": str(
-                estimate_cell(paired_difference(row["episodes"], human, "return"), 0, sign="+")
-            ),
-            "mean speed [m/s]": f"{metric_estimate(row['episodes'], 'mean_speed').mean:.2f}",
-            "speed, difference to human [m/s]": str(
-                estimate_cell(paired_difference(row["episodes"], human, "mean_speed"), 2, sign="+")
-            ),
-        }
-        for row in rows
-    )
+    columns = (("return", "return", "return", 0), ("mean speed [m/s]", "speed", "mean_speed", 2))
+    table: Table = []
+    for row in rows:
+        cells = {"expert": row["expert"], "largest gain allowed": f"{row['limit']:g}" if row["limit"] else "any"}
+        cells["its gain"] = f"{row['gain']:.2f}"
+        for heading, quantity, metric, digits in columns:
+            difference = estimate_cell(paired_difference(row["episodes"], human, metric), digits, sign="+")
+            cells[heading] = f"{metric_estimate(row['episodes'], metric).mean:.{digits}f}"
+            cells[f"{quantity}, difference to human{' [m/s]' if digits else ''}"] = str(difference)
+        table.append(cells)
+    return pd.DataFrame(table)
 
 
 def string_figure(folder: Path) -> Figure:
@@ -120,12 +110,8 @@ def string_figure(folder: Path) -> Figure:
             own = sorted((row for row in rows if row["expert"] == expert), key=lambda row: row["gain"])
             returns = [metric_estimate(row["episodes"], "return") for row in own]
             bars = [[each.mean - each.low for each in returns], [each.high - each.mean for each in returns]]
-            axes.errorbar(
-                *([row["gain"] for row in own], [each.mean for each in returns], bars),
-                color=color,
-                marker="o",
-                label=expert,
-            )
+            gains, means = [row["gain"] for row in own], [each.mean for each in returns]
+            axes.errorbar(gains, means, bars, color=color, marker="o", label=expert)
         axes.axvline(1.02, color="0.7", lw=0.8)
         axes.set(title=road, xlabel="largest string gain", ylabel="return")
     panels[0].legend()

@@ -19,15 +19,16 @@ from unjam.files import atomic_write, make_folder
 from unjam.manifest import manifest, without_folders
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import estimate_cell, with_no_break_spaces
+from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, estimate, estimate_on_shared_seeds, estimate_over_trainings, format_ci
 from unjam.reports.results import EVALUATION_FILE, read_progress, read_rows
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig, load_config
-from unjam.training.evaluate import TRAINED_LABEL, evaluate, raise_failures
+from unjam.training.evaluate import TRAINED_LABEL, evaluate, raise_failure, raise_failures
 from unjam.training.run_folder import read_config
-from unjam.worlds.record import Floats
-from unjam.worlds.worker_pool import WorkerPool
+from unjam.worlds.record import Episode, Floats
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.results_file import CONTROLLERS, StudyPart, measure_parts, write_figure, write_part
 from unjam_paper.variants import VARIANTS
 
@@ -175,10 +176,7 @@ class Study:
     """figures of its page by name, made from its results"""
 
     def run(self, study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-        """Measure the parts that have no current results, and write everything into the study's folder.
-
-        Parts may follow from the results of others: `make_parts` is asked again until it names no more.
-        """
+        """Measure parts without current results until there are no more, and write everything into `folder`."""
         parts: dict[str, StudyPart] = {}
         while (planned := self.make_parts(study_folder, seeds)) != parts:
             parts = planned
@@ -203,6 +201,20 @@ def write_manifest(folder: Path, **metadata: Any) -> None:
     write_part(folder, "manifest", {**about, **metadata})
 
 
+def measure_tasks(
+    tasks: Sequence[EpisodeTask], workers: int, make_row: Callable[[int, Episode, dict[str, Any]], dict[str, Any]]
+) -> Table:
+    """Return a row for each task, made from its number, episode and metrics; raise the first failure."""
+
+    def measured_row(number: int, episode: Episode) -> dict[str, Any]:
+        metrics = measure(episode)
+        raise_failure([metrics])
+        return make_row(number, episode, metrics)
+
+    with WorkerPool(workers) as pool:
+        return pool.run_and_map(tasks, measured_row)
+
+
 def evaluate_drivers(
     scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, workers: int
 ) -> dict[str, Table]:
@@ -220,10 +232,7 @@ def evaluate_drivers(
 def evaluate_metrics(
     scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, metrics: Sequence[str], workers: int
 ) -> dict[str, Any]:
-    """Return the verdict on each driver and these metrics of its episodes on test seeds.
-
-    The human baseline, if it is one of the drivers, is `human`.
-    """
+    """Return the verdict on each driver, relative to `human`, and these metrics of its episodes on test seeds."""
     rows = evaluate_drivers(scenario, drivers, seeds, workers)
     verdicts = feasibility_by_driver(rows)
     return {
@@ -239,10 +248,7 @@ class DriverComparison:
     roads: Sequence[Mapping[str, Any]]
 
     def groups(self, trainings: Mapping[str, str]) -> dict[str, list[str]]:
-        """Return the drivers of each row of a table: all trainings `PREFIX SEED` in one, and the others alone.
-
-        `trainings` has the names of the rows of trainings by prefix.
-        """
+        """Return the drivers of each row of a table: all `trainings`, PREFIX SEED, in one with a name, others alone."""
         groups = {label: [label] for label in self.roads[0] if label.rpartition(" ")[0] not in trainings}
         for prefix, name in trainings.items():
             own = [label for label in self.roads[0] if label.rpartition(" ")[0] == prefix]
@@ -278,6 +284,14 @@ class DriverComparison:
         """Return `yes` if drivers are feasible on all roads, else the first reason against it."""
         reasons = (verdict for verdict in self.verdicts(labels) if verdict != FEASIBLE)
         return next((reason or NO_VALUE_TEXT for reason in reasons), "yes")
+
+
+def group_rows(rows: Table, name: str) -> dict[Any, Table]:
+    """Return the rows by the value of an entry."""
+    groups: dict[Any, Table] = {}
+    for row in rows:
+        groups.setdefault(row[name], []).append(row)
+    return groups
 
 
 def mean_text(values: Floats, digits: int) -> str:

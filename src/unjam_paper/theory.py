@@ -1,7 +1,6 @@
 """Measurable quantities of the theorems of the paper, and the cost of training (Figure 8).
 
-Theorem A1 is about untrained policies, A2 about convergence, A3 about the model and its bound. The cost of all variants
-is measured side by side in one run.
+Theorem A1 is about untrained policies, A2 about convergence, A3 about the model and its bound.
 """
 
 import tempfile
@@ -40,10 +39,7 @@ RANDOM_POLICIES, HIDDEN_UNITS = 10, 64
 CONVERGENCE_TOLERANCE = 0.05
 """share of the best known return within which a training counts as converged (A2)"""
 TIMED_ROAD = "ring"
-TIMED_VARIANTS = (
-    *("trpo", "ppo", "sac", "mb-trpo", "without-model"),
-    *("proposed", "proposed-ppo", "proposed-sac", "ours"),
-)
+TIMED_VARIANTS = ("trpo", "ppo", "sac", "mb-trpo", "without-model", "proposed", "proposed-ppo", "proposed-sac", "ours")
 TIMED_STEPS, TIMED_START_STEPS, TIMING_ROUNDS = 24_000, 3_000, 3
 """environment steps of each timed training, those before SAC's first update, and rounds over all variants"""
 
@@ -86,10 +82,8 @@ def convergence_rows(study_folder: StudyFolder, road: str, seeds: int) -> Table:
     threshold = best - CONVERGENCE_TOLERANCE * abs(best)
     rows = []
     for variant, found in runs.items():
-        steps = [
-            next((row["environment_steps"] for row in run.progress if row["return_mean"] >= threshold), None)
-            for run in found
-        ]
+        close = ((row["environment_steps"] for row in run.progress if row["return_mean"] >= threshold) for run in found)
+        steps = [next(each, None) for each in close]
         last = [run.final_training_mean("return_mean") for run in found]
         row = {"variant": variant, "name": VARIANTS[variant].label, "best_known": best, "convergence_steps": steps}
         row |= {"converged_at_end": sum(value >= threshold for value in last), "trainings": len(found)}
@@ -153,8 +147,7 @@ def theory_study(title: str, road: str, untrained_roads: Sequence[str]) -> Study
 def measure_training_time(steps: int, rounds: int, workers: int) -> dict[str, Any]:
     """Return the wall time of the parts of training per 1,000 environment steps [s], by variant and round.
 
-    The variants are trained in turn, so that other load of the machine affects all of them equally; as it may slow down
-    single rounds, figures show the `median` round.
+    The variants are trained in turn, so that other load affects all of them; figures show the `median` round.
     """
     torch.set_num_threads(1)
     measured: dict[str, list[dict[str, float]]] = {variant: [] for variant in TIMED_VARIANTS}
@@ -172,10 +165,8 @@ def measure_training_time(steps: int, rounds: int, workers: int) -> dict[str, An
             thousands, parts = rows[-1]["environment_steps"] / 1000.0, seconds_by_part(rows)
             parts.pop("validation", None)  # switched off, because it is the same for all variants
             measured[variant].append({part: each / thousands for part, each in parts.items()})
-    medians = {
-        variant: sorted(each, key=lambda parts: sum(parts.values()))[len(each) // 2]
-        for variant, each in measured.items()
-    }
+    ordered = {variant: sorted(each, key=lambda parts: sum(parts.values())) for variant, each in measured.items()}
+    medians = {variant: each[len(each) // 2] for variant, each in ordered.items()}
     totals = {variant: sum(parts.values()) for variant, parts in medians.items()}
     relative = {variant: total / totals[TIMED_VARIANTS[0]] for variant, total in totals.items()}
     return {"rounds": measured, "median": medians, "relative_to_trpo": relative}

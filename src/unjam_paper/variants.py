@@ -5,10 +5,8 @@ from typing import Any
 
 from unjam.models.settings import ModelSettings
 
-STEP_BUDGET, MILLION_STEPS = 300_000, 1_000_000
-"""environment steps of a training; the larger budget where it takes less than an hour"""
-PAPER_STEP_BUDGET = 4_000_000
-"""environment steps of a training in the paper"""
+STEP_BUDGET, MILLION_STEPS, PAPER_STEP_BUDGET = 300_000, 1_000_000, 4_000_000
+"""environment steps of a training; the larger budget where it takes less than an hour; those of the paper"""
 RINGS_EXPERT, SHARED_RINGS_EXPERT = "unjam:rings-tuned", "unjam:shared-rings-tuned"
 """best experts for all rings of the family, and for rings that several CAVs share"""
 ON_RAMP_JAM_AHEAD = (
@@ -37,8 +35,7 @@ def reduced_step_variants(
 ) -> dict[str, Variant]:
     """Return `best` with an eighth of the steps of a road: alone, with twice as many, and with a model of the road.
 
-    With the model an eighth of each iteration is environment steps; the rest are episodes of `horizon` control steps in
-    the model. `common_changes` apply to all three.
+    With the model, seven eighths of each iteration are episodes of `horizon` control steps in it.
     """
     few, double = (
         {"backend": "batch", **common_changes, "trpo.steps_per_iteration": times * batch_steps} for times in (1, 2)
@@ -93,7 +90,10 @@ FIRST_150_SECONDS = {
     **{"trpo.gamma": 0.996, "trpo.gae_lambda": 0.96, "policy.exploration_std": 0.05, "policy.action_duration": 1.5},
 }
 """found by a search on the first half of the episodes of the jammed ring; `best` was found on whole episodes"""
-FILTER = {"scenario_options.safety.active": True}
+EXACT_VERSIONS: tuple[tuple[str, dict[str, Any], int], ...] = (
+    *(("", {}, PAPER_STEP_BUDGET), ("-filtered", {"scenario_options.safety.active": True}, PAPER_STEP_BUDGET)),
+    ("-million", {}, MILLION_STEPS),
+)
 EXACT_TRPO = {**NO_EXPERT, **NO_EARLY_STOPPING}
 PPO_AGENT, SAC_AGENT = {"agent": "ppo"}, {"agent": "sac"}
 VARIANTS: dict[str, Variant] = {
@@ -110,14 +110,11 @@ VARIANTS: dict[str, Variant] = {
     "trpo-as-printed": Variant("TRPO, Eq. 16 as printed", "paper", {**NO_EXPERT, "reward": "eq16-as-printed"}),
     "proposed-eq16": Variant("proposed, Eq. 16 as meant", "paper", {"reward": "eq16"}),
     "proposed-as-printed": Variant("proposed, Eq. 16 as printed", "paper", {"reward": "eq16-as-printed"}),
-    "trpo-exact": Variant("TRPO", "paper-exact", EXACT_TRPO, PAPER_STEP_BUDGET, "trpo"),
-    "proposed-exact": Variant("proposed", "paper-exact", NO_EARLY_STOPPING, PAPER_STEP_BUDGET, "proposed"),
-    "trpo-exact-filtered": Variant("TRPO", "paper-exact", {**EXACT_TRPO, **FILTER}, PAPER_STEP_BUDGET, "trpo"),
-    "proposed-exact-filtered": Variant(
-        "proposed", "paper-exact", {**NO_EARLY_STOPPING, **FILTER}, PAPER_STEP_BUDGET, "proposed"
-    ),
-    "trpo-exact-million": Variant("TRPO", "paper-exact", EXACT_TRPO, MILLION_STEPS, "trpo"),
-    "proposed-exact-million": Variant("proposed", "paper-exact", NO_EARLY_STOPPING, MILLION_STEPS, "proposed"),
+    **{
+        f"{name}-exact{suffix}": Variant(label, "paper-exact", {**own, **filtered}, steps, name)
+        for suffix, filtered, steps in EXACT_VERSIONS
+        for name, label, own in (("trpo", "TRPO", EXACT_TRPO), ("proposed", "proposed", NO_EARLY_STOPPING))
+    },
     "ours": Variant("unjam residual", "quick", {}),
     "ours-without-model": Variant("unjam residual without model", "quick", {"model.model_ratio": 0.0}),
     "best": Variant("unjam residual, all steps", "best", {}, None),
@@ -137,11 +134,9 @@ VARIANTS: dict[str, Variant] = {
     "ramp-small": Variant("unjam residual, few steps in small iterations", "best", SMALL_ITERATIONS, 86_400),
     "best-in-batches": Variant("unjam residual, all steps", "best", {"backend": "batch"}, None),
     "first-150-seconds": Variant("residual", "best", FIRST_150_SECONDS, None),
-    "rings": Variant("residual", "rings", TWO_EPISODES_PER_ROAD, None),
-    "shared-rings": Variant("residual", "shared-rings", TWO_EPISODES_PER_ROAD, None),
+    **{name: Variant("residual", name, TWO_EPISODES_PER_ROAD, None) for name in ("rings", "shared-rings", "all-roads")},
     "rings-trpo": Variant("TRPO", "rings", FROM_SCRATCH, 1_200_000),
     "rings-ppo": Variant("PPO", "rings", {**PPO_AGENT, **FROM_SCRATCH}, 1_200_000),
-    "all-roads": Variant("residual", "all-roads", TWO_EPISODES_PER_ROAD, None),
     "all-roads-trpo": Variant("TRPO", "all-roads", FROM_SCRATCH, MILLION_STEPS),
     "all-roads-ppo": Variant("PPO", "all-roads", {**PPO_AGENT, **FROM_SCRATCH}, MILLION_STEPS),
 }

@@ -11,40 +11,38 @@ import pytest
 from unjam.controller import make_driver
 from unjam.worlds.episode import can_drive
 from unjam_paper.motorway_benchmark import (
+    ACC_ALONE,
     CHANGED_SETTING,
     CHANGES,
-    FINALISTS,
-    HUMAN,
-    HUMAN_SEEDS,
-    STUDY_NAME,
-    make_job_scenario,
-    make_parts,
-    rank_candidates,
-)
-from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF
-from unjam_paper.motorway_methods import CANDIDATES_PER_METHOD, METHODS
-from unjam_paper.motorway_tables import (
-    ACC_ALONE,
     CONTROLLER,
     FINAL_PART,
+    FINALISTS,
+    HUMAN,
     HUMAN_PART,
+    HUMAN_SEEDS,
     OPPONENT,
     PACKAGED_PART,
     SENSING_PART,
     SENSITIVITY_PART,
+    STUDY_NAME,
     TEST_HUMAN_PART,
     TEST_PART,
     TUNING_PART,
     comparison_table,
     delay_change,
+    make_job_scenario,
+    make_parts,
     no_harm_table,
     packaged_table,
     parameter_effects_table,
+    rank_candidates,
     sensing_table,
     sensitivity_table,
     settings_with_breakdown,
     summary_table,
 )
+from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF
+from unjam_paper.motorway_methods import CANDIDATES_PER_METHOD, METHODS
 from unjam_paper.results_file import write_part
 from unjam_paper.study import StudyFolder
 

@@ -13,14 +13,7 @@ from unjam.errors import InputError
 from unjam.physics.fuel import fuel_rate
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.worker_pool import EpisodeTask
-from unjam_paper import (
-    fuel_optimal_plan,
-    information_ahead,
-    recorded_gaps,
-    recorded_residuals,
-    recorded_roads,
-    recorded_tables,
-)
+from unjam_paper import fuel_optimal_plan, information_ahead, recorded_gaps, recorded_roads
 from unjam_paper.fuel_optimal_plan import PlanLimits, plan_speeds
 from unjam_paper.information_ahead import (
     FIXED_PARAMETERS,
@@ -33,22 +26,22 @@ from unjam_paper.information_ahead import (
 from unjam_paper.parameter_search import SearchBudget, measure_candidates
 from unjam_paper.recorded_gaps import FIXED_PARAMETERS as FIXED_BY_LAW
 from unjam_paper.recorded_gaps import LIMITED, RECORDED_GAPS, gap_limits, search_space
-from unjam_paper.recorded_residuals import MODEL_RATIOS
 from unjam_paper.recorded_roads import (
     DRIVE_SETTINGS,
     DRIVES_PARTS,
     IDEAL_CAR,
+    MODEL_RATIOS,
     PLAN_LABEL,
     PUBLISHED_FILES,
     RECORDED_ROADS,
     RECORDINGS_FOLDER,
     TEST_DRIVES_PART,
     TRAINING_DRIVES_PART,
+    DriveResults,
     recorded_drives,
     tuned_name,
     untuned_driver,
 )
-from unjam_paper.recorded_tables import DriveResults
 from unjam_paper.results_file import read_part
 from unjam_paper.study import NO_VALUE_TEXT, StudyFolder
 
@@ -114,14 +107,13 @@ def test_a_plan_saves_fuel_within_its_limits() -> None:
 def test_the_study_tunes_trains_and_then_compares_all_drivers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorded_roads, "SEARCH_BUDGET", SearchBudget(5, 6))
     small_settings = {name: DRIVE_SETTINGS[name] for name in (*DRIVE_SETTINGS,)[:2]}
-    for module in (recorded_roads, recorded_tables):
-        monkeypatch.setattr(module, "DRIVE_SETTINGS", small_settings)
+    monkeypatch.setattr(recorded_roads, "DRIVE_SETTINGS", small_settings)
     monkeypatch.setitem(fuel_optimal_plan.OPTIMIZER_OPTIONS, "maxiter", 20)
-    monkeypatch.setattr(recorded_residuals, "STEPS_PER_ITERATION", 2000)
-    monkeypatch.setattr(recorded_residuals, "TRAINING_STEPS", 4000)
+    monkeypatch.setattr(recorded_roads, "STEPS_PER_ITERATION", 2000)
+    monkeypatch.setattr(recorded_roads, "TRAINING_STEPS", 4000)
     small = {"evaluation.validation_episodes": 2, "evaluation.validation_interval": 1, "scenario_options.window": 30.0}
     for name, value in small.items():
-        monkeypatch.setitem(recorded_residuals.TRAINING_CHANGES, name, value)
+        monkeypatch.setitem(recorded_roads.TRAINING_CHANGES, name, value)
     study = folder / "recorded-roads"
     RECORDED_ROADS.run(StudyFolder(folder), 1, study, 1)
     laws = ["human", "follower-stopper", "published", "smooth-acc, tuned", "acc, tuned"]

@@ -21,8 +21,7 @@ __all__ += ["to_sb3_vec_env", "write_onnx_policy"]
 def to_sb3_vec_env(environment: VectorEnv[Any, Any, Any]) -> "SB3VecEnv":
     """Return a vector environment of `gymnasium.make_vec` as a `VecEnv` of Stable-Baselines3.
 
-    With equal seeds, observations, rewards, ends and terminal observations are those of a `DummyVecEnv` of
-    `gymnasium.make`. No transition of a buffer belongs to Gymnasium's step between two episodes.
+    With equal seeds, it equals a `DummyVecEnv` of `gymnasium.make`, without Gymnasium's step between two episodes.
 
     Raises:
         InputError: the environment starts the next episode by itself in the same step, or returns tensors.

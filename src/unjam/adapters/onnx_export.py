@@ -67,7 +67,6 @@ def _as_table(value: PolicyInput | PolicyOutput) -> dict[str, Any]:
 
 @contextmanager
 def _quiet_export() -> Iterator[None]:
-    """Hide what torch says of packages that are not needed here, and of its own deprecated code."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

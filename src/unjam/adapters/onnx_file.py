@@ -1,7 +1,6 @@
-"""An ONNX file of a third party as a driver, with a description of its inputs and outputs in TOML.
+"""An ONNX file of a third party as a driver, with a description of its inputs and outputs in TOML: data only.
 
-The description is next to the graph (`policy.toml` for `policy.onnx`), or in the metadata of the graph itself. It
-names data only: the graph in its own folder, and an expert among the drivers with names.
+The description is next to the graph (`policy.toml` for `policy.onnx`), or in the metadata of the graph itself.
 """
 
 import os
@@ -78,7 +77,6 @@ def _read_described(path: Path) -> tuple[bytes, dict[str, Any]]:
 
 
 def _read(path: Path, max_bytes: int) -> bytes:
-    """Return the content of a regular file, which is no link."""
     if path.is_symlink():
         raise InputError(f"driver {path.name}: a symbolic link is not allowed; allowed: the file itself")
     try:
@@ -102,7 +100,6 @@ def _parse_description(content: bytes, name: str) -> dict[str, Any]:
 
 
 def _expert(name: Any, time_step: float) -> Driver:
-    """Return the expert of a description: a driver with a name, which is no file."""
     if not isinstance(name, str) or split_parameters(name)[0] not in DRIVERS:
         raise unknown_name("expert", name, DRIVERS)
     return driver_from_name(name, time_step)

@@ -29,27 +29,22 @@ def policy_driver(
     """Return a policy as a driver that runs in this process, without exploration.
 
     With the features of its Gymnasium environment as `inputs`, and the same expert, a model of Stable-Baselines3 drives
-    as in that environment. Observations are clipped to its observation space, and normalized by its `VecNormalize`
-    environment if it has one. Expert and sum are limited as its actions. Its further training changes the driver, too.
+    as in that environment, with its limits and its `VecNormalize`. Its further training changes the driver, too.
 
     Args:
         policy: a function of observations of n CAVs, shape (n, inputs), that returns numbers, shape (n,) or (n, 1); a
-            `torch.nn.Module`, of which a copy in evaluation mode is such a function, in the precision and on the device
-            of its parameters, and also takes tensors, as in `DifferentiableRings`; an algorithm or a policy of
-            Stable-Baselines3 whose actions are a `Box` of one number; or the path of the .zip file of a model, which is
-            read without unpickling. The file does not contain the statistics of `VecNormalize`.
-        inputs: its observation in order: names of features such as `local`, `PolicyInput`s, or functions of a
-            `LocalState`.
+            `torch.nn.Module`, of which a copy in evaluation mode is such a function, and also takes tensors, as in
+            `DifferentiableRings`; an algorithm or a policy of Stable-Baselines3 whose actions are a `Box` of one
+            number; or the path of the .zip file of a model (without unpickling, and without `VecNormalize`).
+        inputs: its observation in order: names of features, `PolicyInput`s, or functions of a `LocalState`.
         expert: a driver to which the accelerations are added; None: the policy drives alone.
         output: what its numbers mean; without limits, those of a model's action space.
         time_step: control step of the road [s].
-        policy_time_step: control step with which the policy was trained [s], a multiple of that of the road, for which
-            its action is held; None: that of the road.
+        policy_time_step: control step of the policy [s], a multiple of that of the road; None: that of the road.
 
     Raises:
         InputError: the policy does not take these inputs, returns another shape, has other actions, or is recurrent;
-            or the file is missing, damaged or no `MlpPolicy` with continuous actions, without state-dependent
-            exploration.
+            or the file is missing, damaged or no `MlpPolicy` with continuous actions and usual exploration.
         MissingPartError: torch is not installed, or cannot read weights safely.
     """
     label, function, size, torch = object_label(policy), policy, None, sys.modules.get("torch")

@@ -22,18 +22,11 @@ MIN_EXPLORATION = 1e-3
 
 
 def stable_baselines3_model(driver: ResidualDriver, agent: str) -> Any:
-    """Return a model whose deterministic action is the residual of a driver [m/s2].
+    """Return a model of an algorithm of `ALGORITHMS` whose deterministic action is the residual of a driver [m/s2].
 
     Its observations are those of the Gymnasium environments with the driver's expert and features. Its actor has the
-    weights of the driver; critics and optimizers are new.
-
-    Args:
-        driver: the residual.
-        agent: the algorithm: `trpo`, which is in sb3-contrib, `ppo`, `sac` or `td3`.
-
-    Raises:
-        InputError: there is no such algorithm.
-        MissingPartError: Stable-Baselines3 is not installed.
+    weights of the driver; critics and optimizers are new. Raise `InputError` for an unknown algorithm,
+    `MissingPartError` without Stable-Baselines3.
     """
     if agent not in ALGORITHMS:
         raise unknown_name("agent", agent, ALGORITHMS)

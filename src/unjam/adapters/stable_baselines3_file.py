@@ -1,8 +1,4 @@
-"""The policy of a file of Stable-Baselines3, without unpickling: only its JSON and its weights are read.
-
-`PPO.load` and its siblings unpickle parts of the file, which can run any code. Here these parts are ignored, and the
-network is rebuilt from the names of its weights.
-"""
+"""The policy of a file of Stable-Baselines3 from its JSON and its weights alone: unpickling can run any code."""
 
 import io
 import json
@@ -54,10 +50,7 @@ class _Actor:
 
 ACTORS = (
     _Actor(
-        hidden="mlp_extractor.policy_net.",
-        output="action_net.",
-        others=("log_std", "mlp_extractor.value_net.", "value_net."),
-        activation="Tanh",
+        *("mlp_extractor.policy_net.", "action_net.", ("log_std", "mlp_extractor.value_net.", "value_net."), "Tanh"),
         is_squashed=False,
     ),
     _Actor("actor.latent_pi.", "actor.mu.", ("actor.log_std.", "critic.", "critic_target."), "ReLU", is_squashed=True),
@@ -122,11 +115,8 @@ def _read_parts(content: bytes, names: Sequence[str] | None = None) -> dict[str,
 
 
 def _check_pickles(parts: dict[str, bytes]) -> None:
-    """Raise `ValueError` if a pickle is too large, or has a tuple more than once.
-
-    Tuples of tuples of the same one are as small in a file as they are large to hash: torch would never end. Shapes of
-    weights are tuples that occur once.
-    """
+    # Tuples of tuples of the same one are as small in a file as they are large to hash: torch would never end. The
+    # shapes of weights are tuples that occur once.
     for content in (part for name, part in parts.items() if name.endswith(PICKLE_SUFFIX)):
         if len(content) > MAX_PICKLE_BYTES:
             raise ValueError(f"a pickle larger than {MAX_PICKLE_BYTES:,} bytes")
@@ -177,7 +167,6 @@ def _find_actor(weights: dict[str, Floats]) -> _Actor:
 
 
 def _read_activation(data: dict[str, Any], actor: _Actor) -> Callable[[Floats], Floats]:
-    """Return the activation; raise `ValueError` if options change the actions in another way."""
     options = dict(data["policy_kwargs"])
     name = re.sub(r".*\.|'>", "", options.pop("activation_fn", actor.activation))
     if not data["policy_class"]["__module__"].startswith(POLICY_PACKAGES):

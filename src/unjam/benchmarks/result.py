@@ -24,13 +24,10 @@ from unjam.road_family import FAMILY
 if TYPE_CHECKING:  # imported late, so that commands start quickly
     import pandas as pd
 
-FILE_FORMAT = 1
+FILE_FORMAT, DIGITS, MAX_LABEL_CHARACTERS = 1, 7, 500
+"""version of files; significant digits of stored metrics; maximum length of the name of a driver"""
 MAX_FILE_BYTES = 4 * 2**20
 """maximum size of a file; one with all roads has 200 kB"""
-MAX_LABEL_CHARACTERS = 500
-"""of the name of a driver"""
-DIGITS = 7
-"""significant digits of stored metrics"""
 MAX_RELATIVE_DIFFERENCE = 1e-4
 """allowed relative difference to reference values of the human baseline"""
 TRAINING_STEPS_UNIT = "environment steps: control steps in the simulator"
@@ -91,10 +88,7 @@ class BenchmarkResult:
         return found
 
     def mean_gain(self, part: str = "all roads") -> Estimate:
-        """Return the mean gain over the finished roads of one of `PARTS`, with its 95 % CI over roads and seeds.
-
-        Roads and seeds are crossed random effects (`estimate_crossed`). Raise `InputError` for an unknown part.
-        """
+        """Return the mean gain over the finished roads of one of `PARTS`, with its 95 % CI over roads and seeds."""
         if not isinstance(part, str) or part not in PARTS:
             raise unknown_name("part", part, PARTS)
         own = [seeds for name, (_, seeds, _) in self._gains.items() if FAMILY[name].part in PARTS[part]]
@@ -115,10 +109,7 @@ class BenchmarkResult:
         return {name: each.mean for name, (each, *_) in self._gains.items()}
 
     def road_rows(self) -> list[dict[str, Any]]:
-        """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend.
-
-        If all roads are finished, the means follow.
-        """
+        """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend; then the means."""
         rows: list[dict[str, Any]] = [
             {"road": name, "part": FAMILY[name].part, **_interval(each), "feasible": verdict}
             | {"backend": self.roads[name].backend, "expert": references()[name]["expert"]}
@@ -167,7 +158,6 @@ def to_columns(rows: gain.EpisodeRows) -> dict[str, list[Any]]:
 
 
 def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
-    """Return the rows of stored columns."""
     seeds, values = iter(FAMILY_TEST_SEEDS), zip(*columns.values(), strict=True)
     rows = (dict(zip(columns, row, strict=True)) for row in values)
     return [{"seed": next(seeds)} | {name: nan if each is None else each for name, each in row.items()} for row in rows]

@@ -1,8 +1,8 @@
 """Run a benchmark: the human baseline and a driver on the test seeds of each road of a suite."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,6 @@ from unjam.worlds.worker_pool import WorkerPool
 
 EXACT_BACKEND = "exact"
 """backend of benchmarks: the batch where its episodes are those of SUMO, else SUMO"""
-
 MAX_TRAINING_STEPS = 2**53
 """environment steps that a result can record"""
 
@@ -73,8 +72,7 @@ def benchmark(
         training_steps: environment steps that made the driver, unless its file says so: control steps (decisions of the
             driver) in the simulator, the calls of `env.step` of all environments together.
         progress: called with a line after each road.
-        roads: names of roads of the suite, for a trial: only these are driven. The result is not finished then, and
-            cannot be compared; `out` can be continued without `roads`.
+        roads: names of roads of the suite, for a trial: only these are driven, and the result cannot be compared.
 
     Raises:
         InputError: an argument is wrong, the driver fails or can drive on no road, or `out` has another result or is
@@ -104,8 +102,13 @@ def benchmark(
         training_steps=_recorded_steps(label) or training_steps,
         manifest={**origin, "command": without_folders(origin["command"]), "backend": backend},
     )
-    path = None if out is None else Path(out)
-    with _locked_result(path), WorkerPool(workers or os.cpu_count() or 1) as pool:
+    path, lock = None if out is None else Path(out), nullcontext()
+    if path is not None:
+        if path.is_symlink():
+            raise invalid_value("out", str(path), "a file, and no link")
+        make_folder(path.parent)
+        lock = lock_file(path.with_name(f".{path.name}.lock"), f"out: {str(path)!r}")
+    with lock, WorkerPool(workers or os.cpu_count() or 1) as pool:
         if path is not None and os.path.lexists(path):
             result = _stored_result(path, result)
             progress(f"{len(result.roads)} of {len(scenarios)} roads are in {path.name}, and are not driven again")
@@ -136,19 +139,6 @@ def _check_roads(roads: Sequence[str], suite: Suite) -> Sequence[str]:
     return names or suite.roads
 
 
-@contextmanager
-def _locked_result(path: Path | None) -> Iterator[None]:
-    """Make the folder of a result, and lock its file for this process; None: there is none."""
-    if path is None:
-        yield
-        return
-    if path.is_symlink():
-        raise invalid_value("out", str(path), "a file, and no link")
-    make_folder(path.parent)
-    with lock_file(path.with_name(f".{path.name}.lock"), f"out: {str(path)!r}"):
-        yield
-
-
 def _make_drivers(
     driver: str | DriverLike, roads: dict[str, Scenario]
 ) -> tuple[dict[str, Driver], dict[str, InputError]]:
@@ -173,7 +163,8 @@ def _drive_road(scenario: Scenario, driver: Driver, backend: str, pool: WorkerPo
     simulator = "sumo" if is_exact else backend
     tasks = make_tasks(scenario, driver, FAMILY_TEST_SEEDS, simulator)
     # Code of users may compute with all rows at once, which are CAVs of different roads in a batch.
-    if is_exact and not unsupported_reason(scenario) and _is_free_of_user_code(driver):
+    can_batch = is_exact and not unsupported_reason(scenario) and is_serializable(driver)
+    if can_batch and not user_code_recipes(driver_recipe(driver)[0]):
         return "batch", [_measure_episode(*each) for each in enumerate(run_batches(tasks))]
     if tasks[0].is_serializable:
         return simulator, pool.run_and_map(tasks, _measure_episode)
@@ -183,10 +174,6 @@ def _drive_road(scenario: Scenario, driver: Driver, backend: str, pool: WorkerPo
 def _measure_episode(index: int, episode: Episode) -> dict[str, Any]:
     raise_failure([] if episode.has_run else [measure(episode)])
     return family_metrics(index, episode)
-
-
-def _is_free_of_user_code(driver: Driver) -> bool:
-    return is_serializable(driver) and not user_code_recipes(driver_recipe(driver)[0])
 
 
 def _driver_hash(label: str, driver: Driver) -> str | None:
@@ -202,7 +189,6 @@ def _driver_hash(label: str, driver: Driver) -> str | None:
 
 
 def _recorded_steps(label: str) -> int | None:
-    """Return the environment steps that the file of a controller records, of its training or tuning."""
     path = controller_path(label) if label else None
     if path is None:
         return None

@@ -53,8 +53,5 @@ def find_suite(name: str) -> Suite:
 
 @cache
 def references() -> dict[str, dict[str, Any]]:
-    """Return by road the best tuned `expert`, and by test seed the `performance` of it and of the human `baseline`.
-
-    They are rows of the study `all-roads`, measured in SUMO; the expert was selected on other seeds.
-    """
+    """Return by road the best tuned `expert`, and by test seed the `performance` of it and of the human `baseline`."""
     return json.loads((files("unjam.benchmarks") / "references.json").read_text(encoding="utf-8"))["roads"]

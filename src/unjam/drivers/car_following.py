@@ -267,14 +267,10 @@ class DrivingStrategy(NamedTuple):
     deceleration: float
 
 
-FREE_ROAD_STRATEGY = DrivingStrategy(1.0, 1.0, 1.0)
-"""strategy on a free road, and in a jam"""
-JAM_TAIL_STRATEGY = DrivingStrategy(1.0, 1.0, 0.7)
-"""strategy at the upstream end of a jam: early braking, for the safety of the vehicles behind"""
-BOTTLENECK_STRATEGY = DrivingStrategy(0.7, 1.5, 1.0)
-"""near a merge"""
-JAM_HEAD_STRATEGY = DrivingStrategy(0.5, 2.0, 1.0)
-"""strategy at the downstream end of a jam: a larger outflow makes the jam shorter"""
+FREE_ROAD_STRATEGY, BOTTLENECK_STRATEGY = DrivingStrategy(1.0, 1.0, 1.0), DrivingStrategy(0.7, 1.5, 1.0)
+"""strategies on a free road and in a jam, and near a merge"""
+JAM_TAIL_STRATEGY, JAM_HEAD_STRATEGY = DrivingStrategy(1.0, 1.0, 0.7), DrivingStrategy(0.5, 2.0, 1.0)
+"""strategies at the upstream end of a jam, where CAVs brake early, and at the downstream end, with a larger outflow"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)

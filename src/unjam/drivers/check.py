@@ -21,12 +21,12 @@ PROBE_ROWS, MAX_PROBE_DIFFERENCE = 4, 1e-4
 def check_driver(
     driver: DriverLike, rows: int = 8, steps: int = 50, seed: int = 0, optional_fields: bool = False
 ) -> None:
-    """Check that a driver fulfills the contract of `unjam.drivers.Driver`.
+    """Check that a driver fulfills the contract of `unjam.Driver`; an `InputError` names the violation and its step.
 
     It drives `rows` vehicles for `steps` random steps, drawn from `seed`. Accelerations must be finite and of shape
     (rows,), n rows at once must equal n single calls to 1e-12 (to 1e-5 in single precision), the same call must give
-    the same answer, and neither state nor memory may be changed. With `optional_fields` the state has all fields that
-    motorways provide. Raise `InputError` with one line that names the violation and its step.
+    the same answer, and neither state nor memory may be changed. With `optional_fields` the state has those of
+    motorways, too.
     """
     driver = as_driver(driver)
     reads_optional_fields = set(driver.requirements().input_fields) > set(COMMON_FIELDS)
@@ -46,7 +46,10 @@ def check_driver(
         repeated, _ = _call_act(driver, state, memory_copy, step)
         if not np.array_equal(acceleration, repeated):
             raise InputError(f"driver: step {step}: the same state and memory gave another acceleration")
-        tolerance = _row_tolerance(driver, state, memory)
+        decision = driver.decide(state, memory)
+        parts = decision.command.acceleration, decision.residual
+        is_single = any(str(getattr(part, "dtype", "")).endswith("float32") for part in parts)
+        tolerance = MAX_SINGLE_PRECISION_DIFFERENCE if is_single else MAX_ROW_DIFFERENCE
         for row in range(rows):
             answer, single[row] = _call_act(driver, state.select(slice(row, row + 1)), single[row], step)
             alone, among = float(np.asarray(answer)[0]), float(acceleration[row])
@@ -84,14 +87,6 @@ def _call_act(driver: Driver, state: LocalState, memory: Memory, step: int) -> t
         raise InputError(f"driver: step {step}: {type(error).__name__}: {error}") from error
 
 
-def _row_tolerance(driver: Driver, state: LocalState, memory: Memory) -> float:
-    """Return the allowed difference between rows; float32 networks round differently for another number of rows."""
-    decision = driver.decide(state, memory)
-    parts = decision.command.acceleration, decision.residual
-    is_single = any(str(getattr(part, "dtype", "")).endswith("float32") for part in parts)
-    return MAX_SINGLE_PRECISION_DIFFERENCE if is_single else MAX_ROW_DIFFERENCE
-
-
 def check_acceleration(acceleration: Any, rows: int, context: str) -> np.ndarray:
     """Return the answer of a driver as an array; raise `InputError` unless it is finite and has `rows` rows."""
     array = answer_as_array(acceleration, rows, f"driver: {context}")
@@ -109,18 +104,13 @@ def random_state(generator: np.random.Generator, rows: int, optional_fields: boo
     if not optional_fields:
         return near
     lane_speeds, road_speeds = generator.uniform(0.0, 30.0, (2, rows, SECTIONS_AHEAD))
-    allowed, distance = generator.uniform(20.0, 30.0, rows), generator.uniform(-500.0, 2000.0, rows)
-    adjacent_gaps = generator.uniform(-5.0, 60.0, (rows, len(ADJACENT_POSITIONS)))
-    return near._replace(
-        allowed_speed=allowed,
-        distance_to_merge=distance,
-        lane_speeds=lane_speeds,
-        road_speeds=road_speeds,
-        adjacent_gaps=adjacent_gaps,
-        adjacent_speeds=generator.uniform(0.0, 30.0, adjacent_gaps.shape),
-        penetration_rate=generator.uniform(0.0, 0.3, rows),
-        congestion=(generator.random((rows, SECTIONS_AHEAD)) < 0.3).astype(float),
-    )
+    fields = {"lane_speeds": lane_speeds, "road_speeds": road_speeds}
+    fields["allowed_speed"] = generator.uniform(20.0, 30.0, rows)
+    fields["distance_to_merge"] = generator.uniform(-500.0, 2000.0, rows)
+    fields["adjacent_gaps"] = generator.uniform(-5.0, 60.0, (rows, len(ADJACENT_POSITIONS)))
+    fields["adjacent_speeds"] = generator.uniform(0.0, 30.0, (rows, len(ADJACENT_POSITIONS)))
+    fields["penetration_rate"] = generator.uniform(0.0, 0.3, rows)
+    return near._replace(**fields, congestion=(generator.random((rows, SECTIONS_AHEAD)) < 0.3).astype(float))
 
 
 def _is_same_memory(memory: Memory, other: Memory) -> bool:

@@ -45,10 +45,7 @@ def _as_doubles(answer: Any) -> NDArray[np.float64]:
 def as_numbers(
     answer: Any, label: str, allowed: str = "", to_array: Callable[[Any], Array] = _as_doubles
 ) -> NDArray[np.float64]:
-    """Return the answer of a user's code as an array of any shape; raise `InputError` unless it consists of numbers.
-
-    The message says what is `allowed`. `to_array` makes another kind of array.
-    """
+    """Return the answer of a user's code as an array, made by `to_array`; raise `InputError` unless it is numbers."""
     try:
         return to_array(answer)
     except (TypeError, ValueError, RuntimeError):  # the last for tensors with a gradient
@@ -68,10 +65,7 @@ def answer_as_array(
 
 
 def batch_commanded_accelerations(command: Command | None, limits: Limits, rows: int, step: int) -> Array:
-    """Return the commands of the vehicles on many roads, within the limits, shape (rows,) [m/s2].
-
-    Raise `InputError` unless they are finite numbers, one for each row.
-    """
+    """Return the commands within the limits, shape (rows,) [m/s2]; `InputError` unless they are finite, one a row."""
     found: Any = () if command is None else command.acceleration
     if np.shape(found) != (rows,) or not bool(namespace(found).isfinite(found).all()):
         raise InputError(f"driver: step {step}: not {rows} accelerations that are finite")
@@ -81,8 +75,7 @@ def batch_commanded_accelerations(command: Command | None, limits: Limits, rows:
 def commanded_accelerations(command: Command | None, limits: Limits, names: Sequence[str], step: int) -> list[float]:
     """Return the commands of the vehicles `names`, within the limits, as plain floats [m/s2].
 
-    An acceleration is a number, or one for each vehicle; None is right for no vehicle. Raise `InputError` with `step`
-    in its message if an acceleration is not finite, or their number is not that of the vehicles.
+    Raise `InputError` with `step` in its message unless they are finite, one for each vehicle.
     """
     found: Array = () if command is None else command.acceleration
     rows = len(names)

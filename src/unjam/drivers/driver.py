@@ -67,17 +67,11 @@ class Driver(Subclassable):
         return {name: inner.initial_memory(n) for name, inner in self.inner_drivers.items()}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return `memory` as if the driver had observed `history` before it took over.
-
-        Called once, after a warm-up. `history` holds arrays of shape (n, steps), oldest first.
-        """
+        """Return `memory` as if the driver had observed `history`, a warm-up of shape (n, steps), oldest first."""
         return memory | {name: inner.recall(memory[name], history) for name, inner in self.inner_drivers.items()}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the desired acceleration [m/s2], shape (n,), and the memory after this step.
-
-        The road limits the acceleration. `state` and `memory` are not changed.
-        """
+        """Return the desired acceleration [m/s2], shape (n,), and the memory after this step, as a new object."""
         raise NotImplementedError
 
     def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
@@ -125,10 +119,7 @@ class Driver(Subclassable):
         return None
 
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
-        """Return what it and the drivers that it contains need; with `road`, only those that drive there count.
-
-        If it has an attribute `time_step`, its formulas assume this control step.
-        """
+        """Return what it and its inner drivers need, on `road` only those that drive there; with its `time_step`."""
         step = getattr(self, "time_step", None)
         own = self.own_requirements._replace(time_steps=frozenset(() if step is None else (step,)))
         return merge_requirements(own, *(driver.requirements(road) for driver in self.active_drivers(road)))

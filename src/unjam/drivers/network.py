@@ -18,11 +18,9 @@ LOG_STD_RANGE = (-20.0, 2.0)
 class Network:
     """A perceptron with ReLU layers and a bounded output: `authority * tanh(last layer)`.
 
-    Exploration adds noise with standard deviation `exploration_std`. If the last layer has a second output, it is
-    the log of the standard deviation, and the noise is added before the tanh: `authority * tanh(first output +
-    noise)` (soft actor-critic).
-
-    Weights are float64, so that n rows at once equal n single rows to 1e-12 and the trained float32 network to 1e-6.
+    Exploration adds noise with standard deviation `exploration_std`. A second output of the last layer is the log of
+    the standard deviation of noise before the tanh (soft actor-critic). Weights are float64, so that n rows at once
+    equal n single rows to 1e-12.
     """
 
     layers: tuple[tuple[Floats, Floats], ...] = field(repr=False)
@@ -45,32 +43,33 @@ class Network:
             raise invalid_value("network: authority", self.authority, "> 0")
         if not 0.0 <= self.exploration_std < math.inf:
             raise invalid_value("network: exploration_std", self.exploration_std, ">= 0")
-        *hidden, last = _fold_biases(self.layers)
+        # Biases as weights of an additional unit that is always 1 save a NumPy call a layer.
+        folded = (np.vstack([weight, bias]) for weight, bias in self.layers)
+        *hidden, last = (np.hstack([weights, np.eye(len(weights))[:, -1:]]) for weights in folded)
         object.__setattr__(self, "squashes_noise", self.layers[-1][1].shape == (2,))
         object.__setattr__(self, "_hidden_weights", tuple(hidden))
         object.__setattr__(self, "_last_weights", last)
         object.__setattr__(self, "_residual_weights", np.ascontiguousarray(last[:, 0]))
 
     def __call__(self, observation: Any) -> Any:
-        """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), a float for a tuple.
-
-        The result for torch tensors is a tensor of their precision, on their device.
-        """
-        if isinstance(observation, tuple):
-            return self.authority * math.tanh(self._hidden_units_of_arrays(observation).dot(self._residual_weights))
-        if isinstance(observation, np.ndarray):
-            return self.authority * np.tanh(self._hidden_units_of_arrays(observation).dot(self._residual_weights))
-        return self.authority * self._outputs_on_tensors(observation)[:, 0].tanh()
+        """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), array or tensor; a float for a tuple."""
+        if not isinstance(observation, (tuple, np.ndarray)):
+            return self.authority * self._outputs_on_tensors(observation)[:, 0].tanh()
+        tanh = math.tanh if isinstance(observation, tuple) else np.tanh
+        return self.authority * tanh(self._hidden_units_of_arrays(observation).dot(self._residual_weights))
 
     def explore(self, observation: Any, noise: Any) -> Any:
-        """Return the residual with exploration.
+        """Return the residual with exploration; `noise` is standard normal and has the shape of the residual.
 
-        `noise` is standard normal and has the shape of the residual; with `episode_noise` it has a number for each
-        unit of the last hidden layer and one for the bias, shape (n, units + 1), or (units + 1,) for a tuple.
+        With `episode_noise` it has a number for each unit of the last hidden layer and the bias, shape (n, units + 1).
         Source: generalized state-dependent exploration, Raffin et al. 2022, CoRL, which leaves the bias out.
         """
         if self.episode_noise:
-            shift = self.exploration_std * (self._hidden_units(observation) * noise).sum(-1)
+            if isinstance(observation, (tuple, np.ndarray)):
+                units = self._hidden_units_of_arrays(observation)
+            else:
+                units = append_ones(self._hidden_units_of_tensors(observation))
+            shift = self.exploration_std * (units * noise).sum(-1)
             return self(observation) + (float(shift) if isinstance(observation, tuple) else shift)
         if not self.squashes_noise:
             return self(observation) + self.exploration_std * noise
@@ -93,12 +92,6 @@ class Network:
             weight, bias = _as_tensors_like(hidden, layer)
             hidden = namespace(hidden).addmm(bias, hidden, weight).relu_()
         return hidden
-
-    def _hidden_units(self, observation: Any) -> Any:
-        """Return the last hidden layer and a one, shape (n, units + 1), or (units + 1,) for a tuple."""
-        if isinstance(observation, (tuple, np.ndarray)):
-            return self._hidden_units_of_arrays(observation)
-        return append_ones(self._hidden_units_of_tensors(observation))
 
     def _hidden_units_of_arrays(self, observation: Any) -> Floats:
         """Return the last hidden layer, with an additional unit that is always 1."""
@@ -125,15 +118,6 @@ class Network:
 def append_ones(units: Array) -> Array:
     """Return a layer of tensors with an additional unit that is always 1."""
     return namespace(units).cat([units, units.new_ones((len(units), 1))], -1)
-
-
-def _fold_biases(layers: tuple[tuple[Floats, Floats], ...]) -> tuple[Floats, ...]:
-    """Return the layers with biases as part of the weights, which saves a NumPy call a layer.
-
-    The input and each hidden layer get an additional unit that is always 1.
-    """
-    folded = (np.vstack([weight, bias]) for weight, bias in layers)
-    return tuple(np.hstack([weights, np.eye(len(weights))[:, -1:]]) for weights in folded)
 
 
 def _as_tensors_like(tensor: Any, layer: tuple[Floats, Floats]) -> Any:

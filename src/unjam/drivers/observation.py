@@ -35,9 +35,7 @@ from unjam.errors import InputError, RowError, invalid_value, unknown_name
 from unjam.parameters import STRICT, Number, parameter_dataclass
 from unjam.physics.arrays import Array, Floats, as_column, clip, join_columns, namespace, stack_columns
 
-RELATIVE_SPEED_SCALE = 5.0
-GAP_SCALE = 20.0
-MERGE_DISTANCE_SCALE = 1000.0
+RELATIVE_SPEED_SCALE, GAP_SCALE, MERGE_DISTANCE_SCALE = 5.0, 20.0, 1000.0
 MAX_OBSERVATION = 50.0
 """bound of the observations of environments; larger values are clipped"""
 PROXIMITY_DISTANCES = (0.0, 250.0, 500.0, 1000.0, 2000.0)
@@ -70,18 +68,11 @@ class Feature:
 def local_observation(state: LocalState) -> Array:
     """Return the observation of the paper, divided by fixed scales: shape (n, 5), no unit; a tuple for plain numbers.
 
-    Own speed; relative speed and gap to the leader; relative speed and gap to the follower.
-    Relative speeds are the other's minus the own; gaps are bumper to bumper.
+    Own speed; relative speed (the other's minus the own) and gap to the leader, and to the follower.
     """
-    return stack_columns(
-        (
-            state.speed / SPEED_SCALE,
-            (state.leader_speed - state.speed) / RELATIVE_SPEED_SCALE,
-            state.leader_gap / GAP_SCALE,
-            (state.follower_speed - state.speed) / RELATIVE_SPEED_SCALE,
-            state.follower_gap / GAP_SCALE,
-        )
-    )
+    ahead = (state.leader_speed - state.speed) / RELATIVE_SPEED_SCALE, state.leader_gap / GAP_SCALE
+    behind = (state.follower_speed - state.speed) / RELATIVE_SPEED_SCALE, state.follower_gap / GAP_SCALE
+    return stack_columns((state.speed / SPEED_SCALE, *ahead, *behind))
 
 
 def lap_position(state: LocalState) -> Array:
@@ -91,7 +82,6 @@ def lap_position(state: LocalState) -> Array:
 
 
 def _section_speed_feature(field: str, location: str) -> Feature:
-    """Return the feature with the speeds of a field of `LocalState` for each section ahead, minus the own speed."""
     distances = (f"{ROAD_SECTION_LENGTH * number:g} m" for number in range(SECTIONS_AHEAD))
     return Feature(
         lambda inputs: (getattr(inputs.state, field) - inputs.state.speed[..., None]) / SPEED_SCALE,
@@ -315,7 +305,6 @@ def _user_feature(function: UserFunction) -> Feature:
 
 
 def _feature_columns(function: UserFunction, state: LocalState, size: int | None = None) -> Floats:
-    """Return the values of a user's feature, shape (n, size); raise `InputError` if they have another shape."""
     rows, found = len(state.speed), as_numbers(function(state), f"{function.label}: feature")
     columns = found[:, None] if found.ndim == 1 else found
     if columns.ndim != 2 or columns.shape != (rows, columns.shape[1] if size is None else size):

@@ -46,11 +46,12 @@ class OnnxPolicy:
 
     def initial_memory(self, n: int) -> Memory:
         """Return the initial recurrent state of `n` CAVs, in the types of the graph."""
-        return {each.input: self._initial_rows(each, n) for each in self.memory}
-
-    def _initial_rows(self, memory: PolicyMemory, n: int) -> NDArray[Any]:
-        tensor = self.tensors[memory.input]
-        return np.broadcast_to(np.array(memory.initial, tensor.type), (n, *(tensor.shape or ())[1:])).copy()
+        rows: Memory = {}
+        for each in self.memory:
+            tensor = self.tensors[each.input]
+            initial = np.array(each.initial, tensor.type)
+            rows[each.input] = np.broadcast_to(initial, (n, *(tensor.shape or ())[1:])).copy()
+        return rows
 
     def __call__(self, observation: NDArray[np.float64], memory: Memory) -> tuple[Any, Memory]:
         """Return the numbers of the graph and the new recurrent state; raise `InputError` if it cannot be run."""
@@ -73,18 +74,12 @@ class OnnxPolicy:
         return values[:, 0] if len(tensor.shape or ()) == 1 else values
 
 
-@lru_cache(maxsize=16)
-def _cached_session(graph: bytes) -> Any:
-    return open_session(graph)
+_cached_session = lru_cache(maxsize=16)(open_session)
 
 
 @dataclass(frozen=True, eq=False)
 class OnnxDriver(PolicyDriver):
-    """A policy from an ONNX graph, alone or added to an expert.
-
-    Raise `InputError` if the graph is not allowed, or does not fit its description, `MissingPartError` if a package is
-    not installed.
-    """
+    """A policy from an ONNX graph, alone or added to an expert; raises errors as `unjam.adapters.onnx_driver`."""
 
     policy: Any = field(init=False)  # an `OnnxPolicy`
     graph: NDArray[np.uint8] = field(kw_only=True, repr=False)
@@ -141,7 +136,6 @@ def _read_tensor(value: Any) -> Tensor:
 
 
 def _assign_columns(description: PolicyDescription, expert: Driver, names: list[str]) -> dict[str, tuple[int, ...]]:
-    """Return the columns of the observation for each input of a graph."""
     columns: dict[str, list[int]] = {name: [] for name in names}
     start = 0
     for each in description.inputs:

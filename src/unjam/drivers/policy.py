@@ -1,8 +1,7 @@
 """Policies that others have trained: what their numbers mean, and the driver around them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass as plain_dataclass
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -91,7 +90,7 @@ class PolicyDescription:
     memory: tuple[PolicyMemory, ...] = ()
 
 
-@plain_dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class PolicyDriver(ExpertWrapper):
     """A policy that others have trained, alone or added to an expert; other processes cannot build it."""
 
@@ -151,10 +150,7 @@ class PolicyDriver(ExpertWrapper):
         return self.description.output.acceleration(numbers, state, step), {POLICY_KEY: after}
 
     def evaluate(self, observation: Any, memory: Memory) -> tuple[Array, Memory]:
-        """Return the numbers of the policy, shape (n,), and its new memory.
-
-        Raise `InputError` if they are not finite, or of another shape.
-        """
+        """Return the numbers of the policy, shape (n,), and its new memory; `InputError` unless they are finite."""
         rows, xp = len(observation), namespace(observation)
         answer, after = self.policy(observation, memory)
         numbers = np.asarray(answer) if xp is np else xp.as_tensor(answer)
@@ -170,7 +166,7 @@ class PolicyDriver(ExpertWrapper):
         return self.label if self.expert == Constant() else f"{self.expert.describe()} + {self.label}"
 
 
-@plain_dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class TensorPolicyDriver(PolicyDriver):
     """A policy that also takes torch tensors, through which gradients flow from the state to the acceleration."""
 

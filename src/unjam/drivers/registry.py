@@ -72,10 +72,7 @@ def driver_from_name(text: str, time_step: float) -> Driver:
 
 
 def driver_recipe(driver: Driver) -> tuple[Recipe, Arrays]:
-    """Return the recipe of a driver and the weights of its networks; `driver_from_recipe` is the inverse.
-
-    Raise `InputError` if no other process could build such a driver.
-    """
+    """Return the recipe of a driver and its networks' weights; `InputError` if no other process could build it."""
     for each in _all_drivers(driver):
         if not _is_portable(each):
             reason = "is not allowed here: it drives in its own process only"
@@ -87,7 +84,6 @@ def driver_recipe(driver: Driver) -> tuple[Recipe, Arrays]:
 
 
 def _all_drivers(driver: Driver) -> Iterator[Driver]:
-    """Yield a driver and all drivers that it contains."""
     yield driver
     for inner in driver.inner_drivers.values():
         yield from _all_drivers(inner)
@@ -100,8 +96,7 @@ def is_serializable(driver: Driver) -> bool:
 
 def _is_portable(driver: Driver) -> bool:
     """Return whether other processes have the class of a driver; what this process alone registers is unknown there."""
-    kind = type(driver)
-    return kind in DRIVER_CLASSES.values() and is_packaged(kind)
+    return type(driver) in DRIVER_CLASSES.values() and is_packaged(type(driver))
 
 
 def driver_from_recipe(recipe: Recipe, weights: Arrays) -> Driver:
@@ -120,8 +115,7 @@ def driver_from_recipe(recipe: Recipe, weights: Arrays) -> Driver:
 def user_code_recipes(recipe: Any) -> list[Recipe]:
     """Return the parts of `recipe` that refer to the user's own files, which are Python code.
 
-    Raise `InputError` if a network reads a feature from a file that is not listed with its hash, `LookupError` or
-    `TypeError` if `recipe` is not valid.
+    Raise `InputError` if a feature's file is not listed with its hash, `LookupError` or `TypeError` if it is not valid.
     """
     parts = list(_iterate_recipes(recipe))
     files = [part for part in parts if part["kind"] == "file"]

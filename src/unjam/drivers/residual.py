@@ -93,10 +93,7 @@ class ExpertWrapper(DriverWrapper):
 
 @parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class ResidualDriver(ExpertWrapper):
-    """Adds the output of a network to an expert, within the action limit: Eq. 8 of the paper.
-
-    Any driver can be the expert, including another `ResidualDriver`.
-    """
+    """Adds the output of a network to any driver, the expert, within the action limit: Eq. 8 of the paper."""
 
     own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 

@@ -21,12 +21,9 @@ GATHERED_LAP_FRACTION, BROKEN_LAP_FRACTION = 0.5, 0.45
 """free shares of the lap ahead: from the first on, all have gathered behind; below the second, their queue is broken"""
 MIN_PACE = 1.0
 """minimum speed of a pacer [m/s]; at standstill no queue would form"""
-MAX_JAM_DISTANCE = 60.0
-"""distance to a jam from which it waits [m]"""
-FREE_ROAD_GAP = 99.0
-"""gap from which the road counts as free [m]"""
-MAX_OVERRUN = 50.0
-"""distance after `last_position` at which it stops waiting [m]"""
+MAX_JAM_DISTANCE, FREE_ROAD_GAP, MAX_OVERRUN = 60.0, 99.0, 50.0
+"""distance to a jam from which a jam absorber waits, gap from which the road counts as free, and distance after
+`last_position` at which it stops waiting [m]"""
 UNBOUNDED_ACCELERATION = 100.0
 """acceleration above that of any ACC, which does not limit the vehicle [m/s2]"""
 MIN_REPORTED_CONGESTION = 0.5
@@ -47,10 +44,8 @@ TUNED_PACERS: dict[float, dict[str, Any]] = {
     475.9: _tuned_pacer((8.35, -2.057, 3.128, 0.477, 0.086, -0.086, 0.075), 0.04, 0.552),
     489.3: _tuned_pacer((9.039, -1.791, 3.513, 1.051, 0.015, 0.024, 0.216), 0.044, 0.581),
 }
-"""parameters for `use_tuned`, by the length of the lap [m]: of the figure eight with radii 30, 32, 33, 34 and 35 m.
-
-Found by a search over the pace; at 34 m it is 0.1 m/s lower than in the search result, which broke on one of ten seeds.
-"""
+"""parameters for `use_tuned` by the length of the lap [m], found by a search over the pace: of radii of 30, 32, 33, 34
+(0.1 m/s lower than found, as the queue broke on one of ten seeds) and 35 m"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -129,13 +124,11 @@ class Pacer(FormulaDriver):
         xp = namespace(state.speed)
         ready, broken = free >= self.gathering_gap * loop, free < self.regathering_gap * loop
         gathered = xp.where(ready, free * 0.0 + 1.0, xp.where(broken, free * 0.0, memory["has_gathered"]))
-        pace = self._pace(state) + self.gap_gain * (free - self.target_gap * loop)
-        pace = clamp_min(pace, MIN_PACE)
+        pace = clamp_min(self._pace(state) + self.gap_gain * (free - self.target_gap * loop), MIN_PACE)
         target = xp.where(gathered > 0.0, pace, free * 0.0 + self.gathering_speed)
         return (target - state.speed) / self.time_constant, {"has_gathered": gathered}
 
     def _pace(self, state: LocalState) -> Array:
-        """Return the pace at the current position, before the change for the free road ahead."""
         if not self.harmonics:
             return state.loop_length / self.lap_time
         xp = namespace(state.speed)
@@ -233,9 +226,7 @@ class AdvisorySpeed(FormulaDriver):
     """
 
     name: ClassVar[str] = "advisory-speed"
-    own_requirements: ClassVar[Requirements] = Requirements(
-        required_fields=frozenset({"distance_to_merge"}), used_fields=frozenset({"distance_to_merge"})
-    )
+    own_requirements: ClassVar[Requirements] = Requirements(required_fields=frozenset({"distance_to_merge"}))
 
     advised_speed: Positive = 19.4
     """[m/s]"""

@@ -83,11 +83,10 @@ JAM_ENTRY_SPEED_RATIO, JAM_EXIT_SPEED_RATIO = 0.8, 0.9
 
 
 class CongestionMonitor:
-    """Detects congestion in each section, relative to the highest flow that the section has carried.
+    """Detects congestion: a section is denser and much slower than at the highest flow that it has carried so far.
 
-    In free traffic, flow increases with density, even if all vehicles drive far below the speed limit. A section is
-    congested once it is denser and much slower than at its highest flow. If an episode starts in a jam, the jam
-    has the highest flow, and no section is congested before a higher flow has been observed.
+    In free traffic, flow increases with density, even if all vehicles drive far below the speed limit. An episode that
+    starts in a jam has no congestion before a higher flow.
     """
 
     def __init__(self, sections: int, step: float) -> None:
@@ -97,10 +96,7 @@ class CongestionMonitor:
         self._is_congested = np.zeros(sections, bool)
 
     def update(self, counts: Floats, speed_sums: Floats) -> NDArray[np.bool_]:
-        """Return which sections are congested, after one more measurement of their vehicles.
-
-        Density is in vehicles per section, flow is the sum of their speeds [m/s]: only ratios matter.
-        """
+        """Return which sections are congested, after the number of their vehicles and the sum of speeds [m/s]."""
         self._density += self._update_weight * (counts - self._density)
         self._flow += self._update_weight * (speed_sums - self._flow)
         higher = self._flow > self._highest_flow
@@ -146,9 +142,9 @@ class RoadSections:
         return roads, lanes + 1, sections
 
     def totals(self, vehicles: MeasuredVehicles) -> Floats:
-        """Return the number of vehicles and the sum of their speeds [m/s] by road, lane and section.
+        """Return the number of vehicles and the sum of their speeds [m/s], shape (2, roads, lanes + 1, sections).
 
-        The shape is (2, roads, lanes + 1, sections); the last lane stands for all lanes of the main road.
+        The last lane stands for all lanes of the main road.
         """
         _, lane_count, sections = self._shape
         section = (vehicles.positions // ROAD_SECTION_LENGTH).astype(np.intp).clip(0, sections - 1)
@@ -179,10 +175,7 @@ class SpeedMeasurement:
         """means of the detectors' last interval but one, and of the last one"""
 
     def update(self, vehicles: MeasuredVehicles) -> Floats:
-        """Return mean speeds by road, lane and section [m/s]; the last lane stands for all lanes of the main road.
-
-        Sections of which nothing is known, and those beyond the end, have the allowed speed.
-        """
+        """Return mean speeds by road, lane (as in `totals`) and section [m/s]; the allowed speed if unknown."""
         if self._settings.source == "vehicles":
             means = _means(self._sections.totals(vehicles), self._allowed_speed)
         elif self._settings.source == "cavs":
@@ -199,7 +192,6 @@ class SpeedMeasurement:
             totals[:, roads] = 0.0
 
     def _detector_means(self, vehicles: MeasuredVehicles) -> Floats:
-        """Return what the nearest detector of each section has published."""
         spacing = self._settings.detector_spacing
         nearest = (vehicles.positions // spacing + 0.5) * spacing
         has_passed = (vehicles.positions >= nearest) & (vehicles.positions - vehicles.speeds * self._step < nearest)
@@ -214,6 +206,5 @@ class SpeedMeasurement:
 
 
 def _means(totals: Floats, missing: Floats | float) -> Floats:
-    """Return mean speeds of cells with vehicles, and `missing` for the others [m/s]."""
     count, total = totals
     return np.where(count > 0, total / count.clip(1), missing)

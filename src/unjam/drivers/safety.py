@@ -1,9 +1,7 @@
 """The safety filter, and the actuator of a vehicle with its delay and lag.
 
-The filter prevents contact and keeps the time gap above a minimum. It passes an acceleration if the vehicle can
-afterwards still stop behind a leader that brakes at the assumed maximum, and keep its time gap behind a leader that
-brakes hard; otherwise it brakes as hard as necessary.
-`docs/safety.md` states the assumptions and proves both properties for the discrete steps of the simulator.
+The filter passes an acceleration if the vehicle can afterwards still stop behind a leader that brakes at the assumed
+maximum, and keep its time gap behind one that brakes hard. `docs/safety.md` has the assumptions and the proof.
 """
 
 import sys
@@ -100,10 +98,9 @@ class FollowingState(NamedTuple):
     """own front bumper to the leader's rear bumper; infinite without a leader"""
 
 
-MAX_COMMAND = 20.0
-"""largest acceleration that a vehicle with delay or lag can be allowed [m/s2]"""
-MAX_TRACED_SPEED = 50.0
-"""highest speed for which an exported graph of a filter with delay or lag keeps time gaps [m/s]"""
+MAX_COMMAND, MAX_TRACED_SPEED = 20.0, 50.0
+"""largest acceleration that a vehicle with delay or lag can be allowed [m/s2], and highest speed for which its exported
+graph keeps time gaps [m/s]"""
 MAX_LEADER_GAP = 1e6
 """finite gap that replaces larger ones in formulas that count steps [m]"""
 
@@ -151,10 +148,9 @@ class SafetyFilter(Subclassable):
         step: float,
         actuation: tuple[Actuator, ActuatorState] | None = None,
     ) -> Array:
-        """Return the allowed part of a desired acceleration [m/s2], of its shape.
+        """Return the allowed part of a desired acceleration [m/s2] that holds for one `step` of simulation [s].
 
-        The command holds for one `step` of simulation [s]. Without `actuation`, an actuator and its current state, the
-        vehicle responds at once.
+        Without `actuation`, an actuator and its current state, the vehicle responds at once.
         """
         if not self.active:
             return acceleration
@@ -190,11 +186,8 @@ class SafetyFilter(Subclassable):
     def _max_command_for_time_gap(
         self, state: FollowingState, step: float, actuator: Actuator, actuator_state: ActuatorState
     ) -> Array:
-        """Return the highest command that keeps the minimum time gap if both brake with `time_gap_braking` after it.
-
-        After the pending commands, and with n further ones of that braking, own speed and gap are linear in the
-        command as long as the vehicle moves; each n gives a bound. `state.gap` is reduced by the standstill gap.
-        """
+        # After the pending commands, and n further ones of `time_gap_braking`, own speed and gap are linear in the
+        # command as long as the vehicle moves; each n gives a bound. `state.gap` is reduced by the standstill gap.
         braking, time_gap, decay = self.time_gap_braking, self.time_gap, actuator.decay(step)
         speed, leader, gap = state
         for _ in actuator_state.pending:
@@ -215,10 +208,7 @@ class SafetyFilter(Subclassable):
         return allowed - braking
 
     def _max_speed_for_time_gap(self, leader_speed: Array, gap: Array, step: float) -> Array:
-        """Return the highest speed that keeps the minimum time gap while both brake with `time_gap_braking`.
-
-        `gap` is reduced by the standstill gap.
-        """
+        """Return the highest speed that keeps the time gap while both brake; `gap` is reduced by the standstill gap."""
         braking, time_gap = self.time_gap_braking, self.time_gap
         later = clamp_min(leader_speed - braking * step, 0.0)
         end = gap + stopping_distance(leader_speed, braking, step)
@@ -231,12 +221,9 @@ class SafetyFilter(Subclassable):
     def _limit_by_plan_if_needed(
         self, acceleration: Array, state: FollowingState, step: float, actuator: Actuator, actuator_state: ActuatorState
     ) -> Array:
-        """Return the allowed part of an acceleration, for which plans of braking are only made where they matter.
-
-        Until it stands, the vehicle is never faster than `top`, and drives at most as far as one that first keeps this
-        speed until the command arrives, and then brakes without lag. The gap to a leader that brakes equally hard is
-        smallest now or at the end. So the bounds below suffice for any plan.
-        """
+        # Plans of braking are only made where they matter. Until it stands, the vehicle is never faster than `top`, and
+        # drives at most as far as one that keeps this speed until the command arrives, and then brakes without lag. The
+        # gap to a leader that brakes equally hard is smallest now or at the end: the bounds below suffice for any plan.
         speed, leader, gap = state
         gap = gap - (self.gap_error + self.standstill_gap)
         leader, commands = clamp_min(leader - self.speed_error, 0.0), clamp_min(acceleration, 0.0)
@@ -315,10 +302,7 @@ class CAVActuation:
             self._states[name] = ActuatorState(acceleration.detach(), tuple(each.detach() for each in pending))
 
     def apply(self, name: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
-        """Return the filtered command for a desired acceleration, and the acceleration in this step [m/s2].
-
-        Once in each simulation step; all numbers are plain, or arrays of vehicles with a common name.
-        """
+        """Return the filtered command for a desired acceleration, and the acceleration in this simulation step."""
         if not self._has_lag:
             command = self._limit(acceleration, state, self._step)
             return command, command

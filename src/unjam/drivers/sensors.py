@@ -43,11 +43,9 @@ class SensorReadings:
         self._last_readings: dict[str, Floats] = {}
 
     def read_for_filter(self, name: str, state: FollowingState) -> FollowingState:
-        """Return the readings for a safety filter, which subtracts the largest errors.
+        """Return the readings for a safety filter, once per simulation step; `state` has numbers, or arrays.
 
-        It must be called once per simulation step. If a reading is missing, it is assumed that the leader has braked at
-        its maximum since the last reading. The values of `state` are numbers, or arrays for several vehicles with a
-        common name.
+        If a reading is missing, it is assumed that the leader has braked at its maximum since the last one.
         """
         sensors, generator, shape = self._sensors, self._filter_generator, np.shape(state.speed)
         leader = state.leader_speed + sensors.speed_error * generator.uniform(-1.0, 1.0, shape)
@@ -63,10 +61,7 @@ class SensorReadings:
         return FollowingState(state.speed, *((leader, gap) if shape else (float(leader), float(gap))))
 
     def read_for_driver(self, names: Sequence[str], state: LocalState) -> LocalState:
-        """Return the true `state` with the readings of the sensors; missing readings keep the last value.
-
-        The values of `state` are arrays with a row for each of the `names`, or numbers for a single CAV.
-        """
+        """Return the true `state` of CAVs (numbers for one) as read; missing readings keep the last value."""
         sensors, generator = self._sensors, self._driver_generator
         true = np.array([state.leader_gap, state.follower_gap, state.leader_speed, state.follower_speed])
         errors = np.repeat([sensors.gap_error, sensors.speed_error], 2)[:, None]

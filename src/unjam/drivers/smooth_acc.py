@@ -10,16 +10,12 @@ from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
 from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
 from unjam.physics.arrays import Array, clamp_max, clamp_min, clip, namespace, stack_columns
 
-FREE_TIME_GAP = 1.0
-"""time gap that is kept free when a braking beyond the limit is computed [s]"""
 MIN_AVERAGING = 1e-9
 """averaging time that stands for none [s]"""
-MIN_ROOM = 1.0
-"""[m]"""
-GAP_LIMIT_TIME = 3.0
-"""time constant with which the largest gap is approached, critically damped [s]"""
-MAX_CATCH_UP = 1.5
-"""acceleration with which the largest gap is kept [m/s2]"""
+FREE_TIME_GAP, MIN_ROOM = 1.0, 1.0
+"""time gap [s] that is kept free when a braking beyond the limit is computed, and smallest room for it [m]"""
+GAP_LIMIT_TIME, MAX_CATCH_UP = 3.0, 1.5
+"""time constant of the critically damped approach to the largest gap [s], and acceleration that keeps it [m/s2]"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)

@@ -28,10 +28,9 @@ class _SpeedBuffer:
 
 @dataclass(frozen=True)
 class BufferedWindow:
-    """A window of torch rows, oldest speed first: a part of a buffer.
+    """A window of torch rows, oldest speed first: a part of a buffer, behind which a slide writes the newest speed.
 
-    A slide writes the newest speed behind the window in the buffer. Nothing is copied and the older window stays
-    valid, until the buffer is full or another memory that started from the same window has written there.
+    Nothing is copied, until the buffer is full or another memory that started from the same window has written there.
     """
 
     buffer: _SpeedBuffer
@@ -67,10 +66,7 @@ class BufferedWindow:
 
 @dataclass(frozen=True)
 class CircularWindow:
-    """A window of torch rows in the order of `empty_window`, without a shared buffer.
-
-    Slower than `BufferedWindow`, but a pure function of its rows, as the graph of a controller requires.
-    """
+    """A window of torch rows in the order of `empty_window`: a pure function, as the graph of a controller requires."""
 
     rows: Array
     """speeds of the last steps [m/s], shape (n, steps)"""
@@ -90,7 +86,6 @@ class CircularWindow:
 
 
 def _buffered_window(window: Array, count: Array) -> BufferedWindow:
-    """Return the window of torch rows, shape (n, steps) as from `empty_window`, oldest speed first."""
     steps = window.shape[1]
     order = (count[:, None] + namespace(window).arange(steps, device=window.device)) % steps
     return BufferedWindow.from_speeds(window.take_along_dim(order.long(), 1).T)
@@ -109,10 +104,7 @@ def empty_window(n: int, window: float, time_step: float) -> SpeedWindow:
 
 
 def slide_window(memory: SpeedWindow, speed: Array) -> SpeedWindow:
-    """Return the window one step later, with `speed` [m/s] of shape (n,) as the newest.
-
-    The old window is not changed; that of torch rows becomes a `BufferedWindow`, unless it is a `CircularWindow`.
-    """
+    """Return the window one step later, with `speed` [m/s] of shape (n,) as the newest; the old one is not changed."""
     window, count = memory["window"], memory["count"]
     if type(speed) is float:
         window = window[:]

@@ -87,10 +87,7 @@ def last_line(error: BaseException, file: str) -> str:
 
 
 def _as_numpy_function(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of an array, or of a named tuple of arrays or tensors.
-
-    A `torch.nn.Module` receives them as tensors of its own type and device; gradients flow through those from tensors.
-    """
+    """Return a function of arrays; a `torch.nn.Module` gets tensors of its own type and device, with gradients."""
     torch: Any = sys.modules.get("torch")  # it is imported where its modules exist; workers run without it
     module: Any = function
     if torch is None or not isinstance(module, torch.nn.Module):
@@ -136,11 +133,7 @@ class FileReference:
         return f"{self.path.name}:{self.name}"
 
     def read_code(self) -> UserCode:
-        """Return the current code of the file.
-
-        Raise `InputError` if it is missing, unreadable or not Python, imports a compiled module of its folder, or does
-        not have the hash of the reference.
-        """
+        """Return the code of the file; `InputError` if it is missing, unreadable or not Python, or has another hash."""
         if not os.path.isfile(self.path):
             raise InputError(f"Python file: {str(self.path)!r} is not a file")
         if self.path.suffix != ".py":
@@ -158,10 +151,7 @@ class FileReference:
         return self.find_object(self.run_file(code or self.read_code()))
 
     def load_object_once(self) -> tuple[Any, "FileReference"]:
-        """Return the object with the name, and the reference with its hash; the same code runs once in a process.
-
-        Raise `InputError` as `load_object`.
-        """
+        """Return as `load_object`, and the reference with its hash; the same code runs once in a process."""
         code = self.read_code()
         key = self.path, code.sha256
         if key not in _modules:
@@ -316,10 +306,7 @@ DriverLike = Driver | DriverProtocol | type[Driver] | type[DriverProtocol] | Cal
 
 
 def as_driver(driver: DriverLike, time_step: float = FileDriver.time_step) -> Driver:
-    """Return any `DriverLike` as a `Driver`; `time_step` is the control step of its road [s], an argument of classes.
-
-    Raise `InputError` if it is not a driver.
-    """
+    """Return any `DriverLike` as a `Driver`; raise `InputError` if it is none. `time_step` is its control step [s]."""
     if isinstance(driver, str):
         raise invalid_value("driver", driver, f"an object, such as unjam.make_driver({driver!r}, {time_step})")
     name = object_label(driver)
@@ -328,10 +315,7 @@ def as_driver(driver: DriverLike, time_step: float = FileDriver.time_step) -> Dr
 
 
 def _make_implementation(candidate: Any, time_step: float, label: str, parameters: dict[str, Any] | None = None) -> Any:
-    """Return an object with `act` and `initial_memory` from one, from a class with `parameters`, or from a function.
-
-    A parameter `time_step` of a class gets the control step of the road [s].
-    """
+    """Return an object with `act` and `initial_memory` from one, from a class with `parameters`, or from a function."""
     if inspect.isclass(candidate):
         try:
             steps = {"time_step": time_step} if _takes_time_step(candidate) else {}

@@ -79,10 +79,7 @@ class DriverWrapper(CompositeDriver):
 
 @dataclass(frozen=True)
 class MixedDriver(CompositeDriver):
-    """Assigns drivers to CAVs in turn: the first CAV has the first driver, the next the next, and so on.
-
-    After the last driver it starts again with the first; CAVs that enter an open road count in order of entry.
-    """
+    """Assigns drivers to CAVs in turn, again from the first after the last; CAVs of open roads in order of entry."""
 
     own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)
 
@@ -109,9 +106,7 @@ class MixedDriver(CompositeDriver):
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time gap by the driver of each CAV."""
-        return self._select(
-            memory, (driver.time_gaps(state, memory[key]) for key, driver in self.inner_drivers.items())
-        )
+        return self._select(memory, (each.time_gaps(state, memory[key]) for key, each in self.inner_drivers.items()))
 
     def _select(self, memory: Memory, answers: Iterable[Array | None]) -> Array | None:
         """Return the answer by the driver of each CAV, NaN for those without; None if there is no answer."""
@@ -180,8 +175,7 @@ class ImpairedDriver(DriverWrapper):
 class FilteredDriver(DriverWrapper):
     """Another driver with the limits and the safety filter of a road, for a vehicle without its own filter.
 
-    Controllers are exported in this form: the driver carries the proven filter with it, which knows the actuator of
-    the vehicle and its pending commands. On a road with the same filter and actuator and one simulation step per
+    Controllers are exported in this form. On a road with the same filter and actuator and one simulation step per
     control step, nothing changes.
     """
 
@@ -242,10 +236,7 @@ class FilteredDriver(DriverWrapper):
 
 @parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class HistoryDriver(DriverWrapper):
-    """Drives as another driver does, and keeps means of its own speed, its square, and its gap for a network.
-
-    Until an averaging time has passed, its mean is that of all control steps so far.
-    """
+    """Drives as another driver does, and keeps means of its own speed, its square, and its gap for a network."""
 
     own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
@@ -256,15 +247,9 @@ class HistoryDriver(DriverWrapper):
     @property
     def memory_inputs(self) -> tuple[ScaledInput, ...]:
         """Those of the inner driver, and its own."""
-        own = (
-            entry
-            for time in AVERAGING_TIMES
-            for entry in (
-                ScaledInput(f"mean own speed over {time:g} s", SPEED_SCALE, "m/s"),
-                ScaledInput(f"standard deviation of own speed over {time:g} s", SPEED_STD_SCALE, "m/s"),
-                ScaledInput(f"mean gap over {time:g} s", MEAN_GAP_SCALE, "m"),
-            )
-        )
+        kinds = (("mean own speed", SPEED_SCALE, "m/s"), ("standard deviation of own speed", SPEED_STD_SCALE, "m/s"))
+        entries = [(time, *kind) for time in AVERAGING_TIMES for kind in (*kinds, ("mean gap", MEAN_GAP_SCALE, "m"))]
+        own = (ScaledInput(f"{name} over {time:g} s", scale, unit) for time, name, scale, unit in entries)
         return (*self.driver.memory_inputs, *own)
 
     def initial_memory(self, n: int) -> Memory:
@@ -316,9 +301,8 @@ class HistoryDriver(DriverWrapper):
 class QueueFallback(CompositeDriver):
     """Drives by a driver that leads all others in one queue, and by a fallback once that queue has not held.
 
-    Human drivers with larger time gaps, or more of them, form a queue that is longer than half a lap at the pace of
-    the CAV, and meets its own tail at the crossing. No map provides their time gaps. The criterion is therefore that
-    the queue has not formed within `MAX_GATHERING_TIME`, or has broken. The switch is final.
+    A queue that is longer than half a lap meets its own tail at the crossing, and no map provides the time gaps of
+    human drivers. So it must form within `MAX_GATHERING_TIME`, and must not break. The switch is final.
     """
 
     primary: Driver

@@ -35,11 +35,7 @@ RARE_SHARE = 1e-3
 
 
 def read_leaders(path: Path) -> list[LeaderRecording]:
-    """Return the recordings in a file, which is read once: of tables with leaders, those of the leaders.
-
-    Raises:
-        InputError: the file is missing, has no speeds or implausible ones, or a row is bad.
-    """
+    """Return the recordings in a file, of leaders if it has some; `InputError` if it is missing or implausible."""
     return list(_read_leaders(path, file_stamp(path)))
 
 
@@ -76,11 +72,9 @@ def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, 
 
 
 def _follower_table(frame: pd.DataFrame, column: str, stem: str) -> pd.DataFrame:
-    """Return a table of speeds as one of trajectories with each recorded vehicle as the leader.
-
-    A column of vehicles without equal values has the numbers of the rows.
-    """
+    """Return a table of speeds as one of trajectories with each recorded vehicle as the leader."""
     names = [str(name) for name in frame.columns if alphanumeric(name) in VEHICLE_NAMES]
+    # A column without equal values has the numbers of the rows.
     names = [name for name in names if 1 < len(frame[[name]].drop_duplicates()) < len(frame)]
     vehicles = stem + "-" + join_row_values(frame, tuple(names)) if names else stem
     table = to_numeric(frame.loc[:, ["line", "time", column]], ["time", column])

@@ -36,10 +36,7 @@ class LeaderRecording:
 
 
 def recording_files(path: Path) -> list[Path]:
-    """Return the files of a folder that can be recordings, ordered by name; or the file itself.
-
-    The last part of `path` may be a pattern like `2021-03*`. Raise `InputError` if there is none.
-    """
+    """Return the file, or those of a folder or pattern (`2021-03*`) that can be recordings; `InputError` if none."""
     if path.is_file():
         return [path]
     folder, pattern = (path, "*") if path.is_dir() else (path.parent, path.name)

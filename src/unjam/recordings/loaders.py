@@ -23,14 +23,10 @@ COLUMN_ALIASES = {"t": "time", "v_foll": "speed", "v_lead": "leader_speed"}
 """alternative column names of plain tables"""
 VALUE_LIMITS = {"speed": (0.0, 70.0), "leader_speed": (0.0, 70.0), "gap": (0.0, 1000.0)}
 """smallest and largest allowed value of a column [m/s, m/s, m]; other values are errors, or have another unit"""
-TIME_STEP_TOLERANCE = 0.01
-"""largest relative difference between intervals of rows that are equal, and between time steps that are"""
-MISSING_ROW_INTERVAL = 1.5
-"""shortest interval in which a row is missing, relative to the usual one"""
-MAX_TIME_STEP = 1.5
-"""longest time between two samples [s]: waves of a few seconds must be visible"""
-MIN_TRAJECTORY_SAMPLES = 3
-"""fewest samples of a trajectory: the interval between two single rows is no time step"""
+TIME_STEP_TOLERANCE, MISSING_ROW_INTERVAL = 0.01, 1.5
+"""largest relative difference between equal intervals, and smallest ratio to the usual one where a row is missing"""
+MAX_TIME_STEP, MIN_TRAJECTORY_SAMPLES = 1.5, 3
+"""longest time between two samples, to see waves of a few seconds [s], and fewest samples of a trajectory"""
 UNIT_RATIO_LIMITS = (2 / 3, 1.5)
 """smallest and largest ratio of quantities that are equal where the units of all columns fit each other"""
 CHANGE_SECONDS, MIN_GAP_CHANGE, MIN_CORRELATION = 5.0, 1.0, 0.7
@@ -49,10 +45,8 @@ RECONSTRUCTED_COLUMNS = ("vehicleid", "frameid", "localy", "vehiclelength", "mea
 """names of `VEHICLE_COLUMNS` in the reconstructed NGSIM I-80 data (Montanino and Punzo 2015), without underscores"""
 HIGHD_COLUMNS = ("id", "frame", "x", "width", "xVelocity", "laneId", "precedingId")
 """names of `VEHICLE_COLUMNS` in the tracks of highD (Krajewski et al. 2018)"""
-HIGHD_FRAME_RATE = 25.0
-"""frames per second of highD [1/s]"""
-MAX_VEHICLE_ABSENCE = 60.0
-"""longest absence of a vehicle number [s]; after a longer one the number belongs to another vehicle"""
+HIGHD_FRAME_RATE, MAX_VEHICLE_ABSENCE = 25.0, 60.0
+"""frames per second of highD [1/s], and longest absence of a vehicle, after which its number is that of another [s]"""
 FCD_COLUMNS = ("timestep_time", "vehicle_speed", "vehicle_leaderSpeed", "vehicle_leaderGap")
 """names of `TABLE_COLUMNS[1:]` in SUMO's FCD output as CSV, which contains leaders with the option
 --fcd-output.max-leader-distance"""
@@ -99,12 +93,9 @@ class ReadResult:
 
 
 def read_trajectories(path: Path, format: str = "", options: ReadOptions | None = None) -> ReadResult:
-    """Return the trajectories of a file, see `tables.read_table`.
+    """Return the trajectories of a file in a format of `FILE_FORMATS`; empty: it is detected from the columns.
 
-    `format` is a name in `FILE_FORMATS`; empty: it is detected from the columns.
-
-    Raises:
-        InputError: the file is missing or has another format, its units are wrong, or a row is bad.
+    Raise `InputError` if the file is missing or has another format, its units are wrong, or a row is bad.
     """
     if format and format not in FILE_FORMATS:
         raise unknown_name("format", format, FILE_FORMATS)
@@ -117,7 +108,6 @@ def trajectories_of_table(frame: pd.DataFrame, path: Path, options: ReadOptions,
 
 
 def _convert_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of a plain table with `TABLE_COLUMNS` and any of `OPTIONAL_COLUMNS`."""
     frame = frame.rename(columns={other: name for other, name in COLUMN_ALIASES.items() if name not in frame})
     _check_columns(frame, TABLE_COLUMNS, path)
     if options.driver_columns and "driver" not in frame:
@@ -144,10 +134,7 @@ def _convert_reconstructed(frame: pd.DataFrame, path: Path, options: ReadOptions
 
 
 def _convert_highd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of a highD file.
-
-    Its x is the left end of a vehicle, and decreases over time for one direction of travel.
-    """
+    """Return the trajectories of a highD file: x is the left end of a vehicle, and decreases in one direction."""
     vehicles = _select_columns(frame, HIGHD_COLUMNS, VEHICLE_COLUMNS, path)
     # The direction is that of the whole lane, because a standing vehicle has none.
     is_forward = vehicles.groupby("lane")["speed"].transform("sum").to_numpy() >= 0
@@ -157,10 +144,7 @@ def _convert_highd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Rea
 
 
 def _convert_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of SUMO's FCD output: one for each combination of vehicle and leader.
-
-    Both may change their edge or lane meanwhile.
-    """
+    """Return the trajectories of SUMO's FCD output: one for each combination of vehicle and leader."""
     key = ("vehicle_id", "vehicle_leaderID")
     vehicles = _select_columns(frame, FCD_COLUMNS, TABLE_COLUMNS[1:], path)
     _check_columns(frame, key, path)
@@ -171,7 +155,6 @@ def _convert_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadR
 
 
 def _trajectories_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of a table with `VEHICLE_COLUMNS`, in which each row names the number of the leader."""
     low, high = MEDIAN_LENGTH_LIMITS
     median = float(np.nanmedian(vehicles["length"]))
     if not low <= median <= high:
@@ -197,10 +180,7 @@ def _trajectories_from_vehicles(vehicles: pd.DataFrame, path: Path, options: Rea
 
 
 def _reused_number_suffix(vehicles: pd.DataFrame) -> pd.Series:
-    """Return a suffix that distinguishes vehicles with the same number: "" for the first one, "2" for the second.
-
-    The vehicle numbers of NGSIM restart every 15 minutes.
-    """
+    """Return "" for the first vehicle with a number, "2" for the second: those of NGSIM restart every 15 minutes."""
     ordered = vehicles.sort_values(by="time", kind="stable")
     key = [ordered["site"], ordered["vehicle"]]
     is_new = ordered["time"].groupby(key, dropna=False).diff() > MAX_VEHICLE_ABSENCE
@@ -253,13 +233,11 @@ def alphanumeric(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", str(name).lower())
 
 
-def _select_columns(
-    frame: pd.DataFrame, names: tuple[str, ...], new_names: tuple[str, ...], path: Path
-) -> pd.DataFrame:
+def _select_columns(frame: pd.DataFrame, names: tuple[str, ...], labels: tuple[str, ...], path: Path) -> pd.DataFrame:
     """Return the column `line`, and these columns as numbers under new names."""
     _check_columns(frame, names, path)
     numbers = to_numeric(frame.loc[:, ["line", *names]], names)
-    return numbers.rename(columns=dict(zip(names, new_names, strict=True)))
+    return numbers.rename(columns=dict(zip(names, labels, strict=True)))
 
 
 def _check_columns(frame: pd.DataFrame, required: Iterable[str], path: Path) -> None:
@@ -271,10 +249,7 @@ def _check_columns(frame: pd.DataFrame, required: Iterable[str], path: Path) -> 
 
 
 def join_row_values(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
-    """Return for each row the values of these columns, joined by hyphens.
-
-    Rows with equal values are joined only once, because a file may have millions of rows.
-    """
+    """Return for each row the values of these columns, joined by hyphens, equal ones only once for speed."""
     group = frame.groupby(list(columns), sort=False, observed=True, dropna=False).ngroup()
     first = frame[list(columns)].loc[~group.duplicated()]
     names = ["-".join(map(str, row)) for row in first.itertuples(index=False)]
@@ -282,9 +257,9 @@ def join_row_values(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
 
 
 def to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
-    """Return the table with these columns as numbers; other values become NaN, which makes their rows bad.
+    """Return the table with these columns as numbers, also with commas between thousands; other values become NaN.
 
-    A number may have commas between thousands. The column `not_numeric` has the first other value of each row.
+    The column `not_numeric` has the first other value of each row.
     """
     columns, not_numeric = dict[str, pd.Series](), pd.Series("", frame.index)
     for name in names:
@@ -309,10 +284,8 @@ def split_trajectories(
     """Return the trajectories of a table with the columns `line`, `TABLE_COLUMNS` and any of `OPTIONAL_COLUMNS`.
 
     A trajectory consists of rows of one pair, between which none is missing. Its time step is that of its pair. Rows
-    may be in any order. `skipped_rows` has the numbers of rows that were skipped before, by reason.
-
-    Raises:
-        InputError: a row is bad, or no trajectory remains.
+    may be in any order. `skipped_rows` has the numbers of rows that were skipped before, by reason. Raise `InputError`
+    if a row is bad, or no trajectory remains.
     """
     (is_bad, bad_rows), skipped_rows = _find_bad_rows(frame), skipped_rows or {}
     bad_count = int(np.sum(is_bad))
@@ -329,8 +302,7 @@ def split_trajectories(
     has_missing = [each > MISSING_ROW_INTERVAL * np.median(each) for each in intervals]
     regular = [each[~missing] for each, missing in zip(intervals, has_missing, strict=True)]
     steps = _common_time_steps([float(each.mean()) for each in regular], [float(each.sum()) for each in regular])
-    trajectories, part_counts, short_count = list[FollowingTrajectory](), Counter[str](), len(good)
-    longest = 0.0
+    trajectories, part_counts, short_count, longest = list[FollowingTrajectory](), Counter[str](), len(good), 0.0
     for rows, missing, step in zip(groups, has_missing, steps, strict=True):
         for first, last in pairwise([0, *(np.flatnonzero(missing) + 1).tolist(), len(rows)]):
             seconds = (last - first - 1) * step
@@ -349,12 +321,11 @@ def split_trajectories(
             part_counts[pair] += 1
             name = pair if part_counts[pair] == 1 else f"{pair}/{part_counts[pair]}"
             trajectories.append(FollowingTrajectory(name, driver or pair, step, speed, leader_speed, gap, kind, split))
+    limit = f"{options.min_seconds:g} s"
     if not trajectories:
-        raise InputError(
-            f"{path.name}: no trajectory lasts {options.min_seconds:g} s; the longest lasts {longest:.3g} s"
-        )
+        raise InputError(f"{path.name}: no trajectory lasts {limit}; the longest lasts {longest:.3g} s")
     _check_units(trajectories, path)
-    reasons = {**skipped_rows, f"trajectories shorter than {options.min_seconds:g} s": short_count}
+    reasons = {**skipped_rows, f"trajectories shorter than {limit}": short_count}
     return ReadResult(trajectories, len(frame) + sum(skipped_rows.values()), bad_rows, reasons)
 
 
@@ -400,10 +371,7 @@ def _common_time_steps(steps: Sequence[float], seconds: Sequence[float]) -> list
 
 
 def _at_even_times(rows: pd.DataFrame, step: float) -> list[Floats]:
-    """Return speed, leader speed and gap of rows at equal intervals.
-
-    Rows at equal intervals with rounded time stamps are unchanged; between others values are interpolated.
-    """
+    """Return speed, leader speed and gap of rows at equal intervals, interpolated unless only times are rounded."""
     times, *values = (rows[name].to_numpy(np.float64) for name in TABLE_COLUMNS[1:])
     times = times - times[0]
     if np.all(np.abs(np.diff(times) - step) <= TIME_STEP_TOLERANCE * step):
@@ -418,7 +386,6 @@ def _at_even_times(rows: pd.DataFrame, step: float) -> list[Floats]:
 
 
 def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:
-    """Return whether each row is bad, shape (rows,), and the first reason of each line with bad rows."""
     reasons: dict[int, str] = {}
     is_bad = np.zeros(len(frame), bool)
     for name in TABLE_COLUMNS[1:]:

@@ -17,8 +17,8 @@ from unjam.errors import InputError
 from unjam.sandbox import limit_memory_growth
 from unjam.sumo_files.reader import BrokenFileError, XmlAttributes, parse_xml
 
-HEAD_BYTES = 1 << 16
-"""first bytes of a file, from which its form is detected before a table is parsed; no line of a table is longer"""
+HEAD_BYTES, HEAD_LINES = 1 << 16, 20
+"""first bytes, from which the form of a file is detected (no line is longer), and lines, among which its header is"""
 MAX_TEXT_BYTES, MAX_CELLS, MAX_FCD_VEHICLES = 1 << 30, 1 << 27, 1 << 23
 """maximum size of a table: bytes of text (uncompressed, each cell of Parquet counted), cells, and `vehicle` elements of
 FCD output as XML; each takes about five times as much memory"""
@@ -26,8 +26,6 @@ MAX_BINARY_LENGTH = 16
 """longest value of a column of equally long binary values in Parquet that is read [bytes], as decimal numbers have"""
 MAX_PARQUET_MEMORY = 8 << 30
 """maximum memory that a Parquet file takes while it is read [bytes]"""
-HEAD_LINES = 20
-"""first lines of a table, among which its header is"""
 RECONSTRUCTED_COLUMN_ORDER = (
     *("vehicleid", "frameid", "laneid", "localy", "meanspeed"),
     *("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid"),
@@ -51,8 +49,7 @@ ALLOWED_FILES = "CSV with a line for each row, Parquet, or SUMO's FCD output"
 def read_table(path: Path) -> pd.DataFrame:
     """Return the table of a file with a column `line`; its `attrs` have the lines above the header, by first word.
 
-    Raises:
-        InputError: the file is missing or cannot be read, or is no table.
+    Raise `InputError` if the file is missing or cannot be read, or is no table.
     """
     if not path.is_file():
         raise InputError(f"data: {str(path)!r} does not exist")
@@ -83,15 +80,13 @@ def _check_size(path: Path, file: Any, head: bytes) -> None:
         size += len(chunk)
         cells += max(len(chunk.split()), sum(map(chunk.count, (b"\n", b",", b";", b"\t"))))
         chunk = file.read(HEAD_BYTES)
-    _check_text_bytes(path, size)
-    _check_cells(path, cells)
+    _check_sizes(path, size, cells)
 
 
 def _read_parquet(path: Path) -> pd.DataFrame:
-    """Return the columns of numbers and text of a Parquet file; columns of lists and structures are left out.
+    """Return the columns of numbers and text of a Parquet file, text only if it takes little memory as a column.
 
-    Text is read as Parquet stores it, each value once, and becomes a column only if this takes little memory: a file
-    of some kilobytes can refer to one long text a million times.
+    A file of some kilobytes can refer to one long text a million times.
     """
     import pyarrow as pa
     from pyarrow.compute import call_function
@@ -110,18 +105,17 @@ def _read_parquet(path: Path) -> pd.DataFrame:
     has_same_rows = all(chunk.num_values == group.num_rows for group, chunk in chunks)
     if not has_same_rows or sum(group.num_rows for group in groups) != metadata.num_rows:
         raise _refused_file(path, "its numbers of rows contradict each other")
-    _check_cells(path, metadata.num_rows * metadata.num_columns)
+    _check_sizes(path, cells=metadata.num_rows * metadata.num_columns)
     text_bytes = sum(chunk.total_uncompressed_size for _, chunk in chunks if chunk.path_in_schema in texts)
-    _check_text_bytes(path, text_bytes)
     total_bytes = sum(chunk.total_uncompressed_size for _, chunk in chunks)
-    _check_cells(path, (total_bytes - text_bytes) // MAX_BINARY_LENGTH)
+    _check_sizes(path, text_bytes, (total_bytes - text_bytes) // MAX_BINARY_LENGTH)
     # The data can unpack to more than the footer says.
     with ParquetFile(path, read_dictionary=sorted(texts)) as file, limit_memory_growth(MAX_PARQUET_MEMORY):
         table = file.read([each.name for each in flat], use_threads=False)
         dictionaries = [number for number, kind in enumerate(table.schema.types) if pa.types.is_dictionary(kind)]
         arrays = [array for number in dictionaries for array in table.column(number).chunks]
         lengths = (call_function("binary_length", [each.dictionary]).take(each.indices) for each in arrays)
-        _check_text_bytes(path, sum(each.sum().as_py() or 0 for each in lengths))
+        _check_sizes(path, sum(each.sum().as_py() or 0 for each in lengths))
         for number in dictionaries:
             kind = table.schema.field(number).type.value_type
             table = table.set_column(number, table.column_names[number], table.column(number).cast(kind))
@@ -129,14 +123,11 @@ def _read_parquet(path: Path) -> pd.DataFrame:
     return frame.assign(line=np.arange(len(frame)) + 2)
 
 
-def _check_cells(path: Path, cells: int) -> None:
+def _check_sizes(path: Path, text_bytes: int = 0, cells: int = 0) -> None:
+    if text_bytes > MAX_TEXT_BYTES:
+        raise _refused_file(path, f"it has more than {MAX_TEXT_BYTES:,} bytes of text")
     if cells > MAX_CELLS:
         raise _refused_file(path, f"it has more than {MAX_CELLS:,} cells")
-
-
-def _check_text_bytes(path: Path, size: int) -> None:
-    if size > MAX_TEXT_BYTES:
-        raise _refused_file(path, f"it has more than {MAX_TEXT_BYTES:,} bytes of text")
 
 
 def _refused_file(path: Path, reason: str) -> InputError:
@@ -151,7 +142,6 @@ def check_unique(path: Path, columns: Iterable[str]) -> None:
 
 
 def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
-    """Return SUMO's FCD output with the columns that it has as CSV."""
     if b"<fcd-export" not in head:
         raise _refused_file(path, "it is XML, but not SUMO's FCD output")
     parser, time = expat.ParserCreate(), ""
@@ -200,7 +190,10 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     rows = "\n".join(lines[header + 1 :])
     if separator != "," and re.search(r"\d,\d", rows) and not re.search(r"\d\.\d", rows):
         options["decimal"] = ","
-    surplus = [] if separator == r"\s+" else _surplus_columns(lines[header + 1 :], separator, len(cells))
+    widest = (
+        0 if separator == r"\s+" else max(map(len, csv.reader(lines[header + 1 :], delimiter=separator)), default=0)
+    )
+    surplus = [f"surplus {number}" for number in range(widest - len(cells))]
     if surplus:  # pandas would take the first columns for an index, and shift all others
         names = options.get("names") or next(csv.reader([lines[header]], delimiter=separator))
         options = {"header": 0, **options, "names": [*names, *surplus]}
@@ -211,12 +204,6 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     frame = pd.concat([frame, pd.Series(np.arange(len(frame)) + header + 2, frame.index, name="line")], axis=1)
     frame.attrs = attributes
     return frame
-
-
-def _surplus_columns(lines: list[str], separator: str, columns: int) -> list[str]:
-    """Return names for the cells of these lines beyond the columns of the header; none if there are none."""
-    widest = max((len(cells) for cells in csv.reader(lines, delimiter=separator)), default=0)
-    return [f"surplus {number}" for number in range(widest - columns)]
 
 
 def _find_header(lines: list[str]) -> tuple[int, dict[Hashable, str]]:

@@ -58,8 +58,7 @@ class FollowingTrajectory:
     def leader_path(self) -> Floats:
         """Position of the leader's rear bumper relative to the follower's initial front bumper [m], shape (T,).
 
-        It is the sum of the recorded gap and the follower's path, integrated from its speed in Euler steps. Therefore a
-        model with exactly the follower's speeds has exactly the recorded gaps, even if the leader's speed has errors.
+        The recorded gap plus the follower's path in Euler steps: a model with the follower's speeds has its gaps.
         """
         path = next_position(np.zeros(len(self.speed)), np.r_[0.0, np.cumsum(self.speed[1:])], self.time_step)
         return self.gap + path
@@ -154,12 +153,9 @@ class Segments:
 
 
 def make_segments(trajectories: Sequence[FollowingTrajectory], segment_seconds: float | None = None) -> Segments:
-    """Cut trajectories into segments of `segment_seconds` [s]; None: each trajectory is one segment.
+    """Cut trajectories into segments of `segment_seconds` [s], the last one shorter; None: each is one segment.
 
-    The last segment of a trajectory may be shorter.
-
-    Raises:
-        InputError: the trajectories have different time steps.
+    Raise `InputError` if the trajectories have different time steps.
     """
     steps = {each.time_step for each in trajectories}
     if len(steps) != 1:
@@ -186,10 +182,7 @@ def make_segments(trajectories: Sequence[FollowingTrajectory], segment_seconds: 
 def split_by_driver(
     trajectories: Sequence[FollowingTrajectory], shares: Sequence[float], seed: int
 ) -> list[FollowingTrajectory]:
-    """Assign each driver at random to train, validation or test, which get these `shares` of the drivers.
-
-    Return the trajectories with the name of the part as their `split`.
-    """
+    """Return trajectories with train, validation or test as `split`, which get these `shares` of drivers at random."""
     drivers = sorted({each.driver for each in trajectories})
     order = np.random.default_rng(seed).permutation(len(drivers))
     borders = np.round(np.cumsum(shares) * len(drivers)).astype(int)
@@ -206,10 +199,9 @@ def select_splits(trajectories: Sequence[FollowingTrajectory], *splits: str) -> 
 def trajectories_behind_cavs(
     recordings: Iterable[LocalState], control_step: float, steps_per_control_step: int = 1
 ) -> list[FollowingTrajectory]:
-    """Return the trajectories of the followers of CAVs, from the observations of each CAV.
+    """Return the trajectories of the followers of CAVs, from the observations of each, shape (T,), by `control_step`.
 
-    Each recording has the shape (T,), one sample every `control_step` [s]. A trajectory ends when another vehicle
-    becomes the follower, or when there is none.
+    A trajectory ends when another vehicle becomes the follower, or when there is none.
     """
     trajectories = []
     for number, states in enumerate(recordings):
@@ -222,9 +214,8 @@ def trajectories_behind_cavs(
         cuts = np.flatnonzero(np.r_[True, is_other | is_missing[1:] | is_missing[:-1], True])
         for first, last in pairwise(cuts):
             if (last - first) * control_step >= MIN_TRAJECTORY_SECONDS:
-                speed, leader_speed, gap = (
-                    np.asarray(each[first:last], np.float64) for each in (behind, own, states.follower_gap)
-                )
+                columns = (behind, own, states.follower_gap)
+                speed, leader_speed, gap = (np.asarray(each[first:last], np.float64) for each in columns)
                 name = f"{number}-{first}"
                 trajectories.append(FollowingTrajectory(name, name, control_step, speed, leader_speed, gap))
     return trajectories
