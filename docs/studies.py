@@ -155,10 +155,10 @@ def evaluation_table(
 
 
 def unfiltered_table(study: str, road: str, columns: tuple[str, ...] = RING_COLUMNS) -> pd.DataFrame:
-    """Return `evaluation_table` without the safety filter, for PI and the trainings."""
+    """Return `evaluation_table` without the safety filter, for PI, tuned experts and the trainings."""
     names = f"{study}-unfiltered", UNFILTERED_ROADS[road]
     learned = tuple(row["name"] for row in study_rows(*names) if row["is_learned"])
-    return evaluation_table(*names, (*columns, "max braking [m/s²]"), ("PI (paper)", "tuned PI", *learned))
+    return evaluation_table(*names, (*columns, "max braking [m/s²]"), ("PI (paper)", "tuned PI", "tuned pacer", *learned))
 
 
 def _feasibility_text(verdicts: str | list[str]) -> str:
