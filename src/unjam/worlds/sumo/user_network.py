@@ -145,7 +145,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         return dict(zip(speeds, np.fmin([*speeds.values()], allowed).tolist(), strict=True)), safe
 
     def _tracked_leaders(self, names: Sequence[str]) -> list[TrackedLeader]:
-        speeds = zip(self._simulation.speeds(names), map(self._neighbors, names), strict=True)
+        speeds = zip(self._simulation.speeds(names), self._neighbors(names), strict=True)
         return [(leader, FollowingState(speed, *state[:2])) for speed, (leader, *state) in speeds]
 
     def _following_states(self, names: Sequence[str]) -> list[FollowingState]:
@@ -154,15 +154,15 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         states = list[FollowingState]()
         for name, (leader, state) in zip(names, self._tracked_leaders(names), strict=True):
             if not leader:  # at high speed, the filter needs a longer range than the drivers' sensors have
-                state = FollowingState(state.speed, *self._simulation.neighbors(name, SAFETY_FILTER_RANGE)[1:3])
+                state = FollowingState(state.speed, *self._simulation.neighbors([name], SAFETY_FILTER_RANGE)[0][1:3])
             states.append(state)
         return states
 
-    def _neighbors(self, name: str) -> NeighborStates:
-        """Return a vehicle's neighbors; SUMO computes them once per step."""
-        if name not in self._cached_neighbors:
-            self._cached_neighbors[name] = self._simulation.neighbors(name, MAX_OBSERVED_GAP)
-        return self._cached_neighbors[name]
+    def _neighbors(self, names: Sequence[str]) -> list[NeighborStates]:
+        """Return the vehicles' neighbors; SUMO is called once per step."""
+        new = [name for name in names if name not in self._cached_neighbors]
+        self._cached_neighbors |= zip(new, self._simulation.neighbors(new, MAX_OBSERVED_GAP) if new else (), strict=True)
+        return [self._cached_neighbors[name] for name in names]
 
     def _collisions(self) -> tuple[Sequence[str], bool]:
         """Return SUMO's collisions under the user's settings, plus CAVs in contact with their leader.
@@ -219,7 +219,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
             self._hidden_time_loss[name] = self._hidden_time_loss.get(name, 0.0) + loss
 
     def _local_states(self, names: Sequence[str]) -> LocalState:
-        neighbors = [self._neighbors(name)[1:] for name in names]
+        neighbors = [states[1:] for states in self._neighbors(names)]
         leader_speed, leader_gap, follower_speed, follower_gap = np.array(neighbors).reshape(-1, 4).T
         unknown = np.full(len(names), np.nan)
         speed = np.array(self._simulation.speeds(names), np.float64)
