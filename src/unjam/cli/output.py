@@ -29,6 +29,8 @@ from unjam.training.selection import format_duration
 
 PROGRESS_LINE_SECONDS = 5.0
 """time between two plain lines of progress without a terminal"""
+MIN_TIMED_SECONDS = 1.0
+"""time of a count from which the rest is estimated"""
 PIPED_TABLE_WIDTH = 160
 """width of tables without a terminal [characters]"""
 NARROW_COLUMN_WIDTHS = 18, 7
@@ -132,8 +134,11 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
 def print_options(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print the main table of an assessment without its last two columns, which are verdicts."""
     narrow = console.width < WIDE_OPTIONS_WIDTH
-    split = [text.replace(" [", "\n[") if narrow else text for text in headings]
+    split = [text.replace(" − ", "\n− ").replace(" [", "\n[") if narrow else text for text in headings]
     table = new_table(split[:2], split[2:-2])
+    table.columns[1].max_width, table.columns[1].overflow = NARROW_COLUMN_WIDTHS[0] - 6 if narrow else None, "fold"
+    for column in table.columns[2:]:
+        column.no_wrap = True
     for row in rows:
         table.add_row(*(text.replace(" [", "\n[") if narrow else text for text in row[:-2]))
     console.print(table)
@@ -181,7 +186,9 @@ class ProgressReporter:
         self._start_time = self._start_time or now
         if self._is_plain and now - self._last_line > PROGRESS_LINE_SECONDS:
             self._last_line = now
-            left = f", {format_duration((now - self._start_time) * (total - done) / done)} left" if done else ""
+            elapsed, left = now - self._start_time, ""
+            if 0 < done < total and elapsed >= MIN_TIMED_SECONDS:
+                left = f", {format_duration(elapsed * (total - done) / done)} left"
             err_console.print(f"{self._label}: {done:,} of {total:,}{self._unit}{left}")
 
     def begin(self, label: str, total: int) -> None:

@@ -177,9 +177,9 @@ class ControllerResult:
         """What is not yet known: the comparison whose interval includes zero, or is wider, as a clause."""
         comparisons = (self.difference_to_acc, ACC_BASELINE), (self.effect.travel_time, "the human baseline")
         change, baseline = max(comparisons, key=lambda each: (each[0].low <= 0 <= each[0].high, each[0].half_width))
+        if change.count < MIN_VERDICT_SEEDS:
+            return f"the budget had {format_count(change.count, 'test seed')}, and {MIN_VERDICT_SEEDS} are needed"
         seeds = f"with {format_count(change.count, 'test seed')}"
-        if not isfinite(change.half_width):
-            return f"{seeds}, the difference of travel time to {baseline} has no confidence interval"
         return (
             f"{seeds}, the difference of travel time to {baseline} is {change.mean:+.1f} s ± {change.half_width:.1f} s"
         )

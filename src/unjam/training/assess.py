@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from math import isfinite
+from math import ceil, isfinite
 from pathlib import Path
 from typing import Any, cast
 
@@ -242,7 +242,7 @@ def assess(
 
     first = evaluate_options("simulating the human baseline, seed 1 of 1", [HUMAN_BASELINE], held_out_seeds(1), True)
     raise_failure(first.rows[HUMAN_BASELINE.label])
-    for line in _budget_lines(request, budget):
+    for line in budget_lines(request, budget):
         on_message(line)
     selection = select_controllers(request.options, partial(run_options, "tuning"), budget, on_message)
     selection_episodes = budget.used_episodes - 1
@@ -278,7 +278,7 @@ def assess(
     return Assessment(findings.controller_results, findings.acc_results, json.loads(to_json(document)), page)
 
 
-def _budget_lines(request: AssessmentRequest, budget: EpisodeBudget) -> list[str]:
+def budget_lines(request: AssessmentRequest, budget: EpisodeBudget) -> list[str]:
     """Return how long a verdict and the whole budget take, and a smaller question, one line each."""
 
     def duration(episodes: int) -> str:
@@ -286,7 +286,8 @@ def _budget_lines(request: AssessmentRequest, budget: EpisodeBudget) -> list[str
 
     needed, limit = request.verdict_episodes, f" or {request.minutes:g} min" if request.minutes else ""
     lines = [f"a verdict needs at least {MIN_VERDICT_SEEDS} test seeds: {duration(needed)}"]
-    lines.append(f"the budget is at most {duration(request.episodes)}{limit}")
+    too_small = ", which is too small for a verdict" if request.episodes < needed else ""
+    lines.append(f"the budget is at most {duration(request.episodes)}{limit}{too_small}")
     small = request.smallest_question
     if len(request.options) > 1:
         (option,) = small.options
@@ -295,14 +296,14 @@ def _budget_lines(request: AssessmentRequest, budget: EpisodeBudget) -> list[str
     return lines
 
 
-def _missing_budget(request: AssessmentRequest, findings: AssessmentFindings, budget: EpisodeBudget) -> dict[str, Any]:
+def missing_budget(request: AssessmentRequest, findings: AssessmentFindings, budget: EpisodeBudget) -> dict[str, Any]:
     """Return the budget with which the open questions would probably be answered.
 
     All penetration rates stay, and only controllers are left out: they were selected on other seeds.
     """
     undecided = [each for each in findings.controller_results if each.verdict == UNDECIDED]
     needed = [each.difference_to_acc.count + each.missing_seeds for each in undecided]
-    seeds = max(MIN_VERDICT_SEEDS, *(int(each) for each in needed if isfinite(each)), 0)
+    seeds = max([MIN_VERDICT_SEEDS, *(ceil(each) for each in needed if isfinite(each))])
     drivers = list(dict.fromkeys(each.driver for each in undecided))
     counts = len(request.penetration_rates), len(drivers), request.has_acc_properties
     episodes = verdict_episodes(*counts, seeds, len(undecided)) + PLOT_EPISODE_COUNT
@@ -332,7 +333,7 @@ def _assessment_document(
     baseline_rows = findings.rows[HUMAN_BASELINE]
     answer, missing = road_verdict(findings.controller_results, baseline_rows), None
     if answer.verdict == UNDECIDED:
-        missing = _missing_budget(request, findings, budget)
+        missing = missing_budget(request, findings, budget)
         size = f"{format_count(missing['test_seeds'], 'test seed')} ({format_count(missing['episodes'], 'episode')}"
         more = f"a verdict needs about {size}, about {format_duration(missing['seconds'])})"
         answer = answer._replace(sentence=f"{answer.sentence.removesuffix('.')}; {more}.")
