@@ -6,6 +6,7 @@ from math import inf, nan
 import pytest
 
 from tests.measures.test_effect import GOOD, between
+from unjam.errors import format_count
 from unjam.measures.recommendation import (
     MIN_VERDICT_SEEDS,
     NOT_RECOMMENDED,
@@ -19,7 +20,7 @@ from unjam.measures.recommendation import (
     required_seeds,
     road_verdict,
 )
-from unjam.measures.statistics import Estimate, format_count
+from unjam.measures.statistics import Estimate
 
 BEYOND = between(-3.0, -1.0)
 MORE_FLOW = between(-20.0, 40.0)

@@ -11,6 +11,7 @@ from math import ceil, inf, isfinite
 from operator import attrgetter
 from typing import Any, NamedTuple
 
+from unjam.errors import format_count
 from unjam.measures.effect import (
     MAX_FLOW_LOSS,
     TIME_METRIC,
@@ -21,7 +22,7 @@ from unjam.measures.effect import (
     is_too_small,
 )
 from unjam.measures.feasibility import FEASIBLE
-from unjam.measures.statistics import Estimate, format_count, format_difference, format_percent, metric_estimate
+from unjam.measures.statistics import Estimate, format_difference, format_percent, metric_estimate
 
 MAX_TELEPORT_SHARE = 0.01
 """share of the baseline's vehicles that SUMO may teleport or remove; with more of them travel times mean nothing"""

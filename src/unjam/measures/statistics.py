@@ -189,11 +189,6 @@ def format_percent(share: float) -> str:
     return f"{100 * share:g} %"
 
 
-def format_count(count: int, noun: str) -> str:
-    """Return a number of things, with their noun in the singular for one."""
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"
-
-
 def format_ci(value: Estimate, format_spec: str) -> str:
     """Return the CI, or else the range of the values, as text; empty for a single value."""
     if not isnan(value.low):

@@ -16,7 +16,7 @@ from typing import Any, cast
 from unjam.controller import DEFAULT_DRIVER, make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe
-from unjam.errors import InputError, NoCavError, invalid_value
+from unjam.errors import InputError, NoCavError, format_count, invalid_value
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import HARD_BRAKING_METRIC
@@ -31,7 +31,7 @@ from unjam.measures.recommendation import (
     recommended_result,
     road_verdict,
 )
-from unjam.measures.statistics import format_count, metric_estimate
+from unjam.measures.statistics import metric_estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario

@@ -85,19 +85,20 @@ def test_a_missing_log_is_refused(tmp_path: Path) -> None:
 def test_an_entrance_is_slow_if_vehicles_wait_without_a_jam(
     departure: str, speed: float | None, tmp_path: Path, sumo: SumoBackend
 ) -> None:
-    flow = f'<flow id="f" type="{{}}" route="along" begin="0" end="60" period="1.9" {departure}/>'
+    period = 1.0 if speed in (0.0, 5.0) else 1.9
+    flow = f'<flow id="f" type="{{}}" route="along" begin="0" end="60" period="{period}" {departure}/>'
     # Slow vans between cars: the desired speed of a car is often not safe behind them.
     vans = flow.replace('"f"', '"g"').format("van").replace('period="1.9"', 'period="7"')
     kinds = flow.format("car") + (vans if "desired" in departure else "")
     file = straight(tmp_path, kinds, length=600.0, step=0.5)
     episode = run_episode(make_scenario(str(file), {"penetration_rate": 0.1}), Human(), 1, backend=sumo)
-    (note,) = episode_notes({"human": [measure(episode)]}) or [""]
+    notes = [note for note in episode_notes({"human": [measure(episode)]}) if note.startswith("road: ")]
     if speed is None:
-        assert (episode.slow_entrances, note) == ((), "")
+        assert (episode.slow_entrances, notes) == ((), [])
         return
     (slow,) = episode.slow_entrances
     assert (slow.edge, slow.depart_speed) == ("road", pytest.approx(speed, abs=0.5))
-    assert note.startswith(f"road: {slow.vehicles} vehicles wait {slow.depart_delay:.0f} s on average")
+    assert notes[0].startswith(f"road: {slow.vehicles} vehicles wait {slow.depart_delay:.0f} s on average")
 
 
 def test_an_entrance_in_a_jam_is_not_slow() -> None:

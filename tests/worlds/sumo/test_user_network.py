@@ -138,7 +138,7 @@ def test_controls_of_built_in_motorways_are_refused_with_an_alternative_that_dri
     words = str(refused.value).partition("-d ")[2].partition(")")[0]
     road = make_scenario(file, {**ACC_SETTINGS, "penetration_rate": 1.0, "horizon": 300})
     speeds = [
-        np.nanmax(run_episode(road, make_driver(driver, road.control_step), 1, backend=sumo).speeds[-100:])
+        run_episode(road, make_driver(driver, road.control_step), 1, backend=sumo).speeds[-1, 0]
         for driver in ("cruise", words.replace("20", "9"))
     ]
     assert speeds[0] > 11.0
