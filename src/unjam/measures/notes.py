@@ -101,7 +101,7 @@ def _entrance_notes(rows_by_driver: RowsByDriver) -> list[str]:
     return [
         f"{edge}: {each['vehicles']} vehicles wait {each['depart_delay']:.0f} s on average for their insertion without "
         f'a jam, and depart at {each["depart_speed"]:.0f} m/s; departSpeed="max" departLane="best" lets them enter '
-        "as fast as is safe"
+        "as fast as is safe, if the entrance has the capacity for the demand"
         for edge, each in slow.items()
     ]
 

@@ -80,7 +80,7 @@ def test_a_missing_log_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("departure", "speed"),
-    [('departSpeed="max"', None), ("", 0.0), ('departSpeed="5"', 5.0), ('departSpeed="desired"', 20.0)],
+    [('departSpeed="max"', None), ('departSpeed="0"', 0.0), ('departSpeed="5"', 5.0), ('departSpeed="desired"', 20.0)],
 )
 def test_an_entrance_is_slow_if_vehicles_wait_without_a_jam(
     departure: str, speed: float | None, tmp_path: Path, sumo: SumoBackend
