@@ -134,6 +134,11 @@ def one_line(value: object, length: int = 200) -> str:
     return text if len(text) <= length else f"{text[: length - 1]}…"
 
 
+def format_count(count: int, noun: str) -> str:
+    """Return a number of things, with their noun in the singular for one."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def printable(text: str) -> str:
     """Return a text for a terminal, with a question mark for each control, bidirectional or invisible character.
 

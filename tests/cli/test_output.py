@@ -21,6 +21,7 @@ from unjam.measures.metric_table import choose_baseline
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate
 from unjam.parameters import parse_assignments
+from unjam.reports.assessment import OPTION_HEADINGS
 from unjam.scenarios import Recorded
 from unjam.training.config import RunConfig
 
@@ -70,6 +71,42 @@ def messages(monkeypatch: pytest.MonkeyPatch) -> StringIO:
     text = StringIO()
     monkeypatch.setattr(output, "err_console", Console(file=text, width=400))
     return text
+
+
+def test_progress_says_at_once_what_begins_and_later_how_long_it_takes(
+    messages: StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter([0.0, 0.0, 1.0, 11.0, 20.0, 20.5])
+    monkeypatch.setattr(output, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    progress = output.ProgressReporter("assessing", "steps")
+    progress.begin("simulating seed 1 of 1", 100)
+    progress.update("a", 10)
+    progress.update("b", 10)
+    progress.begin("simulating test seeds 1 to 3", 900)
+    progress.update("a", 10)
+    assert lines_of(messages) == [
+        "simulating seed 1 of 1",
+        "simulating seed 1 of 1: 20 of 100 steps, 40 s left",
+        "simulating test seeds 1 to 3",
+    ]
+
+
+@pytest.mark.parametrize("words", ["--out x -n 9 -d a -d b", "--out=x -n9 -da --driver=b --episodes=3"])
+def test_the_next_command_has_other_values_of_options(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["unjam", "assess", "my.sumocfg", *words.split(), "--end", "60"])
+    rest = output.arguments_without("--out", "--driver", "-d", "--episodes", "-n")
+    assert rest == ["assess", "my.sumocfg", "--end", "60"]
+
+
+@pytest.mark.parametrize("width", [80, 100, 160])
+def test_main_table_of_an_assessment_fits_the_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = StringIO()
+    monkeypatch.setattr(output, "console", Console(file=text, width=width, highlight=False))
+    row = ["10 %", "follower-stopper", *["-10.4 [-20.4, +14.2]"] * 2, *["-1026 [-2021, +3074]"] * 2, "feasible", "yes"]
+    output.print_options(OPTION_HEADINGS, [row])
+    lines = text.getvalue().splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= width
+    assert text.getvalue().count("[-20.4, +14.2]") == text.getvalue().count("[-2021, +3074]") == 2
 
 
 def test_progress_names_the_road_with_the_smallest_difference(

@@ -116,7 +116,7 @@ def test_beneficial_effect_has_no_rejection_reasons() -> None:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"travel_time": between(-6, -2, MIN_VERDICT_SEEDS - 1)}, "9 test seeds are too few"),
+        ({"travel_time": between(-6, -2, MIN_VERDICT_SEEDS - 1)}, "9 test seeds, where 10 are needed"),
         ({"failed_episodes": 3}, "3 episodes failed"),
         ({"travel_time": between(1, 3)}, "travel time is longer than that of the human baseline: +2.0 [+1.0, +3.0] s"),
         (
@@ -166,7 +166,7 @@ def test_loss_of_flow_is_rejected_despite_shorter_travel_time() -> None:
 def test_one_seed_is_not_enough_for_a_recommendation() -> None:
     found = effect_of(rows_of([50.0]), rows_of([100.0]))
     reasons = rejection_reasons(found)
-    assert any("too few" in reason for reason in reasons)
+    assert any("1 test seed, where 10 are needed" in reason for reason in reasons)
     assert any("not shown to be shorter" in reason for reason in reasons)
     assert any("flow may be lower" in reason for reason in reasons)
 

@@ -6,23 +6,30 @@ from math import inf, nan
 import pytest
 
 from tests.measures.test_effect import GOOD, between
+from unjam.errors import format_count
 from unjam.measures.recommendation import (
     MIN_VERDICT_SEEDS,
+    NOT_RECOMMENDED,
+    RECOMMENDED,
+    UNDECIDED,
     AccResult,
     ControllerResult,
-    assessment_headline,
+    acc_finding,
     plotted_result,
     recommended_result,
     required_seeds,
+    road_verdict,
 )
 from unjam.measures.statistics import Estimate
 
 BEYOND = between(-3.0, -1.0)
-HELPS = ControllerResult(0.05, "acc", GOOD, BEYOND)
-HELPS_MORE = ControllerResult(0.2, "pi", replace(GOOD, travel_time=between(-12.0, -8.0)), BEYOND)
+MORE_FLOW = between(-20.0, 40.0)
+HELPS = ControllerResult(0.05, "acc", GOOD, BEYOND, MORE_FLOW)
+HELPS_MORE = ControllerResult(0.2, "pi", replace(GOOD, travel_time=between(-12.0, -8.0)), BEYOND, MORE_FLOW)
 QUICK_AND_WRONG = ControllerResult(
-    0.1, "mine.py:bold", replace(GOOD, travel_time=between(-50, -40), flow=between(-90, -50)), BEYOND
+    0.1, "mine.py:bold", replace(GOOD, travel_time=between(-50, -40), flow=between(-90, -50)), BEYOND, MORE_FLOW
 )
+OPEN = replace(HELPS, difference_to_acc=between(-5.0, 3.0), missing_seeds=10.0)
 ACC_HELPS = AccResult(0.2, GOOD)
 ACC_CHANGES_NOTHING = AccResult(0.2, replace(GOOD, travel_time=between(-1.0, 1.0)))
 
@@ -69,44 +76,62 @@ def test_difference_to_acc_vehicles_must_not_be_too_small() -> None:
 def test_too_small_effect_of_acc_vehicles_is_reported(time: Estimate) -> None:
     little = AccResult(0.2, replace(GOOD, travel_time=time))
     small = "by less than 0.5 %, which is too small to matter"
-    assert assessment_headline([], [little]).endswith(f" ACC vehicles alone change travel time {small}.")
+    assert acc_finding([little]) == f"ACC vehicles alone change travel time {small}."
     assert f"travel time differs {small}, compared with the human baseline." in little.summary
-    assert assessment_headline([], [little, ACC_HELPS]).endswith("-4.0 [-6.0, -2.0] s (-4.0 %) at 20 %.")
+    assert acc_finding([little, ACC_HELPS]).endswith("-4.0 [-6.0, -2.0] s (-4.0 %) at 20 %.")
 
 
-def test_headline_recommends_the_largest_gain() -> None:
-    judged = [HELPS, QUICK_AND_WRONG, HELPS_MORE]
+def test_largest_gain_is_recommended_in_one_sentence() -> None:
+    judged = [HELPS, QUICK_AND_WRONG, HELPS_MORE, OPEN]
     assert recommended_result(judged) == plotted_result(judged) == HELPS_MORE
-    assert assessment_headline(judged, [ACC_CHANGES_NOTHING]) == (
-        "Recommended on this road: pi at a penetration rate of 20 %. Travel time -10.0 [-12.0, -8.0] s per "
-        "vehicle (-10.0 %) compared with the human baseline, -2.0 [-3.0, -1.0] s compared with ACC vehicles "
-        "alone. ACC vehicles alone are not shown to shorten travel time."
+    assert road_verdict(judged) == (
+        RECOMMENDED,
+        "Recommended: pi at a penetration rate of 20 %, because travel time is 10.0 s (10.0 %) shorter than in "
+        "human-only traffic and 2.0 s shorter than with ACC vehicles alone.",
     )
 
 
-def test_without_recommendation_the_shortest_travel_time_is_plotted() -> None:
-    judged = [QUICK_AND_WRONG, ControllerResult(0.2, "pi", replace(GOOD, failed_episodes=1), BEYOND)]
+def test_without_recommendation_the_shortest_travel_time_is_named_and_plotted() -> None:
+    judged = [QUICK_AND_WRONG, replace(HELPS_MORE, effect=replace(GOOD, failed_episodes=1))]
     assert recommended_result(judged) is None
-    assert assessment_headline(judged, [ACC_HELPS]) == (
-        "No controller is recommended on this road: none passes the rule. ACC vehicles alone shorten travel "
-        "time: -4.0 [-6.0, -2.0] s (-4.0 %) at 20 %."
+    assert road_verdict(judged) == (
+        NOT_RECOMMENDED,
+        "Not recommended: no controller passes the rule; the fastest is mine.py:bold at a penetration rate of 10 %, "
+        "but flow is lower than that of the human baseline: -70 [-90, -50] veh/h.",
     )
     assert plotted_result(judged) == QUICK_AND_WRONG
+    assert acc_finding([ACC_HELPS]).startswith("ACC vehicles alone shorten travel time: -4.0 [-6.0, -2.0] s (-4.0 %)")
 
 
 def test_without_tested_controllers_nothing_is_recommended_or_plotted() -> None:
     assert plotted_result([]) is None
     worse = AccResult(0.1, replace(GOOD, travel_time=between(1.0, 2.0)))
-    assert assessment_headline([], [worse, ACC_CHANGES_NOTHING]) == (
-        "No controller is recommended on this road: none was tested, or all were rejected before the test. "
+    assert road_verdict([]).sentence == (
+        "Not recommended: no controller was tested, or all were rejected on the tuning seeds."
+    )
+    assert acc_finding([worse, ACC_CHANGES_NOTHING]) == (
         "ACC vehicles alone lengthen travel time: +1.5 [+1.0, +2.0] s (+1.5 %) at 10 %."
     )
 
 
 def test_few_test_seeds_show_nothing_of_acc_vehicles() -> None:
     few = AccResult(0.1, replace(GOOD, travel_time=replace(between(1.0, 2.0), count=MIN_VERDICT_SEEDS - 1)))
-    assert assessment_headline([], [few]).endswith(" ACC vehicles alone have fewer than 10 test seeds.")
-    assert "is not shown to differ (9 test seeds are too few)" in few.summary
+    assert acc_finding([few]) == "ACC vehicles alone have fewer than 10 test seeds."
+    assert "is not shown to differ (9 test seeds, where 10 are needed)" in few.summary
+
+
+def test_infeasible_cavs_are_rejected_with_few_test_seeds() -> None:
+    few = replace(GOOD, travel_time=between(-6.0, -2.0, 1), feasibility="brakes with 9.0 m/s2")
+    assert replace(HELPS, effect=few).reasons == ["infeasible: brakes with 9.0 m/s2"]
+    assert replace(HELPS, effect=replace(few, feasibility=GOOD.feasibility)).reasons[0].startswith("1 test seed, where")
+
+
+def test_counts_of_one_are_singular() -> None:
+    one = replace(GOOD, failed_episodes=1, early_ends=1, teleports=1, collisions=1.0)
+    reasons = replace(HELPS, effect=one).reasons
+    starts = ["1 episode failed", "1 episode ended early", "1 more vehicle teleported", "1 more vehicle in contact"]
+    assert [reason.startswith(start) for reason, start in zip(reasons, starts, strict=True)] == [True] * 4
+    assert format_count(2_000, "episode") == "2,000 episodes"
 
 
 def test_infeasible_acc_vehicles_are_reported() -> None:
@@ -119,15 +144,27 @@ def test_controller_that_changes_nothing_is_reported() -> None:
     assert idle.reasons == ["it never intervened: all travel times are those of ACC vehicles alone"]
 
 
-def test_missing_verdict_has_interval_width_and_missing_seeds() -> None:
-    open_one = replace(HELPS, difference_to_acc=between(-5.0, 3.0), missing_seeds=300.0)
-    assert open_one.summary.endswith(
-        "; no verdict yet: the confidence interval is ±4.0 s, and a verdict needs about 300 more test seeds "
-        "(900 episodes)."
+@pytest.mark.parametrize(
+    ("result", "question"),
+    [
+        (OPEN, "with 20 test seeds, the difference of travel time to ACC vehicles alone is -1.0 s ± 4.0 s"),
+        (
+            replace(OPEN, effect=replace(GOOD, travel_time=between(-12.0, 2.0))),
+            "with 20 test seeds, the difference of travel time to the human baseline is -5.0 s ± 7.0 s",
+        ),
+        (
+            replace(OPEN, effect=replace(GOOD, travel_time=between(-20.0, -2.0))),
+            "with 20 test seeds, the difference of travel time to ACC vehicles alone is -1.0 s ± 4.0 s",
+        ),
+        (replace(OPEN, difference_to_acc=between(-1.0, 1.0, 1)), "the budget had 1 test seed, and 10 are needed"),
+    ],
+)
+def test_open_question_names_its_comparison(result: ControllerResult, question: str) -> None:
+    assert result.summary == f"acc at a penetration rate of 5 %: not yet known: {question}."
+    assert road_verdict([QUICK_AND_WRONG, result]) == (
+        UNDECIDED,
+        f"Not yet known whether to recommend acc at a penetration rate of 5 %: {question}.",
     )
-    assert assessment_headline([open_one], []).startswith("No controller is recommended on this road so far: ")
-    assert "too few for a confidence interval" in replace(open_one, missing_seeds=inf).summary
-    assert replace(ACC_CHANGES_NOTHING, missing_seeds=7.0).summary.endswith("about 7 more test seeds (14 episodes).")
 
 
 @pytest.mark.parametrize(
@@ -154,13 +191,14 @@ def test_property_effect_is_reported_only_if_properties_are_set() -> None:
 
 def test_nearly_free_road_has_nothing_to_gain() -> None:
     free = [{"status": "completed", "travel_time": 103.2, "delay": 3.2} for _ in range(3)]
-    nothing = "Nothing to gain here: the human baseline is within 4 % of free flow. No controller"
-    found = assessment_headline([QUICK_AND_WRONG], [ACC_HELPS], free)
-    assert found.startswith(nothing)
-    assert "ACC" not in found
-    assert assessment_headline([HELPS], [ACC_CHANGES_NOTHING], free).startswith("Recommended on this road")
+    for results in ([QUICK_AND_WRONG], [OPEN], []):
+        assert road_verdict(results, free) == (
+            NOT_RECOMMENDED,
+            "Not recommended: there is nothing to gain, because human-only traffic is within 4 % of free flow.",
+        )
+    assert road_verdict([HELPS], free).verdict == RECOMMENDED
     for busy in ([{**row, "delay": 20.0} for row in free], [{**row, "delay": nan} for row in free], []):
-        assert assessment_headline([QUICK_AND_WRONG], [ACC_CHANGES_NOTHING], busy).startswith("No controller")
+        assert road_verdict([OPEN], busy).verdict == UNDECIDED
 
 
 @pytest.mark.parametrize(

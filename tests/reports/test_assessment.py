@@ -13,7 +13,7 @@ from tests.measures.test_effect import GOOD, between
 from unjam.errors import InputError
 from unjam.manifest import manifest
 from unjam.measures.metrics import METRICS
-from unjam.measures.recommendation import AccResult, ControllerResult, assessment_headline, recommended_result
+from unjam.measures.recommendation import AccResult, ControllerResult, acc_finding, recommended_result, road_verdict
 from unjam.measures.statistics import Estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, effect_figure, render_assessment, write_assessment
 from unjam.scenarios import Motorway, Ring, scenario_recipe
@@ -21,13 +21,15 @@ from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode
 
 TO_ACC = between(-3.0, -1.0)
-HELPS = ControllerResult(0.1, "acc", GOOD, TO_ACC)
+FLOW_TO_ACC = between(-15.0, 25.0)
+HELPS = ControllerResult(0.1, "acc", GOOD, TO_ACC, FLOW_TO_ACC)
 WITH_ACC = [AccResult(0.1, GOOD), AccResult(0.2, GOOD)]
 HARMS = ControllerResult(
     0.2,
     "idm:time_headway=1,max_acceleration=2.5,b=<2>",
     replace(GOOD, travel_time=between(3, 5), feasibility="brakes with 9 m/s2"),
     TO_ACC,
+    FLOW_TO_ACC,
 )
 UNKNOWN = replace(GOOD, travel_time=Estimate(float("nan"), float("nan"), float("nan"), 0), feasibility="")
 
@@ -57,9 +59,14 @@ def assessment_folder(folder: Path, results: list[ControllerResult]) -> Path:
     baseline: dict[str, Any] = dict.fromkeys(METRICS, asdict(Estimate(78.5, 70.0, 80.0, 20)))
     document = {
         "scenario": "my & road.sumocfg",
-        "headline": assessment_headline(results, WITH_ACC),
+        "verdict": road_verdict(results).verdict,
+        "headline": road_verdict(results).sentence,
+        "acc_finding": acc_finding(WITH_ACC),
         "recommended": best and {"penetration_rate": best.penetration_rate, "driver": best.driver},
-        "controller_results": [{**asdict(each), "reasons": each.reasons, "summary": each.summary} for each in results],
+        "controller_results": [
+            {**asdict(each), "reasons": each.reasons, "verdict": each.verdict, "summary": each.summary}
+            for each in results
+        ],
         "acc_results": [{**asdict(each), "driver": "cruise", "summary": each.summary} for each in WITH_ACC],
         "candidates": candidates,
         "baseline": baseline,
@@ -93,11 +100,25 @@ def cells_of(page: str, label: str) -> list[str]:
 
 
 def test_page_starts_with_the_recommendation(page: str) -> None:
-    assert assessment_headline([HELPS, HARMS], WITH_ACC) in page
+    lead = f"{road_verdict([HELPS, HARMS]).sentence} {acc_finding(WITH_ACC)}"
+    assert f'<p class="badge recommended">recommended</p>\n  <p class="lead">{lead}</p>' in page
     assert WITH_ACC[1].summary in page
     assert HELPS.summary in page
     assert "b=&lt;2&gt; at a penetration rate of 20 %: not recommended: travel time is longer" in page
     assert "The CAVs have the recommended controller." in page
+
+
+def test_main_table_has_a_row_per_option_with_differences_to_both_baselines(page: str) -> None:
+    table = page[page.index('<table class="options">') : page.index("</table>")]
+    rows = [re.findall(r"<td.*?>(.*?)</td>", row) for row in table.split("<tr>")[2:]]
+    assert rows[0] == ["none", "human baseline", "78.5 s", "–", "78 veh/h", "–", "–", "–"]
+    to_human = ["-4.0 [-6.0, -2.0]", "+10 [-10, +30]"]
+    assert rows[1] == ["10 %", "ACC alone", to_human[0], "–", to_human[1], "–", "feasible", "–"]
+    to_acc = ["-2.0 [-3.0, -1.0]", "+5 [-15, +25]"]
+    assert rows[2] == ["10 %", "acc", to_human[0], to_acc[0], to_human[1], to_acc[1], "feasible", "recommended"]
+    assert (rows[4][0], rows[4][-1]) == ("20 %", "not recommended")
+    assert "<h1>" in page[: page.index("<table")]
+    assert page.index("<details>") > page.index("</table>")
 
 
 def test_page_describes_the_acc_of_cavs(tmp_path: Path, page: str) -> None:
@@ -141,8 +162,8 @@ def test_page_lists_assumptions_and_works_offline(page: str) -> None:
 
 def test_page_explains_why_nothing_is_recommended(tmp_path: Path) -> None:
     page = render_assessment(assessment_folder(tmp_path, [HARMS]))
-    assert "No controller is recommended on this road" in page
-    assert "it is not recommended" in page
+    assert '<p class="badge not-recommended">not recommended</p>' in page
+    assert "its verdict is in the table" in page
     assert "10 % CAVs: no controller is recommended; each was rejected" in page
     assert "The fastest, acc: slower than the human baseline." in page
 

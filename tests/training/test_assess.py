@@ -1,12 +1,16 @@
 """Assessments: checks of the request, stored rows and documents."""
 
 import json
+import re
 from collections.abc import Iterator
+from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.measures.test_recommendation import OPEN
 from tests.worlds.sumo.user_networks import SPARSE, network, straight
 from unjam.errors import InputError
 from unjam.reports.assessment import render_assessment
@@ -17,10 +21,20 @@ from unjam.training.assess import (
     Assessment,
     AssessmentRequest,
     assess,
+    budget_lines,
     make_request,
+    missing_budget,
     sensing_notes,
 )
-from unjam.training.selection import ACC_DRIVER, HUMAN_BASELINE, UNCHANGED_ACC_DRIVER, Option
+from unjam.training.selection import (
+    ACC_DRIVER,
+    HUMAN_BASELINE,
+    UNCHANGED_ACC_DRIVER,
+    AssessmentFindings,
+    EpisodeBudget,
+    Option,
+    verdict_episodes,
+)
 from unjam.worlds.worker_pool import WorkerPool
 
 HELD = {"horizon": 150, "actuation": "shielded", "safety.active": True}
@@ -82,9 +96,47 @@ def test_acc_property_is_compared_with_unchanged_vehicles(name: str, file: str) 
     assert [road.minimum_gap for road in roads] == [2.5, 2.5]
 
 
+def test_lines_at_the_start_have_one_estimate_and_a_smaller_question(file: str) -> None:
+    request = make_request(file, [0.1, 0.2], 60, 0.02, 5.0, ["acc", "unjam:best"])
+    budget = EpisodeBudget(59, 5.0, 2, clock=iter([0.0, *[6.0] * 9]).__next__)
+    budget.spend(1)
+    assert budget_lines(request, budget) == [
+        "a verdict needs at least 10 test seeds: 86 episodes, about 4 min",
+        "the budget is at most 60 episodes, about 3 min or 5 min, which is too small for a verdict",
+        "a smaller question, --penetration-rates 0.2 -d acc, needs at least 32 episodes, about 96 s",
+    ]
+    assert len(budget_lines(request.smallest_question, budget)) == 2
+
+
+def test_missing_budget_keeps_all_penetration_rates_and_the_undecided_controllers(file: str) -> None:
+    request = make_request(file, [0.1, 0.2, 0.3], 400, 0.02, None, ["acc", "idm", "pi"])
+    undecided = replace(OPEN, penetration_rate=0.1, missing_seeds=15.4)
+    rejected = replace(OPEN, penetration_rate=0.2, driver="idm", missing_seeds=0.0)
+    unknown = replace(OPEN, penetration_rate=0.3, missing_seeds=inf)
+    findings = AssessmentFindings({}, [undecided, rejected, unknown], [])
+    missing = missing_budget(request, findings, EpisodeBudget(400))
+    assert (missing["test_seeds"], missing["drivers"]) == (36, ["acc"])
+    assert missing["episodes"] == verdict_episodes(3, 1, False, 36, 2) + 2
+
+
+def test_page_of_the_documentation_has_the_budgets_of_verdicts(file: str) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "assess.md").read_text()
+    rows = re.findall(r"^\| (\d) \| (\d) \| (\d+) \|$", text, re.MULTILINE)
+    names = [*DEFAULT_CONTROLLERS]
+    assert len(rows) == 4
+    for rates, controllers, episodes in rows:
+        rate_list = [0.1 * (number + 1) for number in range(int(rates))]
+        request = make_request(file, rate_list, 400, 0.02, None, names[: int(controllers)])
+        assert request.verdict_episodes == int(episodes)
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        (
+            {"penetration_rates": [0.1], "drivers": ["pi"], "episodes": 1},
+            ">= 11 for 1 penetration rate and 1 controller$",
+        ),
         ({"penetration_rates": [0.1, 1.2]}, "penetration_rates: 1.2 is not allowed; allowed: shares from 0 to 1"),
         ({"penetration_rates": [float("nan")]}, "penetration_rates: nan"),
         ({"penetration_rates": [0.0]}, "penetration_rates: '0' is not allowed; allowed: one above 0"),
@@ -171,7 +223,7 @@ def test_vehicle_properties_alone_give_no_gain(vehicle: str, tmp_path: Path) -> 
     with WorkerPool(2) as workers:
         found = assess(alone, tmp_path / "out", workers)
     assert found.document["recommended"] is None
-    assert found.document["headline"].startswith("Nothing to gain here: the human baseline is within")
+    assert found.document["headline"].startswith("Not recommended: there is nothing to gain, because")
     assert found.acc_results[0].effect.travel_time.mean >= -0.1
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.measures.test_effect import USUAL
 from unjam.errors import InputError
-from unjam.measures.recommendation import MIN_VERDICT_SEEDS
+from unjam.measures.recommendation import MIN_VERDICT_SEEDS, NOT_RECOMMENDED, RECOMMENDED, UNDECIDED
 from unjam.seeds import SELECTION_SEED, TEST_SEED
 from unjam.training.selection import (
     ACC_DRIVER,
@@ -25,6 +25,7 @@ from unjam.training.selection import (
     compare_on_test_seeds,
     min_episodes,
     select_controllers,
+    verdict_episodes,
 )
 
 SHARES = (0.1, 0.2)
@@ -83,7 +84,7 @@ def test_best_controller_of_each_penetration_rate_is_selected() -> None:
     )
     found = select_controllers(OPTIONS, drive, drive.budget, quiet)
     assert found.finalists == [PI, IDM_MORE]
-    assert found.rejection_reasons[IDM].startswith("behind pi (selection seeds: ")
+    assert found.rejection_reasons[IDM].startswith("behind pi (10 tuning seeds")
     assert {seed[0] for _, seed in drive.driven} == {SELECTION_SEED}
     assert drive.seeds_of(HUMAN_BASELINE) == [
         (SELECTION_SEED, number) for number in range(len(found.rows[HUMAN_BASELINE]))
@@ -196,7 +197,29 @@ def test_small_budget_reports_the_missing_seeds() -> None:
     (judged,) = run_judge(drive, [PI], 0.001).controller_results
     assert judged.difference_to_acc.count == 4
     assert judged.missing_seeds > 0
-    assert "no verdict yet: the confidence interval is ±" in judged.summary
+    assert judged.verdict == UNDECIDED
+
+
+def test_infeasible_and_failed_controllers_end_after_the_first_round() -> None:
+    for change in ({"min_time_gap": 0.1}, {"status": "failed", "reason": "lost", "error": "EpisodeError"}):
+        drive = MadeUp({PI: shift_travel_time(-9.0, **change), IDM_MORE: shift_travel_time(-9.0)})
+        first, second = run_judge(drive, [PI, IDM_MORE]).controller_results
+        assert first.verdict == NOT_RECOMMENDED
+        assert len(drive.seeds_of(PI)) == MIN_TEST_SEEDS
+        assert second.verdict == RECOMMENDED
+        assert len(drive.seeds_of(BASELINE)) >= MIN_VERDICT_SEEDS  # findings on ACC vehicles need ten test seeds
+
+
+@pytest.mark.parametrize("drivers", [1, 3])
+@pytest.mark.parametrize("seeds", [MIN_VERDICT_SEEDS, 25])
+def test_estimated_budget_is_enough_for_its_test_seeds(drivers: int, seeds: int) -> None:
+    options = [Option(share, f"driver {number}") for share in SHARES for number in range(drivers)]
+    episodes = verdict_episodes(len(SHARES), drivers, False, seeds, len(SHARES))
+    drive = MadeUp({option: shift_travel_time(-1.0, 90.0) for option in options}, episodes)
+    found = select_controllers(options, drive, drive.budget, quiet)
+    affordable = drive.budget.affordable_seeds(1 + 2 * len(SHARES))
+    assert affordable >= seeds
+    assert len(found.finalists) == len(SHARES)
 
 
 def test_acc_vehicles_are_tested_without_controllers() -> None:
@@ -241,5 +264,6 @@ def test_each_round_has_a_line_with_the_remaining_time() -> None:
 
     select_controllers([IDM, PI], timed, budget, lines.append)
     compare_on_test_seeds([PI], (0.1,), False, timed, budget, 0.001, lines.append)
-    assert lines[0] == "selection seeds: 5; 1 of 2 options remain; at most 4 min more"
-    assert lines[1].startswith("test seeds: 8; CI of travel time at most ±")
+    assert lines[0] == "5 tuning seeds: 1 of 2 options remain; at most 4 min more"
+    assert lines[1].startswith("3 test seeds: CI of travel time at most ±")
+    assert "; 2 options remain, at most " in lines[1]

@@ -1,6 +1,7 @@
 """Episodes with drivers: `unjam drive` measures them, `watch` shows one, `assess` compares controllers on a road."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -189,8 +190,8 @@ def assess_command(
     ] = None,
     penetration_rates: Annotated[
         str, Option(help="Penetration rates among the vehicles of --cav-classes.")
-    ] = "0.02,0.05,0.1,0.2",
-    episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Maximum number of episodes.")] = 400,
+    ] = "0.05,0.1,0.2",
+    episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Maximum number of episodes.")] = 240,
     minutes: Annotated[float | None, Option(help="Maximum time; checked between batches of episodes.")] = None,
     precision: Annotated[
         float, Option(help="Sufficient half-width of the confidence interval of travel time, relative to it.")
@@ -214,22 +215,32 @@ def assess_command(
     - unjam assess my.sumocfg --penetration-rates 0.05,0.2 -d acc -d pi --minutes 30
     - unjam assess my.sumocfg -d runs/my-001 --penetration-rates 0.1 --begin 28800 --end 32400 --json
     """
-    from unjam.training.assess import DEFAULT_CONTROLLERS, assess, make_request
+    from unjam.reports.assessment import OPTION_HEADINGS, option_rows, parse_assessment
+    from unjam.training.assess import DEFAULT_CONTROLLERS, assess, format_duration, make_request
 
     drivers, changes = driver or DEFAULT_CONTROLLERS, opt.merge_settings(changes, opt.parse_settings(settings))
     request = make_request(scenario, _parse_rates(penetration_rates), episodes, precision, minutes, drivers, changes)
     folder = opt.new_folder(out, f"assess-{Path(scenario).stem}")
-    progress = output.ProgressReporter("assessing, at most", "steps", request.network.horizon * episodes)
+    progress = output.ProgressReporter("assessing", "steps")
     with lock_new_folder(folder), progress, WorkerPool(workers) as pool:
-        assessment = assess(request, folder, pool, progress.update, (lambda line: None) if json else err_console.print)
+        on_message = (lambda line: None) if json else partial(err_console.print, soft_wrap=True)
+        assessment = assess(request, folder, pool, progress.update, on_message, progress.begin)
+    document = assessment.document
     if json:
-        print_json({**assessment.document, "folder": str(folder), "report": str(assessment.page)})
+        print_json({**document, "folder": str(folder), "report": str(assessment.page)})
         return
-    console.print(assessment.document["headline"], soft_wrap=True)
-    for result in (*assessment.controller_results, *assessment.acc_results):
-        console.print(f"- {result.summary}", soft_wrap=True)
-    for line in (*assessment.document["notes"], f"report: {assessment.page}"):
-        err_console.print(line, soft_wrap=True)
+    for line in (document["headline"], document["acc_finding"]):
+        output.print_wrapped(line)
+    output.print_options(OPTION_HEADINGS, option_rows(parse_assessment(document)))
+    for result in (*assessment.controller_results, *(each for each in assessment.acc_results if each.needs_comment)):
+        output.print_wrapped(f"- {result.summary}")
+    output.print_notes(document["notes"])
+    err_console.print(f"report: {assessment.page}", soft_wrap=True)
+    if missing := document["missing_budget"]:
+        size = f"{missing['test_seeds']} test seeds, about {format_duration(missing['seconds'])}"
+        rest = output.arguments_without("--out", "--driver", "-d", "--episodes", "-n", "--minutes")
+        drivers = [word for name in missing["drivers"] for word in ("-d", name)]
+        output.print_next_command(f"for a verdict ({size})", *rest, *drivers, "--episodes", missing["episodes"])
 
 
 def _parse_rates(text: str) -> list[float]:

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.measure import Measurement
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
@@ -25,13 +25,18 @@ from unjam.measures.metric_table import RowsByDriver, TableCell, choose_baseline
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, is_expert_unchanged
 from unjam.measures.verdict import short_table_metrics, verdicts
+from unjam.training.selection import format_duration
 
 PROGRESS_LINE_SECONDS = 5.0
 """time between two plain lines of progress without a terminal"""
+MIN_TIMED_SECONDS = 1.0
+"""time of a count from which the rest is estimated"""
 PIPED_TABLE_WIDTH = 160
 """width of tables without a terminal [characters]"""
 NARROW_COLUMN_WIDTHS = 18, 7
 """widths of the columns of metrics and units in a narrow terminal [characters]"""
+WIDE_OPTIONS_WIDTH = 130
+"""width from which a cell of the main table of an assessment is one line [characters]"""
 TEXT_COLUMN_WIDTH = 22
 """width of headings and verdicts [characters]: that of most numbers with their intervals"""
 
@@ -71,16 +76,21 @@ def print_results(rows_by_driver: RowsByDriver, shows_all: bool, baseline: str =
     """Print the verdicts on drivers and the metrics that matter on their road, or all metrics with differences."""
     for verdict in verdicts(rows_by_driver, baseline):
         for line in verdict.lines:
-            if console.is_terminal:  # elsewhere a line stays one, so that it can be searched
-                hanging = " " * (2 + len(line) - len(line.lstrip()))
-                wrapping = {"subsequent_indent": hanging, "break_long_words": False, "break_on_hyphens": False}
-                line = fill(line, console.width, **wrapping)
-            console.print(line, soft_wrap=True)
+            print_wrapped(line)
     if shows_all:
         print_metrics(rows_by_driver, choose_baseline(rows_by_driver, baseline))
     else:
         print_metrics(rows_by_driver, "", short_table_metrics(rows_by_driver))
         err_console.print("all metrics, with differences: --all")
+
+
+def print_wrapped(line: str) -> None:
+    """Print a line, on a terminal wrapped between words; elsewhere it stays one, so that it can be searched."""
+    if console.is_terminal:
+        hanging = " " * (2 + len(line) - len(line.lstrip()))
+        wrapping = {"subsequent_indent": hanging, "break_long_words": False, "break_on_hyphens": False}
+        line = fill(line, console.width, **wrapping)
+    console.print(line, soft_wrap=True)
 
 
 def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[str] = METRICS) -> None:
@@ -121,6 +131,19 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
         console.print(build_table(block, separator))
 
 
+def print_options(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print the main table of an assessment without its last two columns, which are verdicts."""
+    narrow = console.width < WIDE_OPTIONS_WIDTH
+    split = [text.replace(" − ", "\n− ").replace(" [", "\n[") if narrow else text for text in headings]
+    table = new_table(split[:2], split[2:-2])
+    table.columns[1].max_width, table.columns[1].overflow = NARROW_COLUMN_WIDTHS[0] - 6 if narrow else None, "fold"
+    for column in table.columns[2:]:
+        column.no_wrap = True
+    for row in rows:
+        table.add_row(*(text.replace(" [", "\n[") if narrow else text for text in row[:-2]))
+    console.print(table)
+
+
 def print_notes(notes: Sequence[str]) -> None:
     """Print what a reader of the metrics should know, a line for each note."""
     for note in notes:
@@ -140,10 +163,12 @@ class ProgressReporter:
         """Prepare to count steps, named `unit`, of the work that `label` names."""
         self._label, self._unit = label, f" {unit}" if unit else ""
         self._is_plain = not err_console.is_terminal
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        columns = (TextColumn("{task.description}"), BarColumn(16), TaskProgressColumn(), TimeRemainingColumn())
         self._bar = Progress(*columns, console=err_console, transient=True, disable=self._is_plain)
         self._task, self._total = self._bar.add_task(label, total=total), total or 0
         self._done: dict[Any, int] = {}
+        self._start_time: float | None = None
+        """time of the first report"""
         self._last_line = time.monotonic()
 
     def __enter__(self) -> Self:
@@ -157,9 +182,22 @@ class ProgressReporter:
     def __call__(self, done: int, total: int) -> None:
         """Show that `done` of `total` are done."""
         self._bar.update(self._task, completed=done, total=total)
-        if self._is_plain and time.monotonic() - self._last_line > PROGRESS_LINE_SECONDS:
-            self._last_line = time.monotonic()
-            err_console.print(f"{self._label}: {done:,} of {total:,}{self._unit}")
+        now = time.monotonic()
+        self._start_time = self._start_time or now
+        if self._is_plain and now - self._last_line > PROGRESS_LINE_SECONDS:
+            self._last_line = now
+            elapsed, left = now - self._start_time, ""
+            if 0 < done < total and elapsed >= MIN_TIMED_SECONDS:
+                left = f", {format_duration(elapsed * (total - done) / done)} left"
+            err_console.print(f"{self._label}: {done:,} of {total:,}{self._unit}{left}")
+
+    def begin(self, label: str, total: int) -> None:
+        """Begin to count the steps of another work from zero, with a line that says so."""
+        self._label, self._total, self._done = label, total, {}
+        self._start_time, self._last_line = None, time.monotonic()
+        self._bar.reset(self._task, description=label, total=total)
+        if self._is_plain:
+            err_console.print(label)
 
     def update(self, episode: Any, steps: int) -> None:
         """Show the progress of parallel episodes: one has made so many steps, of the `total` of all."""
@@ -184,9 +222,9 @@ def suggest_after_drive(
     """Suggest the next command on the same road: compare with others, train on an expert, or watch if possible."""
     controllers = [driver for driver in drivers if driver != "human"]
     if "human" not in drivers:
-        print_next_command("compare with human drivers", *arguments_without_out(), "-d", "human")
+        print_next_command("compare with human drivers", *arguments_without("--out"), "-d", "human")
     elif not controllers:
-        print_next_command("compare with a controller", *arguments_without_out(), "-d", controller)
+        print_next_command("compare with a controller", *arguments_without("--out"), "-d", controller)
     elif all(driver.partition(":")[0] in DRIVERS for driver in controllers):
         command = "train", scenario, "--expert", controllers[-1], "--preset", "demo"
         options = setting_options(changes, "scenario_options.", reward, backend)
@@ -211,13 +249,15 @@ def setting_options(
         yield from ("--set", f"{prefix}{key}={value if isinstance(value, str) else json.dumps(value)}")
 
 
-def arguments_without_out() -> list[str]:
-    """Return the arguments of the running command without --out: its folder exists now."""
-    words = list(sys.argv[1:])
-    if "--out" in words:
-        index = words.index("--out")
-        del words[index : index + 2]
-    return [word for word in words if not word.startswith("--out=")]
+def arguments_without(*options: str) -> list[str]:
+    """Return the arguments of the running command without options that have a value."""
+    rest, words = list[str](), iter(sys.argv[1:])
+    for word in words:
+        if word in options:
+            next(words, "")
+        elif not any(word.startswith(f"{each}=" if each.startswith("--") else each) for each in options):
+            rest.append(word)
+    return rest
 
 
 def suggest_after_training(folder: Path, gain: "Estimate | None", steps: int, run: Path, is_finished: bool) -> None:

@@ -220,7 +220,7 @@ def search_command(
     if not json:
         plan = f"{trials} trainings, {workers} at once: {_plan_text(base)} each, into {folder}"
         err_console.print(f"searching {', '.join(space)} in {plan}", soft_wrap=True)
-    resume = output.suggest_resume(folder, *output.arguments_without_out(), "--out", folder)
+    resume = output.suggest_resume(folder, *output.arguments_without("--out"), "--out", folder)
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), resume:
         found = search(base, space, trials, folder, workers, executor, on_message)
     best = folder / BEST_CONFIG_FILE

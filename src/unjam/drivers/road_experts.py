@@ -222,11 +222,14 @@ class Cruise(FormulaDriver):
 class AdvisorySpeed(FormulaDriver):
     """Drives no faster than a fixed speed on a section upstream of a ramp; elsewhere its own ACC drives.
 
-    It needs neither messages nor feedback: the cheapest alternative to every driver that does.
+    It needs neither messages nor feedback: the cheapest alternative to every driver that does. Without a map of ramps,
+    as on your own network, it drives no faster than this speed everywhere.
     """
 
     name: ClassVar[str] = "advisory-speed"
-    own_requirements: ClassVar[Requirements] = Requirements(required_fields=frozenset({"distance_to_merge"}))
+    own_requirements: ClassVar[Requirements] = Requirements(
+        required_fields=frozenset({"allowed_speed"}), used_fields=frozenset({"allowed_speed", "distance_to_merge"})
+    )
 
     advised_speed: Positive = 19.4
     """[m/s]"""
@@ -242,9 +245,9 @@ class AdvisorySpeed(FormulaDriver):
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the speed on the section, elsewhere one above that of any ACC."""
         distance, free = state.distance_to_merge, state.speed * 0.0 + UNBOUNDED_ACCELERATION
-        if distance is None:
-            return free, memory
         towards = clamp_min((self.advised_speed - state.speed) / self.time_constant, -self.max_deceleration)
+        if distance is None:
+            return towards, memory
         is_advised = (distance < self.first_distance) & (distance > self.last_distance)
         return namespace(free).where(is_advised, towards, free), memory
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from unjam.measures.feasibility import HARD_BRAKING_METRIC, overall_feasibility
+from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, overall_feasibility
 from unjam.measures.statistics import (
     CONFIDENCE,
     Estimate,
@@ -92,6 +92,11 @@ class Effect:
     def is_too_small(self) -> bool:
         """Whether the difference of travel time is shown to be too small to matter."""
         return is_too_small(self.travel_time, self.baseline_travel_time)
+
+    @property
+    def is_infeasible(self) -> bool:
+        """Whether CAVs were infeasible in an episode, which further episodes cannot change."""
+        return self.feasibility not in ("", FEASIBLE)
 
     @property
     def is_longer(self) -> bool:

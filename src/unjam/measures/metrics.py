@@ -438,6 +438,7 @@ def measure(episode: Episode) -> dict[str, Any]:
         **{name: getattr(episode, name) for name in ("status", "reason", "error", "teleports", "contacts")},
         "steps": episode.control_steps,
         "warnings": [asdict(each) for each in episode.warnings],
+        **({"slow_entrances": [*map(asdict, episode.slow_entrances)]} if episode.slow_entrances else {}),
         "vehicles": len(episode.vehicle_ids),
         **episode.drawn_values,
         "required_time_gap": episode.audit.required_time_gap,

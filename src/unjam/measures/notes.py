@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from unjam.errors import InputError
+from unjam.errors import InputError, format_count
 from unjam.measures.metric_table import RowsByDriver
 from unjam.measures.statistics import has_ended_early
 
@@ -24,7 +24,8 @@ LOST_DEMAND_PATTERN = re.compile(
 def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return all notes on the episodes of several drivers, the most serious first."""
     lost, others = warning_notes(rows_by_driver)
-    notes = (note(rows_by_driver) for note in (early_end_notes, _backlog_notes, teleport_notes, _repeated_drive_notes))
+    kinds = early_end_notes, _backlog_notes, _entrance_notes, teleport_notes, _repeated_drive_notes
+    notes = (note(rows_by_driver) for note in kinds)
     return [*lost, *(each for group in notes for each in group), *others]
 
 
@@ -64,7 +65,7 @@ def teleport_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note for each driver with teleports, which do not exist in real traffic."""
     counts = {label: sum(row["teleports"] for row in rows) for label, rows in rows_by_driver.items()}
     return [
-        f"{label}: SUMO teleported or removed {count} vehicle{'' if count == 1 else 's'}, which had waited longer than "
+        f"{label}: SUMO teleported or removed {format_count(count, 'vehicle')}, which had waited longer than "
         "time-to-teleport or collided"
         for label, count in counts.items()
         if count
@@ -78,7 +79,7 @@ def _repeated_drive_notes(rows_by_driver: RowsByDriver) -> list[str]:
     if not drives or len(drives) == len(rows):
         return []
     alike = "those of the same drive differ in the noise of human drivers alone, and intervals are too narrow"
-    return [f"{len(rows)} episodes of {len(drives)} recorded drive{'' if len(drives) == 1 else 's'}: {alike}"]
+    return [f"{len(rows)} episodes of {format_count(len(drives), 'recorded drive')}: {alike}"]
 
 
 def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
@@ -91,6 +92,18 @@ def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
             count = f"{backlog:.0f} of {demand:.0f} vehicles"
             notes.append(f"{label}: {count} had not entered by the end: they wait in the insertion backlog")
     return notes
+
+
+def _entrance_notes(rows_by_driver: RowsByDriver) -> list[str]:
+    """Return a note for each entrance at which vehicles wait without a jam, with its values in one episode."""
+    rows = (row for rows in rows_by_driver.values() for row in rows)
+    slow = {each["edge"]: each for row in rows for each in row.get("slow_entrances", ())}
+    return [
+        f"{edge}: {each['vehicles']} vehicles wait {each['depart_delay']:.0f} s on average for their insertion without "
+        f'a jam, and depart at {each["depart_speed"]:.0f} m/s; departSpeed="max" departLane="best" lets them enter '
+        "as fast as is safe, if the entrance has the capacity for the demand"
+        for edge, each in slow.items()
+    ]
 
 
 def warning_notes(rows_by_driver: RowsByDriver) -> tuple[list[str], list[str]]:

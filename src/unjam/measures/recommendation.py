@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isfinite
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple
 
+from unjam.errors import format_count
 from unjam.measures.effect import (
     MAX_FLOW_LOSS,
     TIME_METRIC,
@@ -29,7 +30,9 @@ NEGLIGIBLE_DELAY_SHARE = 0.05
 """delay of the human baseline up to which there is nothing to gain, as a share of the free-flow travel time"""
 MIN_VERDICT_SEEDS = 10
 """minimum number of seeds for a recommendation; with fewer the CI is not reliable"""
-NO_RECOMMENDATION = "No controller is recommended on this road"
+RECOMMENDED, NOT_RECOMMENDED, UNDECIDED = "recommended", "not recommended", "not yet known"
+"""verdicts on a controller, and on a road"""
+ACC_BASELINE = "ACC vehicles alone"
 
 
 def rejection_reasons(effect: Effect) -> list[str]:
@@ -37,15 +40,21 @@ def rejection_reasons(effect: Effect) -> list[str]:
     time, max_loss = format_seconds(effect.travel_time), MAX_FLOW_LOSS * effect.baseline_flow
     # Too few seeds give NaN, with which every comparison is false: then a check fails.
     checks = (
-        (effect.travel_time.count >= MIN_VERDICT_SEEDS, f"{effect.travel_time.count} test seeds are too few"),
-        (not effect.failed_episodes, f"{effect.failed_episodes} episodes failed"),
-        (not effect.early_ends, f"{effect.early_ends} episodes ended early"),
+        (
+            effect.travel_time.count >= MIN_VERDICT_SEEDS or effect.is_infeasible,
+            f"{format_count(effect.travel_time.count, 'test seed')}, where {MIN_VERDICT_SEEDS} are needed",
+        ),
+        (not effect.failed_episodes, f"{format_count(effect.failed_episodes, 'episode')} failed"),
+        (not effect.early_ends, f"{format_count(effect.early_ends, 'episode')} ended early"),
         (
             effect.baseline_teleport_share <= MAX_TELEPORT_SHARE,
             f"nothing can be concluded: in the human baseline SUMO teleports or removes "
             f"{100 * effect.baseline_teleport_share:.1f} % of the vehicles (limit {100 * MAX_TELEPORT_SHARE:g} %)",
         ),
-        (effect.teleports <= 0, f"{effect.teleports} more vehicles teleported or removed than without CAVs"),
+        (
+            effect.teleports <= 0,
+            f"{format_count(effect.teleports, 'more vehicle')} teleported or removed than without CAVs",
+        ),
         *((not is_worse, reason) for is_worse, reason in harm_checks(effect)),
         (not effect.is_too_small, f"travel time differs from that of the human baseline by {TOO_SMALL}: {time}"),
         (
@@ -57,7 +66,10 @@ def rejection_reasons(effect: Effect) -> list[str]:
             f"flow may be lower by more than {100 * MAX_FLOW_LOSS:g} %: {format_difference(effect.flow)} veh/h",
         ),
         (effect.feasibility == FEASIBLE, f"infeasible: {effect.feasibility or 'no CAV drove'}"),
-        (effect.collisions <= 0, f"{effect.collisions:.0f} more vehicles in contact than without CAVs"),
+        (
+            effect.collisions <= 0,
+            f"{format_count(round(effect.collisions), 'more vehicle')} in contact than without CAVs",
+        ),
         (
             effect.hard_braking.mean <= 0,
             "human drivers brake beyond 4.5 m/s² more often than in the human baseline: "
@@ -81,7 +93,7 @@ def required_seeds(difference: Estimate, half_width: float) -> float:
 
 @dataclass(frozen=True)
 class AccResult:
-    """Effect of ACC vehicles without a controller at a penetration rate, on test seeds."""
+    """Effect of ACC vehicles alone at a penetration rate, on test seeds."""
 
     penetration_rate: float
     effect: Effect
@@ -89,7 +101,7 @@ class AccResult:
     """difference of travel time to ACC vehicles with all properties of the vehicles that they replace [s]; None: these
     ACC vehicles have the same properties"""
     missing_seeds: float = 0.0
-    """number of further test seeds that a verdict needs"""
+    """number of further test seeds with which the interval is narrow enough"""
 
     @property
     def has_enough_seeds(self) -> bool:
@@ -97,18 +109,24 @@ class AccResult:
         return self.effect.travel_time.count >= MIN_VERDICT_SEEDS
 
     @property
+    def needs_comment(self) -> bool:
+        """Whether the summary says more than the differences: ACC vehicles are infeasible, or have other properties."""
+        return self.effect.feasibility != FEASIBLE or self.property_effect is not None
+
+    @property
     def summary(self) -> str:
         """The finding as text."""
         time = self.effect.travel_time
         change = "is longer" if time.low > 0 else "is shorter" if time.high < 0 else "is not shown to differ"
         if not self.has_enough_seeds:
-            change = f"is not shown to differ ({time.count} test seeds are too few)"
+            seeds = format_count(time.count, "test seed")
+            change = f"is not shown to differ ({seeds}, where {MIN_VERDICT_SEEDS} are needed)"
         elif self.effect.is_too_small:
             change = f"differs by {TOO_SMALL},"
         text = (
-            f"ACC vehicles alone at a penetration rate of {format_percent(self.penetration_rate)}: travel time "
+            f"{ACC_BASELINE} at a penetration rate of {format_percent(self.penetration_rate)}: travel time "
             f"{change} compared with the human baseline. "
-            f"Differences: {self.effect.summary}{_missing_seeds_text(self.missing_seeds, time, 2)}."
+            f"Differences: {self.effect.summary}."
         )
         if self.effect.feasibility != FEASIBLE:
             text += f" They are infeasible themselves: {self.effect.feasibility or 'no CAV drove'}."
@@ -126,6 +144,8 @@ class ControllerResult:
     effect: Effect
     difference_to_acc: Estimate
     """difference of travel time to ACC vehicles at the same penetration rate [s]"""
+    flow_difference_to_acc: Estimate
+    """difference of flow to the same ACC vehicles [veh/h]"""
     missing_seeds: float = 0.0
     """number of further test seeds that a verdict needs"""
 
@@ -133,9 +153,9 @@ class ControllerResult:
     def reasons(self) -> list[str]:
         """Reasons against a recommendation."""
         change, reasons = self.difference_to_acc, rejection_reasons(self.effect)
-        acc = "with ACC vehicles alone at this penetration rate"
+        acc = f"with {ACC_BASELINE} at this penetration rate"
         if change.low == change.high == 0.0:
-            reasons.append("it never intervened: all travel times are those of ACC vehicles alone")
+            reasons.append(f"it never intervened: all travel times are those of {ACC_BASELINE}")
         elif is_too_small(change, self.effect.baseline_travel_time):
             reasons.append(f"travel time differs from that {acc} by {TOO_SMALL}: {format_seconds(change)}")
         elif not change.high < 0:
@@ -144,31 +164,42 @@ class ControllerResult:
         return reasons
 
     @property
-    def summary(self) -> str:
-        """The finding as text."""
-        name = f"{self.driver} at a penetration rate of {format_percent(self.penetration_rate)}"
-        if self.reasons:
-            missing = _missing_seeds_text(self.missing_seeds, self.difference_to_acc, 3)
-            return f"{name}: not recommended: {'; '.join(self.reasons)}{missing}."
-        effect = self.effect
+    def verdict(self) -> str:
+        """The verdict, which more test seeds may change if it is not yet known."""
+        return RECOMMENDED if not self.reasons else UNDECIDED if self.missing_seeds else NOT_RECOMMENDED
+
+    @property
+    def label(self) -> str:
+        """The controller and its penetration rate."""
+        return f"{self.driver} at a penetration rate of {format_percent(self.penetration_rate)}"
+
+    @property
+    def open_question(self) -> str:
+        """What is not yet known: the comparison whose interval includes zero, or is wider, as a clause."""
+        comparisons = (self.difference_to_acc, ACC_BASELINE), (self.effect.travel_time, "the human baseline")
+        change, baseline = max(comparisons, key=lambda each: (each[0].low <= 0 <= each[0].high, each[0].half_width))
+        if change.count < MIN_VERDICT_SEEDS:
+            return f"the budget had {format_count(change.count, 'test seed')}, and {MIN_VERDICT_SEEDS} are needed"
+        seeds = f"with {format_count(change.count, 'test seed')}"
         return (
-            f"{name}: recommended. Travel time {format_seconds(effect.travel_time)} "
-            f"({100 * effect.relative_travel_time:+.1f} %), flow {format_difference(effect.flow)} veh/h, fuel "
-            f"{format_difference(effect.fuel, 1)} ml/km compared with the human baseline; travel time "
-            f"{format_seconds(self.difference_to_acc)} compared with ACC vehicles alone; "
-            f"{effect.travel_time.count} test seeds."
+            f"{seeds}, the difference of travel time to {baseline} is {change.mean:+.1f} s ± {change.half_width:.1f} s"
         )
 
-
-def _missing_seeds_text(missing_seeds: float, difference: Estimate, episodes_per_seed: int) -> str:
-    """Return the width of the CI and the number of further seeds that a verdict needs, as text."""
-    if not missing_seeds:
-        return ""
-    if not isfinite(missing_seeds):
-        return f"; no verdict yet: {difference.count} test seeds are too few for a confidence interval"
-    episodes = f"{episodes_per_seed * missing_seeds:.0f} episodes"
-    needed = f"a verdict needs about {missing_seeds:.0f} more test seeds ({episodes})"
-    return f"; no verdict yet: the confidence interval is ±{difference.half_width:.1f} s, and {needed}"
+    @property
+    def summary(self) -> str:
+        """The finding as text."""
+        if self.verdict == UNDECIDED:
+            return f"{self.label}: {UNDECIDED}: {self.open_question}."
+        if self.reasons:
+            return f"{self.label}: {NOT_RECOMMENDED}: {'; '.join(self.reasons)}."
+        effect = self.effect
+        return (
+            f"{self.label}: recommended. Travel time {format_seconds(effect.travel_time)} "
+            f"({100 * effect.relative_travel_time:+.1f} %), flow {format_difference(effect.flow)} veh/h, fuel "
+            f"{format_difference(effect.fuel, 1)} ml/km compared with the human baseline; travel time "
+            f"{format_seconds(self.difference_to_acc)} compared with {ACC_BASELINE}; "
+            f"{effect.travel_time.count} test seeds."
+        )
 
 
 def recommended_result(results: Sequence[ControllerResult]) -> ControllerResult | None:
@@ -185,37 +216,49 @@ def plotted_result(results: Sequence[ControllerResult]) -> ControllerResult | No
     return recommended_result(results) or _quickest(results)
 
 
-def assessment_headline(
-    results: Sequence[ControllerResult], acc_results: Sequence[AccResult], baseline: Sequence[dict[str, Any]] = ()
-) -> str:
-    """Return the main finding of an assessment: the recommendation, and the effect of ACC vehicles alone.
+class RoadVerdict(NamedTuple):
+    """The answer of an assessment."""
+
+    verdict: str
+    sentence: str
+    """the answer in one sentence"""
+
+
+def road_verdict(results: Sequence[ControllerResult], baseline: Sequence[dict[str, Any]] = ()) -> RoadVerdict:
+    """Return the answer of an assessment: the recommended controller, or why there is none.
 
     `baseline` has the rows of the human baseline, which show whether traffic is nearly free-flowing.
     """
     best = recommended_result(results)
     if best is not None:
-        effect, rate = best.effect, format_percent(best.penetration_rate)
-        first = (
-            f"Recommended on this road: {best.driver} at a penetration rate of {rate}. Travel time "
-            f"{format_seconds(effect.travel_time)} per vehicle ({100 * effect.relative_travel_time:+.1f} %) compared "
-            f"with the human baseline, {format_seconds(best.difference_to_acc)} compared with ACC vehicles alone."
+        time, to_acc = best.effect.travel_time.mean, best.difference_to_acc.mean
+        share = 100 * abs(best.effect.relative_travel_time)
+        gain = f"{-time:.1f} s ({share:.1f} %) shorter than in human-only traffic"
+        return RoadVerdict(
+            RECOMMENDED,
+            f"Recommended: {best.label}, because travel time is {gain} and {-to_acc:.1f} s shorter than with "
+            f"{ACC_BASELINE}.",
         )
-    elif not results:
-        first = f"{NO_RECOMMENDATION}: none was tested, or all were rejected before the test."
-    elif any(each.missing_seeds for each in results):
-        first = f"{NO_RECOMMENDATION} so far: for some of them there is no verdict yet."
+    travel_time, delay = (metric_estimate(baseline, name).mean for name in (TIME_METRIC, "delay"))
+    if (delay_share := delay / (travel_time - delay)) <= NEGLIGIBLE_DELAY_SHARE:
+        within = max(1, ceil(100 * delay_share))
+        reason = f"there is nothing to gain, because human-only traffic is within {within} % of free flow"
+    elif undecided := [each for each in results if each.verdict == UNDECIDED]:
+        best = _quickest(undecided) or undecided[0]
+        return RoadVerdict(UNDECIDED, f"Not yet known whether to recommend {best.label}: {best.open_question}.")
+    elif best := _quickest(results):
+        reason = f"no controller passes the rule; the fastest is {best.label}, but {best.reasons[0]}"
     else:
-        first = f"{NO_RECOMMENDATION}: none passes the rule."
-    second = _acc_finding([each for each in acc_results if each.has_enough_seeds])
-    if best is None:
-        travel_time, delay = (metric_estimate(baseline, name).mean for name in (TIME_METRIC, "delay"))
-        if (delay_share := delay / (travel_time - delay)) <= NEGLIGIBLE_DELAY_SHARE:
-            within = max(1, ceil(100 * delay_share))
-            return f"Nothing to gain here: the human baseline is within {within} % of free flow. {first}"
-    return f"{first} ACC vehicles alone {second}."
+        reason = "no controller was tested, or all were rejected on the tuning seeds"
+    return RoadVerdict(NOT_RECOMMENDED, f"Not recommended: {reason}.")
 
 
-def _acc_finding(results: Sequence[AccResult]) -> str:
+def acc_finding(results: Sequence[AccResult]) -> str:
+    """Return the finding on ACC vehicles alone as a sentence."""
+    return f"{ACC_BASELINE} {_acc_effect([each for each in results if each.has_enough_seeds])}."
+
+
+def _acc_effect(results: Sequence[AccResult]) -> str:
     """Return the predicate of a sentence about ACC vehicles alone: their largest gain, else their largest loss."""
     key = attrgetter("effect.relative_travel_time")
     gains = [each for each in results if each.effect.travel_time.high < 0 and not each.effect.is_too_small]

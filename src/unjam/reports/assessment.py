@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from unjam.errors import InputError
 from unjam.files import atomic_write, check_parent_folder
-from unjam.measures.effect import MAX_FLOW_LOSS
+from unjam.measures.effect import FLOW_METRIC, MAX_FLOW_LOSS, TIME_METRIC
 from unjam.measures.metric_table import estimate_cell
 from unjam.measures.recommendation import MIN_VERDICT_SEEDS
 from unjam.measures.statistics import Estimate, format_difference, format_percent
@@ -29,7 +29,14 @@ EFFECT_METRICS = (
     ("hard_braking", "human_braking_beyond_4_5", "human drivers' braking beyond 4.5 m/s²", "per million", 0),
 )
 """field of an effect, its metric, and label, unit and digits in tables"""
-HUMAN_BASELINE_LABEL = "human baseline"
+HUMAN_BASELINE_LABEL, ACC_LABEL = "human baseline", "ACC alone"
+OPTION_HEADINGS = (
+    *("CAVs", "driver", "travel time − human [s]", "travel time − ACC [s]"),
+    *("flow − human [veh/h]", "flow − ACC [veh/h]", "feasible", "verdict"),
+)
+"""columns of the main table: differences to the human baseline and to ACC vehicles alone"""
+ACC_DIFFERENCES = "difference_to_acc", "flow_difference_to_acc"
+MISSING = Estimate(nan, nan, nan, 0)
 
 
 def write_assessment(folder: Path, target: Path) -> Path:
@@ -47,18 +54,15 @@ def render_assessment(folder: Path) -> str:
     path = folder / ASSESSMENT_FILE
     if not path.is_file():
         raise InputError(f"report: {str(folder)!r} has no {ASSESSMENT_FILE}")
-    assessment, results = json.loads(path.read_text()), read_results(folder)
-    for each in assessment["controller_results"]:
-        each["difference_to_acc"] = _parse_estimate(each["difference_to_acc"])
-    for each in (*_evaluated_options(assessment), *assessment["candidates"]):
-        each["effect"] = {key: _parse_estimate(value) for key, value in each["effect"].items()}
+    assessment, results = parse_assessment(json.loads(path.read_text())), read_results(folder)
     names = {"human": HUMAN_BASELINE_LABEL}
     panels = [replace(each, driver=names.get(each.driver, each.driver)) for each in results.plot_episodes.values()]
     return render_template(
         "assessment.html",
         assessment=assessment,
         rates_without_controller=_rates_without_controller(assessment),
-        cards=_key_figures(assessment),
+        option_headings=OPTION_HEADINGS,
+        option_rows=option_rows(assessment),
         columns=[HUMAN_BASELINE_LABEL, *map(_option_label, _evaluated_options(assessment))],
         result_rows=_result_rows(assessment),
         candidate_rows=[_tuning_row(each) for each in assessment["candidates"]],
@@ -99,25 +103,39 @@ def _rates_without_controller(assessment: dict[str, Any]) -> list[tuple[float, d
     ]
 
 
-def _key_figures(assessment: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Return label, value and detail of key figures: human baseline, and effect of the recommended controller."""
-    best = assessment["recommended"] or {"penetration_rate": None}
-    results = assessment["controller_results"]
-    effect = next((each["effect"] for each in results if each["penetration_rate"] == best["penetration_rate"]), None)
-    cards = []
-    for field, metric, label, unit, digits in EFFECT_METRICS[:3]:
-        mean = assessment["baseline"][metric]["mean"]
-        change = f"; recommended: {format_difference(effect[field], digits)}" if effect else ""
-        value = "–" if mean is None else f"{mean:.{digits}f} {unit}"
-        cards.append((label, value, HUMAN_BASELINE_LABEL + change))
-    return cards
+def parse_assessment(document: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of `assessment.json` with its estimates as `Estimate`."""
+
+    def parse_values(values: dict[str, Any]) -> dict[str, Any]:
+        return {
+            key: parse_values(value) if key == "effect" else _parse_estimate(value) for key, value in values.items()
+        }
+
+    groups = {
+        name: [*map(parse_values, document[name])] for name in ("controller_results", "acc_results", "candidates")
+    }
+    return {**document, **groups, "baseline": parse_values(document["baseline"])}
+
+
+def option_rows(assessment: dict[str, Any]) -> list[list[str]]:
+    """Return the cells of the main table, as in `OPTION_HEADINGS`: the human baseline, then a row for each option."""
+    time, flow = (assessment["baseline"][metric].mean for metric in (TIME_METRIC, FLOW_METRIC))
+    rows = [["none", HUMAN_BASELINE_LABEL, f"{time:.1f} s", "–", f"{flow:,.0f} veh/h", "–", "–", "–"]]
+    for each in _evaluated_options(assessment):
+        effect, to_acc = each["effect"], [each.get(name, MISSING) for name in ACC_DIFFERENCES]
+        times = [format_difference(change, 1) for change in (effect["travel_time"], to_acc[0])]
+        flows = [format_difference(change) for change in (effect["flow"], to_acc[1])]
+        driver = ACC_LABEL if "verdict" not in each else each["driver"]
+        verdicts = effect["feasibility"] or "–", each.get("verdict", "–")
+        rows.append([format_percent(each["penetration_rate"]), driver, *times, *flows, *verdicts])
+    return rows
 
 
 def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the rows of the results on test seeds: the human baseline in absolute numbers, then differences to it."""
     options = _evaluated_options(assessment)
     effects = [option["effect"] for option in options]
-    baseline = {name: _parse_estimate(value) for name, value in assessment["baseline"].items()}
+    baseline = assessment["baseline"]
     verdicts = ["no" if each.get("reasons") else "yes" if "reasons" in each else "–" for each in options]
     relative = [f"{100 * each['travel_time'].mean / each['baseline_travel_time']:+.1f}" for each in effects]
     acc = [format_difference(each["difference_to_acc"], 1) if "difference_to_acc" in each else "–" for each in options]

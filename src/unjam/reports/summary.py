@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from unjam.errors import printable
+from unjam.errors import format_count, printable
 from unjam.measures.effect import LAG_METRIC, POWER_FUEL_METRIC
 from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, estimate_cell
 from unjam.measures.metrics import METRICS
@@ -156,10 +156,10 @@ def _drive_finding(result: Results) -> str:
     [(label, rows)] = result.rows.items()
     speed = metric_estimate(rows, "mean_speed")
     if speed.count == 0:
-        return f"{label} on {scenario}: all {len(rows)} episodes failed."
+        return f"{label} on {scenario}: no episode of {len(rows)} succeeded."
     return (
-        f"{label} on {scenario}, {len(rows)} episodes: the mean speed of all vehicles is {speed.mean:.2f} m/s, "
-        f"and in steady state {percent[label]} of the limit."
+        f"{label} on {scenario}, {format_count(len(rows), 'episode')}: the mean speed of all vehicles is "
+        f"{speed.mean:.2f} m/s, and in steady state {percent[label]} of the limit."
     )
 
 

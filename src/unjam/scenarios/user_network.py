@@ -44,6 +44,12 @@ MAX_LOGGED_NAMES, MAX_NOTED_NAMES = 8, 200
 DEVICE_SHARE = re.compile(r"(person-)?device\..*\.probability")
 DROPPED_DEVICE_SHARE = re.compile(rf"option {DEVICE_SHARE.pattern}")
 """options, and items left out, by which SUMO draws the vehicles that have a device, all from one random sequence"""
+OPERATOR_SETTINGS = "speed_limit_control", "ramp_meter"
+"""settings of built-in motorways for what their operator does"""
+ALTERNATIVES = (
+    "allowed here: a fixed speed of CAVs (-d advisory-speed:advised_speed=20), or a variable speed sign or a signal in "
+    "your own files"
+)
 _LOGGER = logging.getLogger(__name__)
 
 
@@ -227,6 +233,10 @@ def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
 
     Raise `InputError` with one line about what is missing or broken, before SUMO starts.
     """
+    for name in (each for each in OPERATOR_SETTINGS if each in changes):
+        raise InputError(
+            f"{name}: it is not allowed on your own network, only on motorways such as on-ramp; {ALTERNATIVES}"
+        )
     files = read_sumo_files(Path.cwd() / file)  # a link stays one: SUMO finds other files beside it
     _log_once(*notes_on_files(files, MAX_LOGGED_NAMES))
     if isinstance(cruise := changes.get("cruise", {}), dict):

@@ -5,25 +5,31 @@ penetration rate on selection seeds and tested on others; a rule decides whether
 """
 
 import json
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
+from math import ceil, isfinite
 from pathlib import Path
 from typing import Any, cast
 
 from unjam.controller import DEFAULT_DRIVER, make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe
-from unjam.errors import InputError, NoCavError, invalid_value
+from unjam.errors import InputError, NoCavError, format_count, invalid_value
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import HARD_BRAKING_METRIC
 from unjam.measures.notes import check_baseline, episode_notes
 from unjam.measures.recommendation import (
+    MIN_VERDICT_SEEDS,
+    UNDECIDED,
     AccResult,
     ControllerResult,
-    assessment_headline,
+    acc_finding,
     plotted_result,
     recommended_result,
+    road_verdict,
 )
 from unjam.measures.statistics import metric_estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
@@ -47,12 +53,14 @@ from unjam.training.selection import (
     compare_on_test_seeds,
     format_duration,
     min_episodes,
-    min_verdict_episodes,
     select_controllers,
+    verdict_episodes,
 )
 from unjam.worlds.episode import check_can_drive
 from unjam.worlds.worker_pool import WorkerPool
 
+StageCallback = Callable[[str, int], None]
+"""called with the name of a stage that begins, and its maximum number of control steps"""
 DEFAULT_CONTROLLERS = (DEFAULT_DRIVER, "follower-stopper", "pi")
 """default controllers, which suit open roads"""
 ACC_PROPERTIES = ("acceleration", "deceleration", "keep_right", "speed_gain")
@@ -98,6 +106,19 @@ class AssessmentRequest:
     def has_acc_properties(self) -> bool:
         """Whether the user replaces a property of the vehicles for CAVs."""
         return any(getattr(self.network.cruise, name) is not None for name in ACC_PROPERTIES)
+
+    @property
+    def verdict_episodes(self) -> int:
+        """Number of episodes of the smallest verdict."""
+        counts = len(self.penetration_rates), len(self.drivers), self.has_acc_properties
+        return verdict_episodes(*counts) + PLOT_EPISODE_COUNT
+
+    @property
+    def smallest_question(self) -> "AssessmentRequest":
+        """The same request with its median penetration rate and first controller only."""
+        rate = self.penetration_rates[len(self.penetration_rates) // 2]
+        drivers = dict(list(self.drivers.items())[:1])
+        return replace(self, penetration_rates=(rate,), drivers=drivers)
 
     def make_setup(self, option: Option) -> tuple[Scenario, Driver]:
         """Return the road with this penetration rate, and the driver of the CAVs."""
@@ -150,7 +171,8 @@ def make_request(
     request = AssessmentRequest(file, road, controllers, rates, episodes, minutes, precision)
     minimum = min_episodes(len(rates), len(controllers), request.has_acc_properties) + PLOT_EPISODE_COUNT
     if episodes < minimum:
-        allowed = f">= {minimum} for {len(rates)} penetration rates and {len(controllers)} controllers"
+        counts = format_count(len(rates), "penetration rate"), format_count(len(controllers), "controller")
+        allowed = f">= {minimum} for {' and '.join(counts)}"
         raise invalid_value("episodes", episodes, allowed)
     return request
 
@@ -174,19 +196,22 @@ def assess(
     workers: WorkerPool,
     progress: Callable[[Any, int], None] | None = None,
     on_message: MessageCallback = lambda line: None,
+    on_stage: StageCallback = lambda name, steps: None,
 ) -> Assessment:
     """Run an assessment, and write rows, `assessment.json` and the page into a new folder.
 
     Files are written at the end. Without `minutes`, the result does not depend on the number of workers. `progress` is
-    called repeatedly with the control steps of an episode, `on_message` with a line for each batch of episodes. Raise
-    `InputError` if the folder is not empty, or no driver can drive on this road.
+    called repeatedly with the control steps of an episode, `on_stage` at the beginning of a batch of episodes, and
+    `on_message` with a line about its result. Raise `InputError` if the folder is not empty, or no driver can drive on
+    this road.
     """
     make_new_folder(folder)
     budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
 
     def evaluate_options(
-        options: Sequence[Option], seeds: Sequence[EpisodeSeed], with_plots: bool = False
+        stage: str, options: Sequence[Option], seeds: Sequence[EpisodeSeed], with_plots: bool = False
     ) -> Evaluation:
+        on_stage(stage, request.network.horizon * len(options) * len(seeds))
         setups = {option.label: request.make_setup(option) for option in options}
         batch = budget.used_episodes
 
@@ -198,8 +223,11 @@ def assess(
         budget.spend(len(options) * len(seeds))
         return evaluation
 
-    def run_options(options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
-        rows = evaluate_options(options, seeds).rows
+    def run_options(kind: str, options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
+        first, last = seeds[0][-1] + 1, seeds[-1][-1] + 1
+        numbers = f"seeds {first} to {last}" if first < last else f"seed {first}"
+        stage = f"simulating {kind} {numbers} of {format_count(len(options), 'option')}"
+        rows = evaluate_options(stage, options, seeds).rows
         human_rows = rows[HUMAN_BASELINE.label]
         baseline.extend(human_rows)
         check_baseline(baseline, MIN_BASELINE_EPISODES)
@@ -212,27 +240,26 @@ def assess(
             for option in options
         }
 
-    first = evaluate_options([HUMAN_BASELINE], held_out_seeds(1), with_plots=True)
+    first = evaluate_options("simulating the human baseline, seed 1 of 1", [HUMAN_BASELINE], held_out_seeds(1), True)
     raise_failure(first.rows[HUMAN_BASELINE.label])
-    duration, total = format_duration(budget.elapsed_seconds), format_duration(budget.estimate_seconds(budget.episodes))
-    on_message(
-        f"an episode of the human baseline took {duration}; all {request.episodes} episodes on {workers.count} "
-        f"workers may take {total}" + (f", but at most {request.minutes:g} min" if request.minutes else "")
-    )
-    counts = len(request.penetration_rates), len(request.drivers), request.has_acc_properties
-    needed = min_verdict_episodes(*counts) + PLOT_EPISODE_COUNT
-    if request.episodes < needed:
-        on_message(f"{request.episodes} episodes may be too few for a verdict; enough are {needed}")
-    selection = select_controllers(request.options, run_options, budget, on_message)
+    for line in budget_lines(request, budget):
+        on_message(line)
+    selection = select_controllers(request.options, partial(run_options, "tuning"), budget, on_message)
     selection_episodes = budget.used_episodes - 1
     rates, precision = request.penetration_rates, request.precision
     findings = compare_on_test_seeds(
-        selection.finalists, rates, request.has_acc_properties, run_options, budget, precision, on_message
+        selection.finalists,
+        rates,
+        request.has_acc_properties,
+        partial(run_options, "test"),
+        budget,
+        precision,
+        on_message,
     )
     best = plotted_result(findings.controller_results)
     plotted = Option(best.penetration_rate, best.driver) if best else Option(rates[-1], ACC_DRIVER)
     plot_episodes = first.plot_episodes
-    plot_episodes |= evaluate_options([plotted], held_out_seeds(1), with_plots=True).plot_episodes
+    plot_episodes |= evaluate_options("simulating the pictures", [plotted], held_out_seeds(1), True).plot_episodes
 
     metadata = {"scenario": Path(request.file).name, "reward": request.network.reward, "manifest": manifest()}
     selection_rows = {option.label: rows for option, rows in selection.rows.items()}
@@ -249,6 +276,39 @@ def assess(
     atomic_write(folder / ASSESSMENT_FILE, to_json(document, indent=1))
     page = write_assessment(folder, folder / ASSESSMENT_PAGE)
     return Assessment(findings.controller_results, findings.acc_results, json.loads(to_json(document)), page)
+
+
+def budget_lines(request: AssessmentRequest, budget: EpisodeBudget) -> list[str]:
+    """Return how long a verdict and the whole budget take, and a smaller question, one line each."""
+
+    def duration(episodes: int) -> str:
+        return f"{format_count(episodes, 'episode')}, about {format_duration(budget.estimate_seconds(episodes))}"
+
+    needed, limit = request.verdict_episodes, f" or {request.minutes:g} min" if request.minutes else ""
+    lines = [f"a verdict needs at least {MIN_VERDICT_SEEDS} test seeds: {duration(needed)}"]
+    too_small = ", which is too small for a verdict" if request.episodes < needed else ""
+    lines.append(f"the budget is at most {duration(request.episodes)}{limit}{too_small}")
+    small = request.smallest_question
+    if len(request.options) > 1:
+        (option,) = small.options
+        question = f"--penetration-rates {option.penetration_rate:g} -d {shlex.quote(option.driver)}"
+        lines.append(f"a smaller question, {question}, needs at least {duration(small.verdict_episodes)}")
+    return lines
+
+
+def missing_budget(request: AssessmentRequest, findings: AssessmentFindings, budget: EpisodeBudget) -> dict[str, Any]:
+    """Return the budget with which the open questions would probably be answered.
+
+    All penetration rates stay, and only controllers are left out: they were selected on other seeds.
+    """
+    undecided = [each for each in findings.controller_results if each.verdict == UNDECIDED]
+    needed = [each.difference_to_acc.count + each.missing_seeds for each in undecided]
+    seeds = max([MIN_VERDICT_SEEDS, *(ceil(each) for each in needed if isfinite(each))])
+    drivers = list(dict.fromkeys(each.driver for each in undecided))
+    counts = len(request.penetration_rates), len(drivers), request.has_acc_properties
+    episodes = verdict_episodes(*counts, seeds, len(undecided)) + PLOT_EPISODE_COUNT
+    seconds = budget.estimate_seconds(episodes)
+    return {"test_seeds": seeds, "episodes": episodes, "seconds": seconds, "drivers": drivers}
 
 
 def sensing_notes(request: AssessmentRequest) -> list[str]:
@@ -271,6 +331,12 @@ def _assessment_document(
 ) -> dict[str, Any]:
     best = recommended_result(findings.controller_results)
     baseline_rows = findings.rows[HUMAN_BASELINE]
+    answer, missing = road_verdict(findings.controller_results, baseline_rows), None
+    if answer.verdict == UNDECIDED:
+        missing = missing_budget(request, findings, budget)
+        size = f"{format_count(missing['test_seeds'], 'test seed')} ({format_count(missing['episodes'], 'episode')}"
+        more = f"a verdict needs about {size}, about {format_duration(missing['seconds'])})"
+        answer = answer._replace(sentence=f"{answer.sentence.removesuffix('.')}; {more}.")
     candidates = [
         {
             **option._asdict(),
@@ -282,10 +348,14 @@ def _assessment_document(
         if selection.rows[option]
     ]
     return {
-        "headline": assessment_headline(findings.controller_results, findings.acc_results, baseline_rows),
+        "verdict": answer.verdict,
+        "headline": answer.sentence,
+        "acc_finding": acc_finding(findings.acc_results),
+        "missing_budget": missing,
         "recommended": best and {"penetration_rate": best.penetration_rate, "driver": best.driver},
         "controller_results": [
-            {**asdict(each), "reasons": each.reasons, "summary": each.summary} for each in findings.controller_results
+            {**asdict(each), "reasons": each.reasons, "verdict": each.verdict, "summary": each.summary}
+            for each in findings.controller_results
         ],
         "acc_results": [
             {**asdict(each), "driver": ACC_DRIVER, "summary": each.summary} for each in findings.acc_results

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from math import ceil, isfinite, log2
 from typing import Any, NamedTuple
 
-from unjam.measures.effect import Effect, describe_harm, effect_of, is_too_small
+from unjam.errors import format_count
+from unjam.measures.effect import FLOW_METRIC, TIME_METRIC, Effect, describe_harm, effect_of, is_too_small
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.recommendation import MIN_VERDICT_SEEDS, AccResult, ControllerResult, required_seeds
 from unjam.measures.statistics import CONFIDENCE, Estimate, format_percent, paired_difference
@@ -76,6 +77,12 @@ class EpisodeBudget:
         """Return the estimated duration of more episodes [s]."""
         return self.elapsed_seconds / max(1, self._completed_rounds) * ceil(episodes / self._workers)
 
+    @property
+    def remaining_seconds(self) -> float:
+        """Estimated time until the budget is spent [s]."""
+        seconds = self.estimate_seconds(self.episodes - self.used_episodes)
+        return seconds if self.minutes is None else min(seconds, max(0.0, 60.0 * self.minutes - self.elapsed_seconds))
+
     def affordable_seeds(self, option_count: int, fraction: float = 1.0) -> int:
         """Return the number of seeds on which so many options can run within a fraction of the budget."""
         episodes = int(fraction * self.episodes + 1e-9) - self.used_episodes
@@ -103,17 +110,24 @@ class Selection:
 def min_episodes(rate_count: int, driver_count: int, with_unchanged_acc: bool = False) -> int:
     """Return the smallest budget with which every option runs and the selected ones are tested."""
     selection = 1 + rate_count * driver_count if driver_count > 1 else 0
-    return selection + MIN_TEST_SEEDS * _episodes_per_test_seed(rate_count, driver_count, with_unchanged_acc)
+    return selection + MIN_TEST_SEEDS * (1 + rate_count * (1 + bool(driver_count) + with_unchanged_acc))
 
 
-def min_verdict_episodes(rate_count: int, driver_count: int, with_unchanged_acc: bool = False) -> int:
-    """Return a budget that is enough for the test seeds of a verdict, whatever selection uses."""
-    test_episodes = MIN_VERDICT_SEEDS * _episodes_per_test_seed(rate_count, driver_count, with_unchanged_acc)
+def verdict_episodes(
+    rate_count: int,
+    driver_count: int,
+    with_unchanged_acc: bool = False,
+    seeds: int = MIN_VERDICT_SEEDS,
+    undecided_rate_count: int = 0,
+) -> int:
+    """Return a budget that is enough for a number of test seeds, whatever selection uses.
+
+    Of the seeds beyond those of any verdict, only `undecided_rate_count` penetration rates need all.
+    """
+    options_per_rate = 1 + bool(driver_count) + with_unchanged_acc
+    first = MIN_VERDICT_SEEDS * (1 + rate_count * options_per_rate)
+    test_episodes = first + (seeds - MIN_VERDICT_SEEDS) * (1 + undecided_rate_count * options_per_rate)
     return ceil(test_episodes / (1.0 - SELECTION_BUDGET_FRACTION)) if driver_count > 1 else test_episodes
-
-
-def _episodes_per_test_seed(rate_count: int, driver_count: int, with_unchanged_acc: bool) -> int:
-    return 1 + rate_count * (1 + bool(driver_count) + with_unchanged_acc)
 
 
 def select_controllers(
@@ -147,11 +161,11 @@ def select_controllers(
                 (each for each in remaining if each.penetration_rate == rate),
                 key=lambda each: _ranking_key(selection.effect(each)),
             )
-            reason = f"behind {ranked[0].driver} (selection seeds: {seed_count})"
+            reason = f"behind {ranked[0].driver} ({format_count(seed_count, 'tuning seed')})"
             rejected |= dict.fromkeys(ranked[ceil(len(ranked) / 2) :], reason)
         remaining = [option for option in remaining if option not in rejected]
-        status = f"selection seeds: {seed_count}; {len(remaining)} of {len(options)} options remain"
-        on_message(f"{status}{_remaining_time_text(budget)}")
+        status = f"{format_count(seed_count, 'tuning seed')}: {len(remaining)} of {len(options)} options remain"
+        on_message(f"{status}; {_remaining_time_text(budget)}")
         if not remaining:
             break
     if options and len(_failure_reasons(rows, options)) == len(options):
@@ -191,7 +205,8 @@ def compare_on_test_seeds(
     active, results, acc_results = [*rows][1:], list[ControllerResult](), list[AccResult]()
     while active:
         seeds = len(rows[HUMAN_BASELINE])
-        wanted = MIN_VERDICT_SEEDS - seeds if seeds < MIN_VERDICT_SEEDS else seeds // 2
+        # The first round ends options that can never be recommended, such as infeasible ones.
+        wanted = seeds // 2 if seeds >= MIN_VERDICT_SEEDS else MIN_VERDICT_SEEDS - seeds if seeds else MIN_TEST_SEEDS
         count = max(min(wanted, budget.affordable_seeds(1 + len(active))), 0 if seeds else MIN_TEST_SEEDS)
         if not count:
             break
@@ -215,8 +230,9 @@ def compare_on_test_seeds(
             if option in undecided or (option not in finalists and option.penetration_rate in undecided_rates)
         ]
         widths = _width_text([each.effect.relative_half_width for each in (*results, *acc_results)], precision)
-        status = f"test seeds: {len(rows[HUMAN_BASELINE])}; {widths}, {len(active)} options remain"
-        on_message(f"{status}{_remaining_time_text(budget) if active else ''}")
+        status = f"{format_count(len(rows[HUMAN_BASELINE]), 'test seed')}: {widths}"
+        remaining = f"; {format_count(len(active), 'option')} remain, {_remaining_time_text(budget)}" if active else ""
+        on_message(status + remaining)
     acc_rows = [row for option in acc_options for row in rows[option]]
     if all(row["status"] == "failed" for row in acc_rows):
         raise_failure(acc_rows)
@@ -228,18 +244,25 @@ def _controller_result(
 ) -> ControllerResult:
     effect = effect_of(rows[option], rows[HUMAN_BASELINE], confidence)
     acc_rows = rows[Option(option.penetration_rate, ACC_DRIVER)][: len(rows[option])]
-    difference = paired_difference(rows[option], acc_rows, "travel_time", confidence)
+    differences = (paired_difference(rows[option], acc_rows, name, confidence) for name in (TIME_METRIC, FLOW_METRIC))
+    difference, flow_difference = differences
     half_width = precision * effect.baseline_travel_time
     required = max(required_seeds(each, half_width) for each in (difference, effect.travel_time))
-    missing = 0.0 if _is_rejected(effect, difference) else max(0.0, required - difference.count)
-    return ControllerResult(*option, effect, difference, missing)
+    required = MIN_VERDICT_SEEDS if _is_rejected(effect, difference) else required
+    missing = 0.0 if _has_failed(effect) else max(0.0, required - difference.count)
+    return ControllerResult(*option, effect, difference, flow_difference, missing)
 
 
 def _is_rejected(effect: Effect, difference_to_acc: Estimate) -> bool:
     """Return whether more test seeds can hardly lead to a recommendation."""
     harms = bool(describe_harm(effect)) or difference_to_acc.low > 0
     too_small = effect.is_too_small or is_too_small(difference_to_acc, effect.baseline_travel_time)
-    return bool(effect.failed_episodes) or harms or too_small or effect.feasibility != FEASIBLE
+    return harms or too_small or effect.feasibility != FEASIBLE
+
+
+def _has_failed(effect: Effect) -> bool:
+    """Return whether an episode rules a recommendation out, however many others follow."""
+    return bool(effect.failed_episodes) or effect.is_infeasible
 
 
 def _acc_result(option: Option, rows: dict[Option, OptionRows], confidence: float, precision: float) -> AccResult:
@@ -247,7 +270,8 @@ def _acc_result(option: Option, rows: dict[Option, OptionRows], confidence: floa
     unchanged = rows.get(Option(option.penetration_rate, UNCHANGED_ACC_DRIVER))
     property_effect = paired_difference(rows[option], unchanged, "travel_time", confidence) if unchanged else None
     required = required_seeds(effect.travel_time, precision * effect.baseline_travel_time)
-    missing = 0.0 if effect.is_too_small else max(0.0, required - effect.travel_time.count)
+    required = MIN_VERDICT_SEEDS if effect.is_too_small else required
+    missing = max(0.0, required - effect.travel_time.count)
     return AccResult(option.penetration_rate, effect, property_effect, missing)
 
 
@@ -255,8 +279,8 @@ def _may_change_verdict(result: ControllerResult, max_seeds: int, precision: flo
     """Return whether more test seeds may still lead to a recommendation, or make it more precise."""
     effect, difference = result.effect, result.difference_to_acc
     if difference.count < MIN_VERDICT_SEEDS:
-        return not effect.failed_episodes
-    is_hopeless = difference.mean >= 0 or _is_rejected(effect, difference)
+        return not _has_failed(effect)
+    is_hopeless = difference.mean >= 0 or _has_failed(effect) or _is_rejected(effect, difference)
     is_unreachable = result.missing_seeds > max_seeds - difference.count
     half_widths = difference.half_width / effect.baseline_travel_time, effect.relative_half_width
     return not (is_hopeless or is_unreachable or max(half_widths) <= precision)
@@ -289,10 +313,7 @@ def _width_text(widths: Sequence[float], precision: float) -> str:
 
 
 def _remaining_time_text(budget: EpisodeBudget) -> str:
-    seconds = budget.estimate_seconds(budget.episodes - budget.used_episodes)
-    if budget.minutes is not None:
-        seconds = min(seconds, max(0.0, 60.0 * budget.minutes - budget.elapsed_seconds))
-    return f"; at most {format_duration(seconds)} more"
+    return f"at most {format_duration(budget.remaining_seconds)} more"
 
 
 def format_duration(seconds: float) -> str:

@@ -123,6 +123,10 @@ class Trips:
     time_loss: Floats = field(default_factory=lambda: np.zeros(0))
     """time lost by driving below the desired speed, `timeLoss` [s]"""
     has_arrived: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    entrances: tuple[str, ...] = ()
+    """edge on which each vehicle was inserted; empty: it was not"""
+    depart_speed: Floats = field(default_factory=lambda: np.zeros(0))
+    """speed of each vehicle at its insertion [m/s]"""
 
     @property
     def delay(self) -> Floats:
@@ -138,6 +142,18 @@ class Trips:
         """Return the mean travel time of a group of `VEHICLE_GROUPS` [s]; NaN if it has no vehicles."""
         is_in_group = np.isin(self.vehicle_classes, VEHICLE_GROUPS[group])
         return float(self.travel_time[is_in_group].mean()) if is_in_group.any() else float("nan")
+
+
+@dataclass(frozen=True)
+class SlowEntrance:
+    """An edge on which vehicles wait for their insertion, although traffic moves freely or their speed is fixed."""
+
+    edge: str
+    vehicles: int
+    depart_delay: float
+    """mean [s]"""
+    depart_speed: float
+    """mean [m/s]"""
 
 
 @dataclass(frozen=True)
@@ -222,6 +238,8 @@ class Episode:
     trajectories: tuple[Trajectory, ...] = ()
     trips: Trips = field(default_factory=Trips)
     """trips of all vehicles on a user's network; empty on other roads"""
+    slow_entrances: tuple[SlowEntrance, ...] = ()
+    """entrances of a user's network at which demand waits without a jam"""
     audit: Audit = field(default_factory=Audit)
     warnings: tuple[SumoWarning, ...] = ()
     """SUMO's warnings, including the warm-up; without teleports, collisions and braking, which are counted above"""

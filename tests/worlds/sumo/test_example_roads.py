@@ -4,14 +4,16 @@ import shlex
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from tests.worlds.sumo.user_networks import grid
 from unjam.controller import make_driver
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.example_roads import EXAMPLE_ROADS, write_example_road
-from unjam.worlds.sumo.networks import sumo_program
+from unjam.worlds.sumo.networks import network_geometry, sumo_program
 
 
 @pytest.mark.parametrize("name", EXAMPLE_ROADS)
@@ -21,6 +23,22 @@ def test_a_road_can_be_driven(name: str, tmp_path: Path) -> None:
     episode = run_episode(scenario, make_driver("human", scenario.control_step), 1)
     assert (episode.status, episode.warnings) == ("completed", ())
     assert len(episode.vehicle_ids) > 30
+    assert episode.slow_entrances == ()
+
+
+def test_ramps_of_user_networks_are_marked_where_they_join(tmp_path: Path) -> None:
+    configuration = write_example_road("on-ramp", tmp_path)
+    scenario = make_scenario(str(configuration), {"penetration_rate": 0.2, "horizon": 300})
+    episode = run_episode(scenario, make_driver("human", scenario.control_step), 1, record_details=True)
+    lengths = network_geometry(tmp_path / "on-ramp.net.xml").edge_lengths
+    assert episode.merge_positions == (lengths["upstream"],)
+
+
+def test_crossings_with_signals_are_no_ramps(tmp_path: Path) -> None:
+    scenario = make_scenario(str(grid(tmp_path)), {"penetration_rate": 0.2})
+    episode = run_episode(scenario, make_driver("human", scenario.control_step), 1, record_details=True)
+    assert np.isfinite(episode.positions).any()
+    assert episode.merge_positions == ()
 
 
 @pytest.mark.parametrize("name", EXAMPLE_ROADS)

@@ -417,16 +417,18 @@ def test_a_speed_limit_holds_upstream_while_the_density_is_high(simulation: Simu
     assert np.mean(speeds["downstream"]) > control.min_limit + 3.0
 
 
-def test_an_advised_speed_holds_on_its_section_only() -> None:
+def test_an_advised_speed_holds_on_its_section_and_without_a_map_everywhere() -> None:
     driver = AdvisorySpeed(advised_speed=20.0, first_distance=1000.0, last_distance=200.0)
     ones = np.ones(4)
     state = LocalState(25.0 * ones, 25.0 * ones, 50.0 * ones, *(25.0 * ones, 50.0 * ones), ones, np.nan * ones)
     state = state._replace(distance_to_merge=np.array([1500.0, 900.0, 100.0, -50.0]))
     accelerations, _ = driver.act(state, {})
     assert accelerations.tolist() == [100.0, -1.5, 100.0, 100.0]
+    without_map, _ = driver.act(state._replace(distance_to_merge=None), {})
+    assert without_map.tolist() == [-1.5] * 4
 
 
-def test_advisory_speed_drives_where_ramps_are_and_no_default_comparison_stops_at_it() -> None:
+def test_advisory_speed_drives_on_open_roads_and_no_default_comparison_stops_at_it() -> None:
     assert can_drive(AdvisorySpeed(), ON_RAMP)
     assert not can_drive(AdvisorySpeed(), Ring())
     assert can_drive(PISaturation(time_step=0.5), Ring())  # a wrong time step is refused later, in words

@@ -1,17 +1,27 @@
 """SUMO's warnings are read from its log: each kind once, with its count, without those that unjam counts itself."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.worlds.sumo.user_networks import STANDING, TELEPORTS, UNSORTED, straight
 from unjam.drivers import Human
 from unjam.errors import EpisodeError
+from unjam.measures.metrics import measure
+from unjam.measures.notes import episode_notes
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
-from unjam.worlds.record import SumoWarning
+from unjam.worlds.record import SlowEntrance, SumoWarning, Trips
 from unjam.worlds.sumo.backend import SumoBackend
-from unjam.worlds.sumo.outputs import MAX_EXAMPLE_LENGTH, MAX_LOG_BYTES, read_warnings, warning_kind
+from unjam.worlds.sumo.outputs import (
+    MAX_EXAMPLE_LENGTH,
+    MAX_LOG_BYTES,
+    find_slow_entrances,
+    read_warnings,
+    warning_kind,
+)
 from unjam.worlds.sumo.simulation import Simulation
 
 STOP = "Vehicle '%' performs emergency stop at lane '%', decel=%, time=%, stage=%."
@@ -66,6 +76,37 @@ def test_the_size_of_a_log_that_is_read_is_limited(tmp_path: Path) -> None:
 def test_a_missing_log_is_refused(tmp_path: Path) -> None:
     with pytest.raises(EpisodeError, match="warnings cannot be read: No such file"):
         read_warnings(tmp_path / "none.log")
+
+
+@pytest.mark.parametrize(
+    ("departure", "speed"),
+    [('departSpeed="max"', None), ('departSpeed="0"', 0.0), ('departSpeed="5"', 5.0), ('departSpeed="desired"', 20.0)],
+)
+def test_an_entrance_is_slow_if_vehicles_wait_without_a_jam(
+    departure: str, speed: float | None, tmp_path: Path, sumo: SumoBackend
+) -> None:
+    period = 1.0 if speed in (0.0, 5.0) else 1.9
+    flow = f'<flow id="f" type="{{}}" route="along" begin="0" end="60" period="{period}" {departure}/>'
+    # Slow vans between cars: the desired speed of a car is often not safe behind them.
+    vans = flow.replace('"f"', '"g"').format("van").replace('period="1.9"', 'period="7"')
+    kinds = flow.format("car") + (vans if "desired" in departure else "")
+    file = straight(tmp_path, kinds, length=600.0, step=0.5)
+    episode = run_episode(make_scenario(str(file), {"penetration_rate": 0.1}), Human(), 1, backend=sumo)
+    notes = [note for note in episode_notes({"human": [measure(episode)]}) if note.startswith("road: ")]
+    if speed is None:
+        assert (episode.slow_entrances, notes) == ((), [])
+        return
+    (slow,) = episode.slow_entrances
+    assert (slow.edge, slow.depart_speed) == ("road", pytest.approx(speed, abs=0.5))
+    assert notes[0].startswith(f"road: {slow.vehicles} vehicles wait {slow.depart_delay:.0f} s on average")
+
+
+def test_an_entrance_in_a_jam_is_not_slow() -> None:
+    trips = Trips(entrances=("a",) * 12, depart_delay=np.full(12, 30.0), depart_speed=np.linspace(1.0, 6.0, 12))
+    assert find_slow_entrances(trips, {"a": 20.0}) == ()
+    fast = replace(trips, depart_speed=np.linspace(16.0, 21.0, 12))
+    assert find_slow_entrances(fast, {"a": 20.0}) == (SlowEntrance("a", 12, 30.0, 18.5),)
+    assert find_slow_entrances(replace(fast, entrances=("",) * 12), {"a": 20.0}) == ()
 
 
 @pytest.mark.parametrize("backend", ["libsumo", pytest.param("traci", marks=pytest.mark.long)])

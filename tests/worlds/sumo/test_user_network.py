@@ -8,8 +8,9 @@ import libsumo
 import numpy as np
 import pytest
 
-from tests.worlds.sumo.user_networks import game, grid, straight
+from tests.worlds.sumo.user_networks import SPARSE, game, grid, straight
 from tests.worlds.test_record import fingerprint, serialize_and_restore
+from unjam.controller import make_driver
 from unjam.drivers import IDM, Constant, Human, PISaturation
 from unjam.drivers.command import Command
 from unjam.drivers.network import Network
@@ -19,6 +20,7 @@ from unjam.measures.metrics import measure
 from unjam.physics.idm import IDMParameters
 from unjam.scenarios import Scenario, make_scenario
 from unjam.scenarios.population import Population, write_population
+from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.worlds.backend import WorldOptions
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.backend import SumoBackend, make_traffic, sumo_inputs
@@ -124,6 +126,23 @@ def test_calibrated_drivers_drive_the_cars_and_the_same_vehicles_are_cavs(tmp_pa
                 seen.setdefault(kind, set()).add((libsumo.vehicle.getTau(name), libsumo.vehicle.getMinGap(name)))
     assert seen["passenger"] == {(one.time_headway, one.minimum_gap) for one in (near, far)}
     assert not seen.get("truck", set()) & seen["passenger"]
+
+
+@pytest.mark.parametrize("setting", ["ramp_meter.active", "speed_limit_control.target_density"])
+def test_controls_of_built_in_motorways_are_refused_with_an_alternative_that_drives(
+    setting: str, tmp_path: Path, sumo: SumoBackend
+) -> None:
+    file = str(straight(tmp_path, '<vType id="own"/>' + SPARSE))
+    with pytest.raises(InputError, match=r"only on motorways such as on-ramp; allowed here: a fixed speed") as refused:
+        make_scenario(file, {setting: 1})
+    words = str(refused.value).partition("-d ")[2].partition(")")[0]
+    road = make_scenario(file, {**ACC_SETTINGS, "penetration_rate": 1.0, "horizon": 300})
+    speeds = [
+        run_episode(road, make_driver(driver, road.control_step), 1, backend=sumo).speeds[-1, 0]
+        for driver in ("cruise", words.replace("20", "9"))
+    ]
+    assert speeds[0] > 11.0
+    assert speeds[1] == pytest.approx(9.0, abs=0.5)
 
 
 def test_a_population_with_a_residual_is_refused_on_a_users_network(tmp_path: Path) -> None:

@@ -4,18 +4,23 @@ import glob
 import re
 from collections import Counter
 from fnmatch import fnmatchcase
+from math import inf
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
 from unjam.errors import DiskError, EpisodeError
-from unjam.worlds.record import SumoWarning, Trips
+from unjam.worlds.record import SlowEntrance, SumoWarning, Trips
 from unjam.worlds.sumo.networks import MESSAGE_TOTAL_MARKER
 
 NOT_ARRIVED = -1.0
-TRIP_TIME_ATTRIBUTES = "departDelay", "duration", "timeLoss", "arrival"
-"""attributes of a trip that are read [s]"""
+TRIP_ATTRIBUTES = "departDelay", "duration", "timeLoss", "arrival", "departSpeed"
+"""attributes of a trip that are read [s, m/s]"""
+MIN_NOTED_DELAY, MIN_NOTED_VEHICLES = 2.0, 10
+"""mean insertion delay [s] and number of vehicles from which an entrance is slow"""
+FREE_SPEED_SHARE = 0.8
+"""share of the speed limit from which vehicles depart into free traffic"""
 MAX_LOG_BYTES = 2**20
 """bytes of a log that are read; SUMO writes one example and one total for most kinds"""
 MAX_EXAMPLE_LENGTH = 300
@@ -43,7 +48,7 @@ def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -
     `warmup_end` [s], and trips of vehicles that were to depart later are left out. Raise `DiskError` if the file is not
     complete.
     """
-    ids, kinds, times = list[str](), list[str](), list[list[float]]()
+    ids, kinds, entrances, times = list[str](), list[str](), list[str](), list[list[float]]()
     try:
         for _, element in ElementTree.iterparse(path):
             trip = element.attrib
@@ -52,12 +57,29 @@ def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -
             if float(trip["depart"]) >= 0.0 or float(trip["departDelay"]) > 0.0:
                 ids.append(trip["id"])
                 kinds.append(_vehicle_class(trip["vType"], vehicle_classes))
-                times.append([float(trip[name]) for name in TRIP_TIME_ATTRIBUTES])
+                entrances.append(trip["departLane"].rpartition("_")[0])
+                times.append([float(trip[name]) for name in TRIP_ATTRIBUTES])
             element.clear()
     except ElementTree.ParseError:
         raise DiskError(f"SUMO has not written {path.name} whole; allowed: space in {path.parent}") from None
-    depart_delay, duration, time_loss, arrival = np.array(times, np.float64).reshape(-1, len(TRIP_TIME_ATTRIBUTES)).T
-    return Trips(tuple(ids), tuple(kinds), depart_delay, duration, time_loss, arrival != NOT_ARRIVED)
+    delay, duration, time_loss, arrival, speed = np.array(times, np.float64).reshape(-1, len(TRIP_ATTRIBUTES)).T
+    has_arrived = arrival != NOT_ARRIVED
+    return Trips(tuple(ids), tuple(kinds), delay, duration, time_loss, has_arrived, tuple(entrances), speed)
+
+
+def find_slow_entrances(trips: Trips, speed_limits: dict[str, float]) -> tuple[SlowEntrance, ...]:
+    """Return the edges on which vehicles wait for their insertion, but depart near the speed limit or all equally fast.
+
+    In a jam, vehicles depart slowly, and with different speeds. `speed_limits` has those of the edges [m/s].
+    """
+    found = list[SlowEntrance]()
+    for edge in sorted(set(trips.entrances) - {""}):
+        is_here = np.array(trips.entrances) == edge
+        delay, speeds = float(trips.depart_delay[is_here].mean()), trips.depart_speed[is_here]
+        is_free = speeds.mean() >= FREE_SPEED_SHARE * speed_limits.get(edge, inf) or np.ptp(speeds) == 0.0
+        if delay >= MIN_NOTED_DELAY and len(speeds) >= MIN_NOTED_VEHICLES and is_free:
+            found.append(SlowEntrance(edge, len(speeds), delay, float(speeds.mean())))
+    return tuple(found)
 
 
 def _vehicle_class(kind: str, vehicle_classes: dict[str, str]) -> str:

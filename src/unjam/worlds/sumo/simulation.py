@@ -251,11 +251,14 @@ class Simulation(AbstractContextManager["Simulation"]):
         """Return the vehicles' desired speeds over the speed limit, and their maximum speeds [m/s]."""
         return list(zip(map(self._sumo.vehicle.getSpeedFactor, ids), map(self.max_speed, ids), strict=True))
 
-    def neighbors(self, name: str, max_distance: float) -> NeighborStates:
-        """Return a vehicle's neighbors as SUMO sees them.
+    def neighbors(self, ids: Sequence[str], max_distance: float) -> list[NeighborStates]:
+        """Return the vehicles' neighbors as SUMO sees them.
 
         A neighbor beyond `max_distance` [m] counts as missing: it has the vehicle's speed, and this distance.
         """
+        return [self._neighbors_of(name, max_distance) for name in ids]
+
+    def _neighbors_of(self, name: str, max_distance: float) -> NeighborStates:
         vehicle, speed = self._sumo.vehicle, self._get_speed(name)
         leader, leader_gap = vehicle.getLeader(name, max_distance) or ("", 0.0)
         follower, follower_gap = vehicle.getFollower(name, max_distance)

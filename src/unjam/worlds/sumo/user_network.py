@@ -4,7 +4,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,6 +23,7 @@ from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.inputs import CALIBRATED_TYPE_TEMPLATE, user_network_inputs, vehicle_class_by_type
 from unjam.worlds.sumo.networks import network_geometry
 from unjam.worlds.sumo.open_road import MultiLaneTraffic
+from unjam.worlds.sumo.outputs import find_slow_entrances
 from unjam.worlds.sumo.sections import RoadsideService
 from unjam.worlds.sumo.simulation import VehicleLimits
 from unjam.worlds.sumo.transports import NeighborStates
@@ -145,7 +146,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         return dict(zip(speeds, np.fmin([*speeds.values()], allowed).tolist(), strict=True)), safe
 
     def _tracked_leaders(self, names: Sequence[str]) -> list[TrackedLeader]:
-        speeds = zip(self._simulation.speeds(names), map(self._neighbors, names), strict=True)
+        speeds = zip(self._simulation.speeds(names), self._neighbors(names), strict=True)
         return [(leader, FollowingState(speed, *state[:2])) for speed, (leader, *state) in speeds]
 
     def _following_states(self, names: Sequence[str]) -> list[FollowingState]:
@@ -154,15 +155,17 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         states = list[FollowingState]()
         for name, (leader, state) in zip(names, self._tracked_leaders(names), strict=True):
             if not leader:  # at high speed, the filter needs a longer range than the drivers' sensors have
-                state = FollowingState(state.speed, *self._simulation.neighbors(name, SAFETY_FILTER_RANGE)[1:3])
+                state = FollowingState(state.speed, *self._simulation.neighbors([name], SAFETY_FILTER_RANGE)[0][1:3])
             states.append(state)
         return states
 
-    def _neighbors(self, name: str) -> NeighborStates:
-        """Return a vehicle's neighbors; SUMO computes them once per step."""
-        if name not in self._cached_neighbors:
-            self._cached_neighbors[name] = self._simulation.neighbors(name, MAX_OBSERVED_GAP)
-        return self._cached_neighbors[name]
+    def _neighbors(self, names: Sequence[str]) -> list[NeighborStates]:
+        """Return the vehicles' neighbors; SUMO is called once per step."""
+        new = [name for name in names if name not in self._cached_neighbors]
+        self._cached_neighbors |= zip(
+            new, self._simulation.neighbors(new, MAX_OBSERVED_GAP) if new else (), strict=True
+        )
+        return [self._cached_neighbors[name] for name in names]
 
     def _collisions(self) -> tuple[Sequence[str], bool]:
         """Return SUMO's collisions under the user's settings, plus CAVs in contact with their leader.
@@ -219,7 +222,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
             self._hidden_time_loss[name] = self._hidden_time_loss.get(name, 0.0) + loss
 
     def _local_states(self, names: Sequence[str]) -> LocalState:
-        neighbors = [self._neighbors(name)[1:] for name in names]
+        neighbors = [states[1:] for states in self._neighbors(names)]
         leader_speed, leader_gap, follower_speed, follower_gap = np.array(neighbors).reshape(-1, 4).T
         unknown = np.full(len(names), np.nan)
         speed = np.array(self._simulation.speeds(names), np.float64)
@@ -252,7 +255,8 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         trips = self._simulation.end_with_trips(vehicle_class_by_type(self.road), start)
         hidden = [self._hidden_time_loss.get(name, 0.0) for name in trips.vehicle_ids]
         trips = replace(trips, time_loss=trips.time_loss + hidden)
-        return replace(episode, trips=trips, contacts=len(self._contact_cavs))
+        slow = find_slow_entrances(trips, network_geometry(self.road.files.network).speed_limits)
+        return replace(episode, trips=trips, contacts=len(self._contact_cavs), slow_entrances=slow)
 
     def _snapshot_fields(self, columns: NDArray[np.intp]) -> dict[str, Any]:
         """Return the fields for figures; positions are those along the most frequent route.
@@ -273,6 +277,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         route = max(self._route_counts, key=lambda edges: sum(planned[edge] for edge in set(edges)))
         starts = accumulate((lengths[edge] for edge in route), initial=0.0)
         start_of_edge = dict(reversed(list(zip(route, starts, strict=False))))
+        fields["merge_positions"] = tuple(sorted({start_of_edge[edge] for edge in self._ramp_targets(route)}))
         rows = [(start_of_edge.get(name, np.nan), counts.get(name, 0)) for name in self._edge_numbers]
         absent = (np.nan, np.nan)
         start, lanes = np.array([*rows, absent]).T[:, np.nan_to_num(edge, nan=-1).astype(int)]
@@ -284,3 +289,19 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         ordinals = ("2nd", "3rd", *(f"{number}th" for number in range(4, most + 1)))[: most - 1]
         names = ("left lane", *(f"{ordinal} lane" for ordinal in ordinals))
         return {**fields, "lane_indices": lane, "lane_names": names}
+
+    def _ramp_targets(self, route: Sequence[str]) -> set[str]:
+        """Return the edges of a route that other vehicles enter from a side without a signal or yield line."""
+        along = set(pairwise(route))
+        joining = {pair for edges in self._route_counts for pair in pairwise(edges)} - along
+        targets = set(route[1:])
+        lanes = {lane.name: lane for lane in self._simulation.lanes()}
+        return {
+            lanes[successor].edge
+            for lane in lanes.values()
+            for successor in lane.successors
+            if not lane.has_stop_line
+            and successor in lanes
+            and lanes[successor].edge in targets
+            and (lane.edge, lanes[successor].edge) in joining
+        }
