@@ -181,6 +181,11 @@ def naming(prefix: str) -> Iterator[None]:
         raise InputError(f"{prefix}{error}") from None
 
 
+def count_of(count: float, noun: str, plural: str = "") -> str:
+    """Return a number with its noun: `1 file`, `2,000 files`; `plural` is for a noun with an irregular one."""
+    return f"{count:,.0f} {noun if count == 1 else plural or f'{noun}s'}"
+
+
 def shorten_list(names: Iterable[str]) -> str:
     """Return the names joined by commas, without those after the first `MAX_LISTED_NAMES`."""
     known = list(names)

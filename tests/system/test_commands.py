@@ -170,7 +170,7 @@ def test_drive_on_the_merge_has_flow_and_backlog(unjam: Run, tmp_path: Path) -> 
     assert (human["steps"], human["collisions"], pi["collisions"]) == (60, 0.0, 0.0)
     assert human["outflow_veh_per_h"] > 0
     assert min(human["insertion_backlog_veh"], pi["insertion_backlog_veh"]) >= 0
-    assert "Speed, waves and backlog over time" in (tmp_path / found["drivers"][0]["report"]).read_text()
+    assert "Speeds and waves over time" in (tmp_path / found["drivers"][0]["report"]).read_text()
 
 
 @pytest.mark.slow

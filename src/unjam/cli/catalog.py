@@ -71,7 +71,7 @@ def scenarios_command(
         print_json({"name": name, "facts": dict(facts), "parameters": scenario_recipe(scenario)})
         return
     console.print(name, style="bold")
-    table = new_table()
+    table = new_table(("", ""))
     for fact in facts:
         table.add_row(*fact)
     console.print(table)
@@ -202,7 +202,8 @@ def _field_docstrings(kind: type) -> dict[str, str]:
 
 
 def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
-    table = new_table((title, "default", "meaning"), style="dim")
+    table = new_table(("", "default", "meaning"), style="dim")
+    table.title, table.title_style, table.title_justify = title, "dim", "left"
     for row in rows:
         value = row["default"]
         if isinstance(value, dict):

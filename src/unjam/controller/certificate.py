@@ -12,7 +12,7 @@ from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, FollowingState
 from unjam.drivers.wrappers import FilteredDriver
-from unjam.errors import InputError, invalid_value
+from unjam.errors import InputError, count_of, invalid_value
 from unjam.files import reject_damaged
 from unjam.parameters import build_dataclass
 from unjam.physics.idm import IDMParameters
@@ -118,7 +118,8 @@ def describe_worst_cases(certificate: dict[str, Any], driver: FilteredDriver) ->
     braking = f"at most {driver.safety.leader_braking:g} m/s2"
     return (
         f"{worst['steps']:,} steps behind adversarial leaders that brake with {braking}, "
-        f"from {worst['leader_stops']:,} states at {speeds} m/s with gaps of {gaps} m: {worst['contacts']} contacts, "
+        f"from {count_of(worst['leader_stops'], 'state')} at {speeds} m/s with gaps of {gaps} m: "
+        f"{count_of(worst['contacts'], 'contact')}, "
         f"minimum gap {worst['min_gap']:.2f} m"
     )
 

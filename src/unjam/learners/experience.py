@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.errors import InputError, UnjamError
+from unjam.errors import InputError, UnjamError, count_of
 from unjam.learners.agent import AgentSpec
 from unjam.worlds.record import Episode, Trajectory
 
@@ -106,7 +106,7 @@ def task_experience(spec: AgentSpec, task_index: int, episodes: Sequence[Episode
     policy, scenario = spec.policy, spec.tasks[task_index].scenario
     pairs = [(episode, trajectory) for episode in episodes for trajectory in episode.trajectories]
     if not pairs:
-        raise InputError(f"no CAV was on the road in {len(episodes)} episodes: increase the share of CAVs")
+        raise InputError(f"no CAV was on the road in {count_of(len(episodes), 'episode')}: increase the share of CAVs")
     drawn_values = np.array([scenario.scale_drawn_values(episode.drawn_values) for episode, _ in pairs])
     critic_inputs, later = spec.privileged_inputs(task_index, drawn_values), None
     if policy.reward_after_exit:

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from unjam.errors import InputError
+from unjam.errors import InputError, count_of
 from unjam.measures.metric_table import RowsByDriver
 from unjam.measures.statistics import has_ended_early
 
@@ -45,7 +45,7 @@ def early_end_notes(rows_by_driver: RowsByDriver) -> list[str]:
 def _early_end_text(rows: Sequence[dict[str, Any]]) -> str:
     counts = count_early_ends(rows)
     reasons = ", ".join(f"{reason} ({count})" if len(counts) > 1 else reason for reason, count in counts.items())
-    return f"{sum(counts.values())} of {len(rows)} episodes ended early: {reasons}"
+    return f"{sum(counts.values())} of {count_of(len(rows), 'episode')} ended early: {reasons}"
 
 
 def check_baseline(rows: Sequence[dict[str, Any]], planned_episodes: int = 0) -> None:
@@ -64,7 +64,7 @@ def teleport_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note for each driver with teleports, which do not exist in real traffic."""
     counts = {label: sum(row["teleports"] for row in rows) for label, rows in rows_by_driver.items()}
     return [
-        f"{label}: SUMO teleported or removed {count} vehicle{'' if count == 1 else 's'}, which had waited longer than "
+        f"{label}: SUMO teleported or removed {count_of(count, 'vehicle')}, which had waited longer than "
         "time-to-teleport or collided"
         for label, count in counts.items()
         if count
@@ -78,7 +78,7 @@ def _repeated_drive_notes(rows_by_driver: RowsByDriver) -> list[str]:
     if not drives or len(drives) == len(rows):
         return []
     alike = "those of the same drive differ in the noise of human drivers alone, and intervals are too narrow"
-    return [f"{len(rows)} episodes of {len(drives)} recorded drive{'' if len(drives) == 1 else 's'}: {alike}"]
+    return [f"{count_of(len(rows), 'episode')} of {count_of(len(drives), 'recorded drive')}: {alike}"]
 
 
 def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
@@ -88,7 +88,7 @@ def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
         backlog = sum(row["insertion_backlog_veh"] for row in complete)
         demand = backlog + sum(row["vehicles"] for row in complete)
         if backlog > MAX_BACKLOG_SHARE * demand:
-            count = f"{backlog:.0f} of {demand:.0f} vehicles"
+            count = f"{backlog:,.0f} of {count_of(demand, 'vehicle')}"
             notes.append(f"{label}: {count} had not entered by the end: they wait in the insertion backlog")
     return notes
 
@@ -103,7 +103,8 @@ def warning_notes(rows_by_driver: RowsByDriver) -> tuple[list[str], list[str]]:
         episodes[each["kind"]] += 1
     lost, others = list[str](), list[str]()
     for kind, count in counts.most_common():
-        frequency = f" ({count} warnings of this kind in {episodes[kind]} of {len(rows)} episodes)"
+        share = f"{episodes[kind]} of {count_of(len(rows), 'episode')}"
+        frequency = f" ({count_of(count, 'warning')} of this kind in {share})"
         note = examples[kind] + (frequency if len(rows) > 1 or count > 1 else "")
         if LOST_DEMAND_PATTERN.search(kind):
             lost.append(f"demand is missing, SUMO warns: {note}")
@@ -111,5 +112,5 @@ def warning_notes(rows_by_driver: RowsByDriver) -> tuple[list[str], list[str]]:
             others.append(f"SUMO warns: {note}")
     if len(others) > MAX_WARNING_KINDS:
         rest = len(others) - MAX_WARNING_KINDS
-        others[MAX_WARNING_KINDS:] = [f"SUMO gives {rest} less frequent kinds of warnings"]
+        others[MAX_WARNING_KINDS:] = [f"SUMO gives {count_of(rest, 'less frequent kind')} of warnings"]
     return lost, others

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from unjam.errors import InputError, shorten_list, unknown_name
+from unjam.errors import InputError, count_of, shorten_list, unknown_name
 from unjam.physics.arrays import Floats
 from unjam.recordings.tables import check_unique, read_table
 from unjam.recordings.trajectories import FollowingTrajectory, even_times
@@ -91,8 +91,12 @@ class ReadResult:
     def summary_lines(self) -> list[str]:
         """Return the lines of a summary: rows that are used, skipped and dropped."""
         used = sum(len(each.speed) for each in self.trajectories)
-        lines = [f"{len(self.trajectories)} trajectories with {used:,} of {self.rows:,} rows"]
-        lines += [f"skipped: {count:,} rows: {reason}" for reason, count in self.skipped_rows.items() if count]
+        lines = [
+            f"{count_of(len(self.trajectories), 'trajectory', 'trajectories')} with {used:,} of {self.rows:,} rows"
+        ]
+        lines += [
+            f"skipped: {count_of(count, 'row')}: {reason}" for reason, count in self.skipped_rows.items() if count
+        ]
         dropped = [f"dropped: line {line}: {reason}" for line, reason in self.bad_rows.items()]
         more = len(dropped) - MAX_LISTED_ROWS
         return [*lines, *dropped[:MAX_LISTED_ROWS], *([f"dropped: {more} more bad rows"] if more > 0 else [])]
