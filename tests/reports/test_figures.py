@@ -335,7 +335,7 @@ def content(uri: str) -> tuple[str, bytes]:
 FIGURES: Sequence[Callable[[], Figure]] = (
     lambda: trajectory_figure(drivers(2)),
     lambda: time_series_figure(drivers(2)),
-    lambda: learning_curve_figure({"ring-001": RUN}, {"pi": 100.0}),
+    lambda: learning_curve_figure({"ring-001": RUN}, {"pi": 100.0}, {"pi": estimate([9.0, 10.0, 12.0])}),
     lambda: training_time_figure(RUN),
 )
 

@@ -95,7 +95,7 @@ class Page(HTMLParser):
         """The columns of the last table, that of all metrics."""
         heads = self.texts["th"]
         first = len(heads) - heads[::-1].index("metric")
-        return heads[first : heads.index("feasible")]
+        return heads[first : heads.index("feasible", first)]
 
     @property
     def replay(self) -> dict[str, Any]:

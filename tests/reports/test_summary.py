@@ -223,7 +223,7 @@ def test_early_ends_of_each_driver_are_noted_once() -> None:
     assert report_notes(noted) == [f"{note}."]
     result = trained_on_pi([1.0], [1.0])
     result.rows["pi"][0]["status"] = "collision"
-    assert [note[:26] for note in report_notes(result)] == ["pi: 1 of 1 episodes ended "]
+    assert [note[:26] for note in report_notes(result)] == ["pi: 1 of 1 episode ended e"]
 
 
 def test_close_following_is_noted_with_a_reward_without_distance() -> None:

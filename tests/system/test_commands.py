@@ -355,6 +355,16 @@ def test_a_trained_run_is_reported_evaluated_and_an_expert(unjam: Run, tmp_path:
     evaluated = document(unjam("evaluate", "run", "--episodes", 3, "--json"))
     assert {"idm", "constant", "trained"} <= {entry["driver"] for entry in evaluated["drivers"]}
     assert all(len(entry["episodes"]) == 3 for entry in evaluated["drivers"])
+    assert [entry["driver"] for entry in evaluated["drivers"]][:1] == ["human"], "in the order of all tables"
+    assert [entry["driver"] for entry in evaluated["drivers"]][-1:] == ["trained"]
+
+    complete = (tmp_path / "run" / "evaluation.json").read_bytes()
+    part = document(unjam("evaluate", "run", "-d", "idm", "-d", "human", "--episodes", 1, "--json"))
+    assert [entry["driver"] for entry in part["drivers"]] == ["human", "idm", "pi", "trained"]
+    assert "partial: compared with idm, human and the expert alone" in part["notes"]
+    assert part["folder"] == "runs/evaluate-run-001"
+    assert (tmp_path / "runs" / "evaluate-run-001" / "report.html").is_file()
+    assert (tmp_path / "run" / "evaluation.json").read_bytes() == complete, "a part never replaces it"
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 import textwrap
 from dataclasses import asdict, is_dataclass
 from io import BytesIO
@@ -139,7 +140,7 @@ def drivers_command(
         console.print("Parameters: unjam drivers NAME. Your own driver: --driver path.py:name, a function or a class.")
     else:
         console.print(f"[bold]{name}[/bold]", markup=True)
-        console.print(descriptions[name])
+        console.print(re.sub(r"(?<!\n)\n(?!\n)", " ", descriptions[name]))  # paragraphs of any width
         if rows := [row for row in parameters[name] if row["name"] != "time_step"]:
             console.print(_parameter_table(rows, f"parameter (--driver {name}:parameter=value)"))
 

@@ -164,7 +164,9 @@ def _check_sample(states: FollowingState, time_step: float) -> None:
         raise invalid_value("certify: control step", time_step, f"at most {LEADER_STOP_SECONDS:g} s")
     fewest = 1 + _steps_of_mean(time_step)
     if len(states.speed) < fewest:
-        raise InputError(f"certify: a sample of {len(states.speed)} states is not allowed; allowed: {fewest} or more")
+        raise InputError(
+            f"certify: a sample of {count_of(len(states.speed), 'state')} is not allowed; allowed: {fewest} or more"
+        )
     for name, values, largest in zip(STATE_NAMES, states, (MAX_SPEED, MAX_SPEED, MAX_OBSERVED_GAP), strict=True):
         if not ((values >= 0.0) & (values <= largest)).all():  # refuses NaN, too
             raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")

@@ -136,14 +136,15 @@ def main_finding(result: Results) -> str:
     if expert in experts:
         gain = paired_difference(rows, experts[expert], "return")
         sentences.append(
-            f"Return difference to its expert, {expert}, on {gain.count} test seeds: {format_difference(gain)}. "
-            f"{gain_verdict(gain)}"
+            f"Return difference to its expert, {expert}, on {count_of(gain.count, 'test seed')}: "
+            f"{format_difference(gain)}. {gain_verdict(gain)}"
         )
     if best != expert:
         gain = paired_difference(rows, experts[best], "return")
         sentences.append(f"Return difference to {best}, the expert with the highest return: {format_difference(gain)}.")
     mean = metric_estimate(rows, "return").mean
-    return " ".join(sentences) or f"On {len(rows)} test seeds the mean return of the trained controller is {mean:.0f}."
+    seeds = count_of(len(rows), "test seed")
+    return " ".join(sentences) or f"On {seeds} the mean return of the trained controller is {mean:.0f}."
 
 
 def _drive_finding(result: Results) -> str:
