@@ -77,8 +77,8 @@ def episode_grid(
     for axes in panels.flat:
         axes.set_visible(bool(axes.collections))
     figure.align_ylabels(panels[:, 0])
-    colors, style = ScalarMappable(scale, figures.SPEED_COLORMAP), {"shrink": 0.8, "pad": 0.02, "aspect": 30}
-    bar = figure.colorbar(colors, ax=panels, extend="max", **style)
+    colors = ScalarMappable(scale, figures.SPEED_COLORMAP)
+    bar = figure.colorbar(colors, ax=panels, shrink=0.8, pad=0.02, aspect=30, extend="max")
     bar.set_label("speed [m/s]")
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
     return figure
