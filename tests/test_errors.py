@@ -1,13 +1,40 @@
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import unjam
 from unjam.drivers.registry import driver_from_name
-from unjam.errors import InputError, invalid_value, one_line, printable
+from unjam.errors import InputError, format_count, invalid_value, one_line, printable
 from unjam.scenarios import make_scenario
 from unjam.training.config import load_config
 from unjam.worlds.reward import make_reward
+
+PACKAGE = Path(unjam.__file__).parent
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(0, "0 trials"), (1, "1 trial"), (1.0, "1 trial"), (2, "2 trials"), (2000, "2,000 trials")]
+)
+def test_a_count_has_the_right_plural(count: float, text: str) -> None:
+    assert format_count(count, "trial") == text
+    assert format_count(count, "trajectory", "trajectories").endswith("y" if count == 1 else "ies")
+
+
+COUNTED = "CAV|controller|driver|drive|episode|file|network|recording|result|road|row|run|seed|trial|training|vehicle"
+
+
+def test_messages_have_the_plural_of_what_they_count() -> None:
+    pattern = re.compile(rf"\{{(?:len|sum)\([^{{}}]*\)[^{{}}]*\}} (?:[a-z]+ )?(?:{COUNTED})s\b(?!.* if len\()")
+    lines = {
+        f"{path.relative_to(PACKAGE)}: {line.strip()}"
+        for path in PACKAGE.rglob("*.py")
+        for line in path.read_text().splitlines()
+        if pattern.search(line) and not re.search(r"\{len\([A-Z_]+\)", line)
+    }
+    assert lines == {line for line in lines if line.startswith("training/assess.py: ")}, "use format_count"
 
 
 @pytest.mark.parametrize(

@@ -134,11 +134,6 @@ def one_line(value: object, length: int = 200) -> str:
     return text if len(text) <= length else f"{text[: length - 1]}…"
 
 
-def format_count(count: int, noun: str) -> str:
-    """Return a number of things, with their noun in the singular for one."""
-    return f"{count:,} {noun}{'' if count == 1 else 's'}"
-
-
 def printable(text: str) -> str:
     """Return a text for a terminal, with a question mark for each control, bidirectional or invisible character.
 
@@ -184,6 +179,11 @@ def naming(prefix: str) -> Iterator[None]:
         if str(error).startswith(prefix):
             raise
         raise InputError(f"{prefix}{error}") from None
+
+
+def format_count(count: float, noun: str, plural: str = "") -> str:
+    """Return a number with its noun: `1 file`, `2,000 files`; `plural` is for a noun with an irregular one."""
+    return f"{count:,.0f} {noun if count == 1 else plural or f'{noun}s'}"
 
 
 def shorten_list(names: Iterable[str]) -> str:

@@ -1,7 +1,9 @@
 """Tables, progress and suggested commands are printed as documented."""
 
+import os
 import re
 import shlex
+import subprocess
 import sys
 from io import StringIO
 from itertools import pairwise
@@ -52,6 +54,40 @@ def test_intervals_are_not_broken_and_lines_fit_the_terminal(monkeypatch: pytest
         sum(line.count("pi") for line in lines if line.startswith("metric")) >= 2
     )  # and the difference to the human baseline
     assert "+1000" in "\n".join(lines)
+
+
+def test_verdicts_are_wrapped_also_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    text, label = StringIO(), "a_very_long_file_of_mine.py:a_very_long_name"
+    monkeypatch.setattr(output, "console", output.TerminalConsole(file=text, width=80))
+    output.print_results({"human": rows_of(1.0), label: rows_of(2.0)}, shows_all=False)
+    lines = text.getvalue().splitlines()
+    assert lines[0].startswith(f"{label}: ")
+    assert lines[1].startswith("  "), "the verdict goes on"
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize(("columns", "width"), [({}, 80), ({"COLUMNS": "132"}, 132)])
+def test_without_a_terminal_output_has_80_columns_or_as_many_as_columns_says(
+    columns: dict[str, str], width: int
+) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "COLUMNS"} | columns
+    code = "from unjam.cli import output; print(output.console.width, output.err_console.width)"
+    command = [sys.executable, "-c", code]
+    found = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert found.stdout.split() == [str(width)] * 2
+
+
+def test_tables_cut_nothing_and_keep_names_whole() -> None:
+    name, words = "a-run-with-a-long-name-001", "a-word-that-is-longer-than-its-column " * 3
+    table = output.new_table(("run", "scenario", "state"), ("steps",))
+    table.add_row(name, f"{words}end-of-{'x' * 90}", words, "1,234,567,890")
+    text = StringIO()
+    output.TerminalConsole(file=text, width=80).print(table)
+    lines = text.getvalue().splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= 80
+    assert any(line.startswith(f"{name} ") for line in lines)
+    assert "…" not in text.getvalue()
+    assert text.getvalue().count("x") >= 90
 
 
 def test_wide_terminals_have_one_table(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,6 +179,25 @@ def test_progress_has_the_time_that_is_left(
         progress.show_iteration({**row, "iteration": iteration, "environment_steps": steps})
     left = [line.partition("expert 4)")[2].removeprefix(", ").removesuffix(" left") for line in lines_of(messages)]
     assert left == expected
+
+
+@pytest.mark.parametrize(("iterations", "seconds", "lines"), [(6, 1.0, 6), (1000, 1.0, 21), (1000, 100.0, 160)])
+def test_progress_has_lines_at_equal_steps_and_no_long_silence(
+    messages: StringIO, monkeypatch: pytest.MonkeyPatch, iterations: int, seconds: float, lines: int
+) -> None:
+    module = sys.modules[_TrainingProgress.__module__]
+    monkeypatch.setattr(module, "err_console", output.err_console)
+    monkeypatch.setattr(module, "planned_steps", lambda config: config.steps)
+    clock = iter(seconds * number for number in range(iterations + 1))
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    progress = _TrainingProgress(RunConfig(steps=100 * iterations), Path("run"))
+    row = {"return_mean": 5.0, "return_expert": 4.0, "return_validation": None}
+    for iteration in range(1, iterations + 1):
+        progress.show_iteration({**row, "iteration": iteration, "environment_steps": 100 * iteration})
+    found = lines_of(messages)
+    assert len(found) == lines
+    assert all(line.endswith(" left") for line in found[:-1])
+    assert f"{100 * iterations:,} of {100 * iterations:,} steps" in found[-1]
 
 
 def lines_of(messages: StringIO) -> list[str]:

@@ -164,7 +164,7 @@ def growing(state: LocalState) -> Any:
     ("feature", "words"),
     [
         (missing_later, r"^missing_later: column 0 is nan; allowed: finite \(cav_0, step \d+\)$"),
-        (growing, r"^growing: feature has shape \(1, 2\) for 1 CAVs; allowed: \(1, 1\) or \(1,\)$"),
+        (growing, r"^growing: feature has shape \(1, 2\) for 1 CAV; allowed: \(1, 1\) or \(1,\)$"),
     ],
 )
 def test_an_invalid_feature_is_named_with_cav_and_step(feature: Any, words: str) -> None:

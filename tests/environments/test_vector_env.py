@@ -323,7 +323,7 @@ def test_what_a_batch_cannot_do_is_refused_in_one_line(arguments: dict[str, Any]
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda made: made.reset(seed=[1]), "seed: 1 seeds are not allowed; allowed: 2, or a single one"),
+        (lambda made: made.reset(seed=[1]), "seed: 1 seed not allowed; allowed: 2, or a single one"),
         (lambda made: made.reset(seed=-1), "seed: -1 is not allowed; allowed: an integer >= 0"),
         (
             lambda made: made.reset(seed="a"),

@@ -1,11 +1,20 @@
 """The table of metrics: baseline, differences, cells."""
 
+import re
 from typing import Any
 
 import numpy as np
 import pytest
 
-from unjam.measures.metric_table import TableCell, TableRow, choose_baseline, estimate_cell, metric_table
+from unjam.measures.metric_table import (
+    CAV_METRICS,
+    TableCell,
+    TableRow,
+    choose_baseline,
+    estimate_cell,
+    in_order,
+    metric_table,
+)
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate, probability_of_improvement
 
@@ -45,6 +54,22 @@ def test_table_has_every_metric_with_its_definition() -> None:
         assert row.description == " ".join((metric.function.__doc__ or "").split())
         assert (row.unit, len(row.cells)) == (metric.unit, 2)
     assert row_named(table, "return").cells == [TableCell("1"), TableCell("15", "(10 to 20)")]
+
+
+def test_a_table_of_human_drivers_alone_has_no_rows_about_cavs() -> None:
+    for labels in (["human"], ["a: human", "b: human"]):
+        _, table = metric_table({label: rows_of(1.0) for label in labels}, "")
+        assert [row.label for row in table] == [METRICS[name].label for name in METRICS if name not in CAV_METRICS]
+    assert not [
+        row.label for row in table if re.search("CAV|feasible|filter|command|time gap|added by SUMO", row.label)
+    ]
+    assert "human drivers' maximum braking" in [row.label for row in table]
+
+
+def test_drivers_are_ordered_human_baseline_then_formulas_then_others_as_given() -> None:
+    given = "runs/b", "unjam:best", "mine.py:gentle", "pi+acc", "trained", "a.unjam", "human", "acc"
+    expected = ["human", "pi+acc", "acc", "runs/b", "unjam:best", "mine.py:gentle", "trained", "a.unjam"]
+    assert list(in_order(dict.fromkeys(given, 0))) == expected
 
 
 def test_differences_are_paired_and_have_their_own_columns() -> None:

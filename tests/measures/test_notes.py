@@ -29,7 +29,7 @@ def test_note_has_driver_count_and_reasons_of_early_ends() -> None:
     assert episode_notes({"human": rows_of(5), "pi": rows, "acc": stopped}) == [
         "pi: 3 of 5 episodes ended early: collision (2), more than 0 teleports (max-num-teleports) (1); "
         "means are over complete episodes only",
-        "acc: 1 of 1 episodes ended early: more than 0 teleports (max-num-teleports); "
+        "acc: 1 of 1 episode ended early: more than 0 teleports (max-num-teleports); "
         "means are over complete episodes only",
     ]
 

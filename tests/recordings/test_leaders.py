@@ -19,7 +19,17 @@ def write(path: Path, **columns: object) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("column", "unit"), [("speed", 1.0), ("speed_kmh", 3.6), ("speed_mph", 1.0 / 0.44704)])
+KMH, MPH = 3.6, 1.0 / 0.44704
+
+
+@pytest.mark.parametrize(
+    ("column", "unit"),
+    [
+        *(("speed", 1.0), ("Speed", 1.0), ("speed_ms", 1.0), ("Speed (m/s)", 1.0), ("v_mps", 1.0)),
+        *((name, KMH) for name in ("speed_kmh", "km/h", "kph", "Speed [km/h]", "velocity_kmh")),
+        *((name, MPH) for name in ("speed_mph", "mph", "MPH", "Velocity (mph)")),
+    ],
+)
 def test_a_table_of_speeds_names_its_unit(tmp_path: Path, column: str, unit: float) -> None:
     (found,) = read_leaders(write(tmp_path / "drive.csv", time=TIMES, **{column: unit * SPEEDS}))
     assert found.name == "drive"
@@ -43,8 +53,19 @@ def test_of_trajectories_the_leaders_are_replayed(tmp_path: Path) -> None:
 
 
 def test_speeds_in_another_unit_are_refused_by_their_accelerations(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="are its speeds in m/s"):
-        read_leaders(write(tmp_path / "drive.csv", time=TIMES, speed=25.0 + 25.0 * np.sin(TIMES)))
+    with pytest.raises(InputError, match="if its speeds are not in m/s, name the column by its unit"):
+        read_leaders(write(tmp_path / "drive.csv", time=TIMES, speed=20.0 + 20.0 * np.sin(TIMES)))
+
+
+def test_high_speeds_without_a_unit_are_refused_with_the_names_of_columns_that_have_one(tmp_path: Path) -> None:
+    fast = SPEEDS + 30.0
+    for column in ("speed", "Speed"):
+        reason = f"drive.csv: {column}: 50 is not allowed; .*speed_kmh, speed_mph or"
+        with pytest.raises(InputError, match=reason) as caught:
+            read_leaders(write(tmp_path / "drive.csv", time=TIMES, **{column: fast}))
+        assert "\n" not in str(caught.value)
+    (found,) = read_leaders(write(tmp_path / "drive.csv", time=TIMES, speed_ms=fast))
+    np.testing.assert_allclose(found.speed, fast, atol=1e-9)
 
 
 def test_a_missing_second_ends_a_recording(tmp_path: Path) -> None:

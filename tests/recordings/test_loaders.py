@@ -185,7 +185,7 @@ def test_public_formats_are_converted_to_si_units(tmp_path: Path, make) -> None:
 def test_rows_without_leader_are_counted(tmp_path: Path) -> None:
     result = read_trajectories(write_ngsim(tmp_path / "data.csv"), options=SHORT)
     assert result.summary_lines() == [
-        "1 trajectories with 30 of 60 rows",
+        "1 trajectory with 30 of 60 rows",
         "skipped: 30 rows: no leader, or leader not recorded",
     ]
 

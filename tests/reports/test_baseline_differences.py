@@ -9,7 +9,7 @@ from unjam.reports.summary import COMPARED_METRICS, ReportColumn, baseline_diffe
 
 def column(name: str, values: list[float], human: ReportColumn | None = None, **more: Any) -> ReportColumn:
     rows = [
-        {"seed": seed, "status": "completed", **dict.fromkeys(METRICS, float("nan")), "fuel_ml_per_km": value}
+        {"seed": seed, "status": "completed", **dict.fromkeys(METRICS, float("nan")), "fuel_by_power": value}
         for seed, value in enumerate(values)
     ]
     return ReportColumn(name, [{**row, **more} for row in rows], None, human.rows if human else None)
@@ -22,14 +22,14 @@ def test_lower_fuel_is_better_and_lower_speed_is_worse() -> None:
     found = baseline_differences([HUMAN, column("pi", [90.0, 191.0, 289.0], HUMAN, mean_speed=4.0)])
     cells = {row["label"]: row["cells"][0] for row in found["rows"]}
     assert found["names"] == ["pi"]
-    assert cells["fuel by emission model"] == {"text": "-10.0 [-12.5, -7.5]", "mark": "better", "count": 3}
+    assert cells["fuel by power"] == {"text": "-10.0 [-12.5, -7.5]", "mark": "better", "count": 3}
     assert cells["mean speed"]["mark"] == "worse"
     assert list(cells) == [METRICS[name].label for name in COMPARED_METRICS if METRICS[name].label in cells]
 
 
 def test_insignificant_differences_have_no_mark_and_unknown_metrics_no_row() -> None:
     found = baseline_differences([HUMAN, column("pi", [90.0, 210.0, 301.0], HUMAN)])
-    assert [(row["label"], row["cells"][0]["mark"]) for row in found["rows"]] == [("fuel by emission model", "")]
+    assert [(row["label"], row["cells"][0]["mark"]) for row in found["rows"]] == [("fuel by power", "")]
 
 
 def test_a_difference_of_some_pairs_has_their_number_and_no_mark() -> None:
@@ -61,6 +61,6 @@ def test_csv_has_all_episodes_and_empty_cells_for_nan() -> None:
         *(("human", str(seed)) for seed in range(3)),
         ('a "b", c', "0"),
     ]
-    assert [float(row["fuel_ml_per_km"]) for row in found] == [100.0, 200.0, 300.0, 1.25]
+    assert [float(row["fuel_by_power"]) for row in found] == [100.0, 200.0, 300.0, 1.25]
     assert {row["return"] for row in found} == {""}
     assert np.isclose(float(found[0]["mean_speed"]), 5.0)

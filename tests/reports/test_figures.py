@@ -2,6 +2,7 @@ import base64
 import io
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from PIL import Image
 
 from tests.reports.open_roads import merge_episode, plot_episode_of, user_episode
 from unjam.errors import printable
+from unjam.measures.statistics import estimate
 from unjam.reports.figures import (
     CAV_PLOT_COLOR,
     LINE_COLORS,
@@ -102,12 +104,13 @@ def test_trajectory_figure_of_three_drivers_has_one_row() -> None:
     assert boxes[0].x0 < boxes[1].x0 < boxes[2].x0
 
 
-def test_all_panels_have_one_scale_of_speed() -> None:
+@pytest.mark.parametrize("shown", [slice(0), slice(1, 2)])
+def test_all_panels_have_one_scale_of_speed(shown: slice) -> None:
     episodes = drivers(3)
-    [*fields] = [field for axes in panels_of(trajectory_figure(episodes)) for field in fields_of(axes)]
-    assert len(fields) == 3
-    max_speed = np.ceil(max(episode.speeds.max() for episode in episodes))
-    assert {(field.norm.vmin, field.norm.vmax) for field in fields} == {(0.0, max_speed)}
+    fields = [field for axes in panels_of(trajectory_figure(episodes, episodes[shown])) for field in fields_of(axes)]
+    assert len(fields) == (len(episodes[shown]) or 3)
+    vmax = speed_scale(episodes).vmax
+    assert {(field.norm.vmin, field.norm.vmax) for field in fields} == {(0.0, vmax)}
 
 
 def test_speed_scale_starts_at_zero_and_is_never_empty() -> None:
@@ -116,6 +119,13 @@ def test_speed_scale_starts_at_zero_and_is_never_empty() -> None:
     assert speed_scale([standing]).vmax == 1.0
     absent = make_episode(speeds=np.array([[2.5, np.nan]], np.float32))
     assert speed_scale([absent]).vmax == 3.0
+    assert speed_scale([make_episode(speeds=np.full((10, 5), np.nan, np.float32))]).vmax == 1.0
+
+
+def test_a_few_fast_vehicles_do_not_stretch_the_speed_scale() -> None:
+    speeds = np.full((100, 20), 8.0, np.float32)
+    speeds[:10, 0] = 40.0
+    assert speed_scale([make_episode(speeds=speeds), make_episode()]).vmax == 8.0
 
 
 def test_speed_field_interpolates_between_vehicles() -> None:
@@ -216,6 +226,14 @@ def test_time_series_have_a_line_of_each_driver_in_each_panel() -> None:
             assert lines[number].get_color() == LINE_COLORS[number]
 
 
+def test_time_series_of_human_drivers_alone_are_those_of_all_vehicles() -> None:
+    humans = replace(make_episode(), driver="human")
+    mean, waves = panels_of(time_series_figure([humans]))
+    assert (mean.get_ylabel(), waves.get_ylabel()) == ("mean speed [m/s]", "speed std across\nvehicles [m/s]")
+    np.testing.assert_allclose(np.asarray(mean.lines[0].get_ydata()), humans.speeds.mean(axis=1), rtol=1e-4)
+    assert len(panels_of(time_series_figure([humans, make_episode()]))) == 3
+
+
 def test_time_series_have_drivers_and_limit_in_the_legend() -> None:
     figure = time_series_figure(drivers(2))
     [legend] = figure.legends
@@ -234,18 +252,31 @@ RUN = [row(1), row(2, 104.0), row(3), row(4, 108.0)]
 
 
 def test_learning_curve_starts_at_step_zero_with_the_expert() -> None:
-    [axes] = panels_of(learning_curve_figure({"ring-001": RUN}, {"pi": 100.0}))
+    [axes] = panels_of(learning_curve_figure({"ring-001": RUN}, {"pi": 100.0}, {}))
     training, validation, expert = axes.lines
     assert np.asarray(validation.get_xydata()).tolist() == [[0.0, 100.0], [24.0, 104.0], [48.0, 108.0]]
     assert np.asarray(training.get_xydata()).tolist() == [[12.0, 91.0], [24.0, 92.0], [36.0, 93.0], [48.0, 94.0]]
-    assert expert.get_label() == "pi"
+    assert expert.get_label() == "pi, validation seeds"
     assert set(np.asarray(expert.get_ydata())) == {100.0}
+
+
+def test_returns_on_test_seeds_have_a_panel_of_their_own() -> None:
+    returns = {"human": estimate([-2479.0] * 3), "trained": estimate([100.0, 110.0, 120.0]), "one": estimate([7.0])}
+    above, below = learning_curve_figure({"ring-001": RUN}, {"pi": 100.0}, returns).axes
+    labels = [str(line.get_label()) for line in above.lines]
+    assert [label.split(",")[0].rpartition(" ")[2] for label in labels] == ["seeds", "seeds", "pi"]
+    assert not any("test" in label for label in labels)
+    assert above.get_ylim()[0] > 0
+    assert "test seeds" in below.get_xlabel()
+    assert [text.get_text() for text in below.get_yticklabels()] == list(returns)
+    means = [float(np.asarray(line.get_xdata())[0]) for line in below.lines if line.get_marker() == "o"]
+    assert means == [found.mean for found in returns.values()]
 
 
 @pytest.mark.parametrize(
     "draw",
     [
-        lambda: learning_curve_figure({"ring-001": RUN}, {}),
+        lambda: learning_curve_figure({"ring-001": RUN}, {}, {}),
         lambda: time_series_figure([make_episode()]),
         lambda: trajectory_figure([make_episode()]),
     ],
@@ -257,35 +288,28 @@ def test_notebooks_display_figures(draw: Callable[[], Figure]) -> None:
 
 def test_learning_curve_without_validation_shows_training() -> None:
     rows = [row(number, return_expert=None) for number in (1, 2)]
-    [axes] = panels_of(learning_curve_figure({"ring-001": rows}, {}))
+    [axes] = panels_of(learning_curve_figure({"ring-001": rows}, {}, {}))
     assert len(np.asarray(axes.lines[0].get_xydata())) == 2
     assert len(np.asarray(axes.lines[1].get_xydata())) == 0
 
 
 def test_several_runs_have_different_labels_and_colors() -> None:
-    figure = learning_curve_figure({"a": RUN, "b": RUN}, {"pi": 100.0})
+    figure = learning_curve_figure({"a": RUN, "b": RUN}, {"pi": 100.0}, {})
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert [label.split(":")[0] for label in labels] == ["a", "a", "b", "b", "pi"]
+    assert [label.split(":")[0] for label in labels] == ["a", "a", "b", "b", "pi, validation seeds"]
     lines = panels_of(figure)[0].lines
     assert lines[1].get_color() != lines[3].get_color()
 
 
 def test_learning_curve_has_all_runs() -> None:
-    [axes] = panels_of(learning_curve_figure({f"run-{number}": RUN for number in range(9)}, {}))
+    [axes] = panels_of(learning_curve_figure({f"run-{number}": RUN for number in range(9)}, {}, {}))
     assert len(axes.lines) == 2 * 9
 
 
-def test_learning_curve_has_all_references() -> None:
-    references = {f"driver {number}": 90.0 + number for number in range(7)}
-    [axes] = panels_of(learning_curve_figure({"ring-001": RUN}, references))
-    assert [line.get_label() for line in axes.lines[2:]] == list(references)
-
-
-def test_a_driver_far_from_a_training_is_only_in_the_legend() -> None:
-    [axes] = panels_of(learning_curve_figure({"ring-001": RUN}, {"human": -2479.0, "pi": 100.0}))
-    labels = [line.get_label() for line in axes.lines[2:]]
-    assert labels == ["human: -2,479, below this range", "pi"]
-    assert axes.get_ylim()[0] > 0
+def test_learning_curve_has_all_experts() -> None:
+    experts = {f"driver {number}": 90.0 + number for number in range(7)}
+    [axes] = panels_of(learning_curve_figure({"ring-001": RUN}, experts, {}))
+    assert [line.get_label() for line in axes.lines[2:]] == [f"{name}, validation seeds" for name in experts]
 
 
 def test_training_time_has_a_bar_for_each_part() -> None:
@@ -311,7 +335,7 @@ def content(uri: str) -> tuple[str, bytes]:
 FIGURES: Sequence[Callable[[], Figure]] = (
     lambda: trajectory_figure(drivers(2)),
     lambda: time_series_figure(drivers(2)),
-    lambda: learning_curve_figure({"ring-001": RUN}, {"pi": 100.0}),
+    lambda: learning_curve_figure({"ring-001": RUN}, {"pi": 100.0}, {"pi": estimate([9.0, 10.0, 12.0])}),
     lambda: training_time_figure(RUN),
 )
 

@@ -17,9 +17,12 @@ from unjam import __version__
 from unjam.errors import DiskError, InputError, printable
 from unjam.files import to_json
 from unjam.measures.metrics import METRICS, measure
+from unjam.measures.statistics import Estimate
+from unjam.measures.verdict import short_table_metrics
 from unjam.reports.figures import learning_curve_figure
 from unjam.reports.html import REPLAY_STEP, write_report_page
 from unjam.reports.results import read_results
+from unjam.reports.space_time import speed_scale
 from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode, failed_episode
 
@@ -92,7 +95,7 @@ class Page(HTMLParser):
         """The columns of the last table, that of all metrics."""
         heads = self.texts["th"]
         first = len(heads) - heads[::-1].index("metric")
-        return heads[first : heads.index("feasible")]
+        return heads[first : heads.index("feasible", first)]
 
     @property
     def replay(self) -> dict[str, Any]:
@@ -152,7 +155,7 @@ def test_figures_of_the_page_load_nothing(written: tuple[str, Page]) -> None:
 
 def test_report_of_a_run_has_each_figure_once(written: tuple[str, Page]) -> None:
     _, page = written
-    assert len({image["src"] for image in page.of("img")}) == len(page.of("img")) == 4
+    assert len({image["src"] for image in page.of("img")}) == len(page.of("img")) == 3 + 3  # three drivers
     assert all(len(image["alt"]) > 20 for image in page.of("img"))
     assert all(image["src"].startswith("data:image/svg+xml;base64,") for image in page.of("img"))
     assert not page.of("source")
@@ -160,7 +163,7 @@ def test_report_of_a_run_has_each_figure_once(written: tuple[str, Page]) -> None
 
 def test_report_of_a_drive_has_no_learning_curve(tmp_path: Path) -> None:
     _, page = page_of(results_in(tmp_path / "drive", "human", "pi"))
-    assert len(page.of("img")) == 2
+    assert len(page.of("img")) == 2 + 1
     assert "Training" not in page.texts["h2"]
 
 
@@ -169,17 +172,17 @@ def test_learning_curve_has_lines_of_drivers_that_do_not_learn(
 ) -> None:
     drawn = []
 
-    def spy(runs: dict[str, Any], references: dict[str, float]) -> Figure:
-        drawn.append((list(runs), references))
-        return learning_curve_figure(runs, references)
+    def spy(runs: dict[str, Any], experts: dict[str, float], test_returns: dict[str, Estimate]) -> Figure:
+        drawn.append((list(runs), experts, {label: found.mean for label, found in test_returns.items()}))
+        return learning_curve_figure(runs, experts, test_returns)
 
     monkeypatch.setattr("unjam.reports.figures.learning_curve_figure", spy)
     write_report_page([run], tmp_path / "page.html")
     found = read_results(run)
-    test_return = np.mean([row["return"] for row in found.rows["human"]])
+    test_returns = {label: np.mean([row["return"] for row in rows]) for label, rows in found.rows.items()}
     # The line of the expert is its return on the validation seeds, where the curve starts.
-    expected = {"pi, validation": found.progress[0]["return_expert"], "human, test seeds": test_return}
-    assert drawn[0] == (["ring-001"], pytest.approx(expected))
+    experts = {"pi": found.progress[0]["return_expert"]}
+    assert drawn[0] == (["ring-001"], experts, pytest.approx(test_returns))
 
 
 def test_page_has_its_version_and_the_command_to_reproduce_it(written: tuple[str, Page]) -> None:
@@ -201,13 +204,21 @@ def test_table_has_the_means_of_the_rows(written: tuple[str, Page], run: Path) -
             assert f"{mean:.{metric.digits}f}" in page.texts["b"]
 
 
+def test_a_report_of_human_drivers_alone_says_nothing_about_cavs(tmp_path: Path) -> None:
+    text, page = page_of(results_in(tmp_path / "drive", "human"))
+    shown = re.sub(r'<style>.*?</style>|<script.*?</script>|href="[^"]*"', "", text, flags=re.DOTALL)
+    assert not re.search(r"CAV(?!s</)", re.sub(r'title="[^"]*"|<dd>.*?</dd>', "", shown))
+    assert "feasible" not in page.texts["th"]
+
+
 def test_names_of_drivers_are_escaped(tmp_path: Path) -> None:
     names = ["<b>x", "a&b", '"quoted"', "</script><script>document.title='x'</script>", "<!--<script>", "ünïcode"]
     text, page = page_of(results_in(tmp_path / "drive", *names))
     assert len(page.of("script")) == 3
     row = measure(make_driven_episode(4.0, 0))
     defined = [name for name in METRICS if np.isfinite(row[name])]
-    assert len(page.of("b")) == len(names) * (len(defined) + 1)  # and the verdict
+    shown = set(defined) & set(short_table_metrics({"x": [row]}))
+    assert len(page.of("b")) == len(names) * (len(defined) + len(shown) + 2)  # and the verdict in both tables
     assert page.drivers[:6] == names
     assert [driver["name"] for driver in page.replay["drivers"]] == names
     data = text.partition('type="application/json">')[2].partition("</script>")[0]
@@ -262,8 +273,7 @@ def test_replay_has_positions_and_speeds(written: tuple[str, Page], run: Path) -
         assert driver["cavs"] == ([] if driver["name"] == "human" else [0])
         assert driver["loop_length"] == LENGTH
         np.testing.assert_allclose(driver["lines"], [episode.outline], atol=0.006)
-    max_speed = max(episode.speeds.max() for episode in plot_episodes.values())
-    assert max_speed <= replay["max_speed"] < max_speed + 1
+    assert replay["max_speed"] == speed_scale(list(plot_episodes.values())).vmax
 
 
 def save_driven(folder: Path, **episodes: Episode) -> Path:

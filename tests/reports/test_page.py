@@ -23,6 +23,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium found: apt
 ROAD = {"length": (120, 120), "vehicles": 8, "horizon": 150}
 LAPTOP = (1280, 800)
 PHONE = (390, 844)
+WIDE_PICTURES = ".picture:not(.pictures *)"
 SECONDS = 15.0
 """duration of the episodes"""
 
@@ -150,9 +151,9 @@ class Opener:
 @pytest.mark.parametrize(
     ("report", "figures"),
     [
-        pytest.param("drive_report", 2, marks=pytest.mark.slow),
-        pytest.param("merge_report", 2, marks=pytest.mark.slow),
-        ("training_report", 7),
+        pytest.param("drive_report", 3, marks=pytest.mark.slow),
+        pytest.param("merge_report", 3, marks=pytest.mark.slow),
+        ("training_report", 9),
         ("assessment_report", 2),
     ],
 )
@@ -190,19 +191,36 @@ def test_figures_fill_a_laptop_and_scroll_on_a_phone(open_page: Opener, drive_re
     sizes = """all => all.map(each => [each.clientWidth, each.scrollWidth, each.firstChild.clientWidth,
                  getComputedStyle(each, "::before").content.includes("swipe")])"""
     page = open_page(drive_report, LAPTOP).page
-    for visible, total, image, has_hint in page.eval_on_selector_all(".picture", sizes):
+    for visible, total, image, has_hint in page.eval_on_selector_all(WIDE_PICTURES, sizes):
         assert visible == total == image > 1000
         assert not has_hint
     page = open_page(drive_report, PHONE).page
-    for visible, total, image, has_hint in page.eval_on_selector_all(".picture", sizes):
+    for visible, total, image, has_hint in page.eval_on_selector_all(WIDE_PICTURES, sizes):
         assert visible < 390 < 700 < total == image
         assert has_hint
-    page.eval_on_selector(".picture", "element => element.scrollLeft = 1000")
-    box = page.locator(".picture img").first.bounding_box()
+    page.eval_on_selector(WIDE_PICTURES, "element => element.scrollLeft = 1000")
+    box = page.locator(f"{WIDE_PICTURES} img").first.bounding_box()
     assert box is not None
     assert box["x"] + box["width"] <= 390
     shape = "all => all.map(image => image.naturalHeight / image.naturalWidth - image.height / image.width)"
     assert all(abs(off) < 0.01 for off in page.eval_on_selector_all("img", shape)), "in the original proportions"
+
+
+def test_pictures_of_drivers_are_side_by_side_on_a_laptop_and_stacked_on_a_phone(
+    open_page: Opener, drive_report: Path
+) -> None:
+    boxes = "all => all.map(each => [each.x, each.y, each.x + each.width])"
+    for size in (LAPTOP, PHONE):
+        page = open_page(drive_report, size).page
+        (left, top, end), (next_left, next_top, last) = page.eval_on_selector_all(".pictures img", boxes)
+        assert (next_top == top, next_left > end) == ((True,) * 2 if size == LAPTOP else (False,) * 2)
+        assert 0 <= left < max(end, last) <= size[0], "nothing is cut"
+
+
+def test_a_table_that_is_opened_has_a_hint_to_swipe(open_page: Opener, drive_report: Path) -> None:
+    page = open_page(drive_report, PHONE).page
+    page.locator("summary", has_text="All metrics").click()
+    page.wait_for_selector("details .scroll.wide")
 
 
 def test_replay_shows_the_vehicles_of_every_driver(open_page: Opener, drive_report: Path) -> None:
@@ -377,7 +395,7 @@ def metrics_in(report: Path) -> list[Metric]:
 
 @pytest.mark.long
 def test_table_has_all_metrics_of_all_drivers(open_page: Opener, training_report: Path) -> None:
-    table = open_page(training_report).page.locator("section:has(h2:text-is('All metrics')) table")
+    table = open_page(training_report).page.locator("section:has(h2:text-is('Metrics')) details table")
     assert table.locator("thead th").all_inner_texts() == [
         *("metric", "human", "pi", "trained", "pi − human", "trained − human")
     ]
@@ -392,7 +410,7 @@ def test_table_has_all_metrics_of_all_drivers(open_page: Opener, training_report
 
 def test_metrics_have_their_definition_as_a_tooltip(open_page: Opener, drive_report: Path) -> None:
     page = open_page(drive_report).page
-    heads = page.locator("section:has(h2:text-is('All metrics')) tbody th")
+    heads = page.locator("section:has(h2:text-is('Metrics')) details tbody th")
     for head, metric in zip(heads.all()[2:], metrics_in(drive_report), strict=True):
         assert head.get_attribute("title") == " ".join((metric.function.__doc__ or "").split())
 

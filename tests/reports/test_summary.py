@@ -7,9 +7,10 @@ import pytest
 
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, estimate
-from unjam.measures.verdict import Verdict
+from unjam.measures.verdict import Verdict, short_table_metrics
 from unjam.reports.results import Results
 from unjam.reports.summary import (
+    baseline_differences,
     common_baseline,
     csv_text,
     format_difference,
@@ -160,11 +161,47 @@ def test_each_folder_is_compared_with_its_own_human_drivers() -> None:
     assert [(each.driver, each.is_better) for each in found] == [("slow: pi", True), ("fast: pi", False)]
 
 
-def test_finding_of_a_single_driver_has_speed_and_share_of_the_limit() -> None:
-    finding = main_finding(drive_results(pi=rows_of([1.0, 2.0], mean_speed=4.0, speed_limit_ratio_steady=0.83)))
-    assert "pi on ring, 2 episodes" in finding
-    assert "all vehicles is 4.00 m/s" in finding
-    assert "83 % of the limit" in finding
+CLOSED: dict[str, Any] = {"travel_time": float("nan"), "mean_speed": 4.0, "speed_limit_ratio_steady": 0.83}
+OPEN: dict[str, Any] = {"travel_time": 61.2, "outflow_veh_per_h": 1827.0}
+RECORDED: dict[str, Any] = {**CLOSED, "time_behind_leader": 9.0, "fuel_by_power": 60.0, "outflow_veh_per_h": 900.0}
+
+
+@pytest.mark.parametrize(
+    ("road", "means"),
+    [
+        (CLOSED, "mean speed 4.00 m/s, mean speed / limit 0.830 (steady)"),
+        (OPEN, "travel time 61.2 s (departure delay included), flow 1827 veh/h"),
+        (RECORDED, "fuel by power 60.0 ml/km, flow 900 veh/h"),
+    ],
+)
+def test_finding_without_a_comparison_has_what_matters_on_the_road(road: dict[str, Any], means: str) -> None:
+    assert main_finding(drive_results(pi=rows_of([1.0, 2.0], **road))) == f"Means of 2 episodes on ring: pi: {means}."
+    several = drive_results(pi=rows_of([1.0], **road), acc=failed_rows(1))
+    assert main_finding(several) == f"Means of 1 episode on ring: pi: {means}; acc: all episodes failed."
+
+
+@pytest.mark.parametrize("road", [CLOSED, OPEN, RECORDED])
+def test_key_figures_and_differences_have_fuel_by_power_alone(road: dict[str, Any]) -> None:
+    assert [card["label"] for card in key_figures(drive_results(pi=rows_of([1.0], **road))) if "fuel" in card["label"]]
+    columns = report_columns([drive_results(human=rows_of([1.0], **road), pi=rows_of([1.0], **road))])
+    labels = [row["label"] for row in baseline_differences(columns)["rows"]]
+    assert [label for label in labels if "fuel" in label] == ["fuel by power"]
+    assert [name for name in short_table_metrics({"pi": rows_of([1.0], **road)}) if "ml_per_km" in name] == []
+
+
+def test_human_drivers_have_no_notes_about_cavs() -> None:
+    assert report_notes(drive_results(human=rows_of([1.0], min_time_gap=0.3, speed_limit_ratio_steady=1.1))) == []
+
+
+def test_columns_have_the_order_of_all_tables() -> None:
+    names = "runs/ring-002", "pi", "unjam:best", "human", "runs/ring-001", "acc:time_headway=1"
+    expected = ["human", "pi", "acc:time_headway=1", "runs/ring-002", "unjam:best", "runs/ring-001"]
+    result = drive_results(**{name: rows_of([1.0]) for name in names})
+    assert [column.name for column in report_columns([result])] == expected
+    folders = [replace(result, folder=Path(f"runs/{name}")) for name in "ab"]
+    assert [column.name for column in report_columns(folders)][:4] == [
+        *("a: human", "b: human", "a: pi", "a: acc:time_headway=1")
+    ]
 
 
 def test_results_of_failed_episodes_show_no_nan() -> None:
@@ -186,7 +223,7 @@ def test_early_ends_of_each_driver_are_noted_once() -> None:
     assert report_notes(noted) == [f"{note}."]
     result = trained_on_pi([1.0], [1.0])
     result.rows["pi"][0]["status"] = "collision"
-    assert [note[:26] for note in report_notes(result)] == ["pi: 1 of 1 episodes ended "]
+    assert [note[:26] for note in report_notes(result)] == ["pi: 1 of 1 episode ended e"]
 
 
 def test_close_following_is_noted_with_a_reward_without_distance() -> None:
@@ -230,12 +267,9 @@ def test_notes_are_about_the_trained_controller_only() -> None:
 
 
 def test_only_a_driver_alone_has_key_figures() -> None:
-    cards = key_figures(drive_results(pi=rows_of([1.0, 2.0], speed_limit_ratio_steady=0.914)))
-    assert [(card["value"], card["detail"]) for card in cards] == [
-        ("91 %", "pi"),
-        ("1.00 m/s", "pi"),
-        ("1 ml/km", "pi"),
-    ]
+    cards = key_figures(drive_results(pi=rows_of([1.0, 2.0], **CLOSED)))
+    assert [card["value"] for card in cards] == ["4.00 m/s", "0.830", "1.00 m/s", "1.0 ml/km"]
+    assert {card["detail"] for card in cards} == {"pi"}
     assert key_figures(trained_on_pi([112.0, 148.0], [1.0, 2.0])) == []
 
 

@@ -170,7 +170,7 @@ def test_drive_on_the_merge_has_flow_and_backlog(unjam: Run, tmp_path: Path) -> 
     assert (human["steps"], human["collisions"], pi["collisions"]) == (60, 0.0, 0.0)
     assert human["outflow_veh_per_h"] > 0
     assert min(human["insertion_backlog_veh"], pi["insertion_backlog_veh"]) >= 0
-    assert "Speed, waves and backlog over time" in (tmp_path / found["drivers"][0]["report"]).read_text()
+    assert "Speeds and waves over time" in (tmp_path / found["drivers"][0]["report"]).read_text()
 
 
 @pytest.mark.slow
@@ -360,6 +360,16 @@ def test_a_trained_run_is_reported_evaluated_and_an_expert(unjam: Run, tmp_path:
     evaluated = document(unjam("evaluate", "run", "--episodes", 3, "--json"))
     assert {"idm", "constant", "trained"} <= {entry["driver"] for entry in evaluated["drivers"]}
     assert all(len(entry["episodes"]) == 3 for entry in evaluated["drivers"])
+    assert [entry["driver"] for entry in evaluated["drivers"]][:1] == ["human"], "in the order of all tables"
+    assert [entry["driver"] for entry in evaluated["drivers"]][-1:] == ["trained"]
+
+    complete = (tmp_path / "run" / "evaluation.json").read_bytes()
+    part = document(unjam("evaluate", "run", "-d", "idm", "-d", "human", "--episodes", 1, "--json"))
+    assert [entry["driver"] for entry in part["drivers"]] == ["human", "idm", "pi", "trained"]
+    assert "partial: compared with idm, human and the expert alone" in part["notes"]
+    assert part["folder"] == "runs/evaluate-run-001"
+    assert (tmp_path / "runs" / "evaluate-run-001" / "report.html").is_file()
+    assert (tmp_path / "run" / "evaluation.json").read_bytes() == complete, "a part never replaces it"
 
 
 @pytest.mark.slow

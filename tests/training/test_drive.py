@@ -38,6 +38,13 @@ def test_every_driver_has_a_row_for_every_seed(drive_result: DriveResult) -> Non
         assert {row["status"] for row in rows} == {"completed"}
 
 
+def test_drivers_have_the_order_of_all_tables_and_the_mean_is_of_the_first_that_was_given() -> None:
+    result = drive("ring", ["pi", "human"], episodes=1, scenario_options=ROAD, workers=1)
+    assert list(result.rows) == list(result.plot_episodes) == ["human", "pi"]
+    assert [entry["driver"] for entry in result.document()["drivers"]] == ["human", "pi"]
+    assert result.mean["return"] == result.rows["pi"][0]["return"]
+
+
 def test_row_measures_the_episode_of_its_seed(drive_result: DriveResult) -> None:
     ring = Ring(**ROAD)
     for row in drive_result.rows["pi"]:

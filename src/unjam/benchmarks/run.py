@@ -25,7 +25,7 @@ from unjam.controller.file import read_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable, user_code_recipes
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, invalid_value, one_line, unknown_name
+from unjam.errors import InputError, format_count, invalid_value, one_line, unknown_name
 from unjam.files import make_folder, sha256_of, sha256_of_file, to_json
 from unjam.manifest import manifest, without_folders
 from unjam.measures.gain import EpisodeRows
@@ -111,7 +111,9 @@ def benchmark(
     with lock, WorkerPool(workers or os.cpu_count() or 1) as pool:
         if path is not None and os.path.lexists(path):
             result = _stored_result(path, result)
-            progress(f"{len(result.roads)} of {len(scenarios)} roads are in {path.name}, and are not driven again")
+            progress(
+                f"{len(result.roads)} of {format_count(len(scenarios), 'road')} in {path.name}; they are not driven"
+            )
         remaining = [name for name in result.missing_roads if name in chosen]
         for number, name in enumerate(remaining, len(result.roads) + 1):
             scenario = scenarios[name]

@@ -9,7 +9,7 @@ from typer import Argument, Option
 from unjam.cli import options as opt
 from unjam.cli.output import console, err_console, new_table, print_json, print_next_command
 from unjam.controller import DEFAULT_DRIVER
-from unjam.errors import InputError, invalid_value
+from unjam.errors import InputError, format_count, invalid_value
 from unjam.files import atomic_write, make_folder
 
 LEADERBOARD_WIDTH = 80
@@ -87,7 +87,9 @@ def benchmark_command(
     if out is not None:
         err_console.print(f"result: {out}", soft_wrap=True)
     if trial:
-        driven = f"{len(result.roads)} of {len(result.roads) + len(result.missing_roads)} roads of {suite}"
+        driven = (
+            f"{len(result.roads)} of {format_count(len(result.roads) + len(result.missing_roads), 'road')} of {suite}"
+        )
         err_console.print(f"trial: {driven}; the same command without --roads drives all", soft_wrap=True)
     else:
         print_next_command("compare it", "benchmark", "--compare", out, "OTHER.json")

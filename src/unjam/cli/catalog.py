@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 import textwrap
 from dataclasses import asdict, is_dataclass
 from io import BytesIO
@@ -71,7 +72,7 @@ def scenarios_command(
         print_json({"name": name, "facts": dict(facts), "parameters": scenario_recipe(scenario)})
         return
     console.print(name, style="bold")
-    table = new_table()
+    table = new_table(("", ""))
     for fact in facts:
         table.add_row(*fact)
     console.print(table)
@@ -139,7 +140,7 @@ def drivers_command(
         console.print("Parameters: unjam drivers NAME. Your own driver: --driver path.py:name, a function or a class.")
     else:
         console.print(f"[bold]{name}[/bold]", markup=True)
-        console.print(descriptions[name])
+        console.print(re.sub(r"(?<!\n)\n(?!\n)", " ", descriptions[name]))  # paragraphs of any width
         if rows := [row for row in parameters[name] if row["name"] != "time_step"]:
             console.print(_parameter_table(rows, f"parameter (--driver {name}:parameter=value)"))
 
@@ -202,7 +203,8 @@ def _field_docstrings(kind: type) -> dict[str, str]:
 
 
 def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
-    table = new_table((title, "default", "meaning"), style="dim")
+    table = new_table(("", "default", "meaning"), style="dim")
+    table.title, table.title_style, table.title_justify = title, "dim", "left"
     for row in rows:
         value = row["default"]
         if isinstance(value, dict):

@@ -7,8 +7,9 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from shutil import get_terminal_size
 from textwrap import fill
-from typing import Any, Self
+from typing import Any, Self, TextIO
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.measure import Measurement
@@ -31,8 +32,6 @@ PROGRESS_LINE_SECONDS = 5.0
 """time between two plain lines of progress without a terminal"""
 MIN_TIMED_SECONDS = 1.0
 """time of a count from which the rest is estimated"""
-PIPED_TABLE_WIDTH = 160
-"""width of tables without a terminal [characters]"""
 NARROW_COLUMN_WIDTHS = 18, 7
 """widths of the columns of metrics and units in a narrow terminal [characters]"""
 WIDE_OPTIONS_WIDTH = 130
@@ -50,10 +49,13 @@ class TerminalConsole(Console):
             yield segment if segment.control else Segment(printable(segment.text), segment.style)
 
 
-console = TerminalConsole(highlight=False, markup=False, width=None if sys.stdout.isatty() else PIPED_TABLE_WIDTH)
-err_console = TerminalConsole(
-    stderr=True, highlight=False, markup=False, width=None if sys.stderr.isatty() else PIPED_TABLE_WIDTH
-)
+def _width(stream: TextIO) -> int | None:
+    """Return the width without a terminal, that of COLUMNS or 80 characters; None with one, which can change."""
+    return None if stream.isatty() else get_terminal_size().columns
+
+
+console = TerminalConsole(highlight=False, markup=False, width=_width(sys.stdout))
+err_console = TerminalConsole(stderr=True, highlight=False, markup=False, width=_width(sys.stderr))
 """progress and messages; standard output is for results"""
 
 
@@ -63,12 +65,16 @@ def print_json(document: Any) -> None:
 
 
 def new_table(text_columns: Sequence[str] = (), number_columns: Sequence[str] = (), style: str = "bold") -> Table:
-    """Return an empty table: columns of text (units dim), then of numbers; headings in `style`."""
-    table = Table(box=None, pad_edge=False, header_style=style, show_header=bool(text_columns))
-    for heading in text_columns:
-        table.add_column(heading, style="dim" if heading == "unit" else None)
+    """Return an empty table: columns of text (units dim), then of numbers; headings in `style`.
+
+    Nothing is cut; names in the first column, which a reader copies, are not broken, unless they are of quantities.
+    """
+    table = Table(box=None, pad_edge=False, header_style=style, show_header=any(text_columns))
+    for number, heading in enumerate(text_columns):
+        is_name, color = number == 0 and "unit" not in text_columns, "dim" if heading == "unit" else None
+        table.add_column(heading, style=color, overflow="fold", no_wrap=is_name)
     for heading in number_columns:
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", overflow="fold")
     return table
 
 
@@ -85,12 +91,10 @@ def print_results(rows_by_driver: RowsByDriver, shows_all: bool, baseline: str =
 
 
 def print_wrapped(line: str) -> None:
-    """Print a line, on a terminal wrapped between words; elsewhere it stays one, so that it can be searched."""
-    if console.is_terminal:
-        hanging = " " * (2 + len(line) - len(line.lstrip()))
-        wrapping = {"subsequent_indent": hanging, "break_long_words": False, "break_on_hyphens": False}
-        line = fill(line, console.width, **wrapping)
-    console.print(line, soft_wrap=True)
+    """Print a line, wrapped between words, with a hanging indent."""
+    hanging = " " * (2 + len(line) - len(line.lstrip()))
+    wrapping = {"subsequent_indent": hanging, "break_long_words": False, "break_on_hyphens": False}
+    console.print(fill(line, console.width, **wrapping), soft_wrap=True)
 
 
 def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[str] = METRICS) -> None:
@@ -116,7 +120,7 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
         return table
 
     def fits(columns: Sequence[int], separator: str) -> bool:
-        unlimited = console.options.update_width(10 * PIPED_TABLE_WIDTH)
+        unlimited = console.options.update_width(10_000)
         return Measurement.get(console, unlimited, build_table(columns, separator)).maximum <= console.width
 
     separator = " " if all(fits(each, " ") for each in columns.values()) else "\n"

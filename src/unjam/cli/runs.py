@@ -18,9 +18,11 @@ from unjam.cli.options import (
     WorkersOption,
     check_page_path,
     network_changes,
+    new_folder,
     with_trust_option,
 )
 from unjam.cli.output import console, err_console, print_json
+from unjam.controller import make_driver
 from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, printable, resume_hint
 from unjam.measures.statistics import format_difference
@@ -29,53 +31,73 @@ from unjam.reports.results import read_progress, read_results
 from unjam.training.evaluate import evaluate_run, evaluation_steps, gain_over_expert
 from unjam.training.run_folder import check_run_files, lock_new_folder, read_config
 from unjam.training.runs import config_differences, find_run, list_runs, read_run, remove_run
+from unjam.worlds.episode import check_can_drive
 from unjam.worlds.worker_pool import WorkerPool
 
 
 def evaluate_command(
     run: Annotated[Path, Argument(help="Folder of a training run.")],
+    driver: Annotated[
+        list[str] | None,
+        Option(
+            "--driver",
+            "-d",
+            help="Driver to compare with besides the run's expert, as in drive.",
+            show_default="human and every formula of the package",
+        ),
+    ] = None,
     episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Test episodes per driver.")] = 20,
     humans: HumansOption = None,
-    out: Annotated[Path | None, Option(help="Folder for the results.", show_default="the run's own")] = None,
+    out: Annotated[
+        Path | None,
+        Option(help="Folder for the results.", show_default="the run's own; of a part, a new one under runs/"),
+    ] = None,
     workers: WorkersOption = DEFAULT_WORKERS,
     show_all: AllMetricsOption = False,
     json: JsonOption = False,
 ) -> None:
     """Compare a trained controller with every expert and the human baseline on fixed test seeds.
 
-    The evaluation and the report of the run are replaced, unless --out names another folder. Other human
-    drivers (--humans) require another folder.
+    The evaluation and the report of the run are replaced, unless --out names another folder. Only a complete
+    evaluation replaces them: one with selected drivers (-d), other human drivers (--humans) or fewer episodes than
+    in the configuration of the run has a folder of its own.
 
     Examples:
 
     - unjam evaluate runs/ring-001
+    - unjam evaluate runs/ring-001 -d human -d pi
     - unjam evaluate runs/ring-001 --episodes 50 --json
     - unjam evaluate runs/ring-001 --humans drivers.json --out runs/other-drivers
     """
-    if humans is not None and out is None:
-        raise InputError("humans: it is not allowed without --out: the run keeps its own evaluation")
     config = read_config(run)
     check_run_files(run, config, "evaluate")
-    evaluation = replace(config.evaluation, baselines=tuple(DRIVERS), episodes=episodes)
+    if driver or humans is not None or episodes < config.evaluation.episodes:
+        out = new_folder(out, f"evaluate-{run.resolve().name}")
+    evaluation = replace(config.evaluation, baselines=tuple(driver or DRIVERS), episodes=episodes)
     options = {**config.scenario_options, **network_changes(humans=humans)}
     config = replace(config, scenario_options=options, evaluation=evaluation)
     if config.tasks:
         raise InputError(f"run: {str(run)!r} has several roads; allowed: the folder of one of them")
     if not (run / "controller.unjam").is_file():
         raise InputError(f"run: {str(run)!r} has no controller yet{resume_hint(run)}")
+    scenario = config.make_scenario()
+    for name in driver or []:
+        check_can_drive(make_driver(name, scenario.control_step), scenario, f"driver {name}")
     from unjam.reports.html import write_report_page  # loads matplotlib, so only after the checks
     from unjam.reports.summary import main_finding
 
+    notes = [f"partial: compared with {', '.join(driver)} and the expert alone"] if driver else []
     total = evaluation_steps(config, run)
     target = out or run
     with lock_folder(target) if out is None else lock_new_folder(out):
         with output.ProgressReporter("evaluating", "steps", total) as progress, WorkerPool(workers) as pool:
-            evaluation = evaluate_run(run, config, pool, progress.update, out)
+            evaluation = evaluate_run(run, config, pool, progress.update, out, notes)
         page = write_report_page([target], target / "report.html")
     results = read_results(target)
     if json:
         gain, means = gain_over_expert(config, evaluation.rows), evaluation.means()
-        facts = {"run": str(run), "scenario": config.scenario, "gain": asdict(gain) if gain else None}
+        facts = {"run": str(run), "folder": str(target), "scenario": config.scenario}
+        facts = {**facts, "gain": asdict(gain) if gain else None}
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in evaluation.rows.items()]
         print_json({**facts, "drivers": drivers, "notes": results.metadata["notes"]})
         return

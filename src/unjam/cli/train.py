@@ -11,7 +11,7 @@ from typer import Option
 from unjam.cli import options as opt
 from unjam.cli import output
 from unjam.cli.output import console, err_console, print_json
-from unjam.errors import InputError
+from unjam.errors import InputError, format_count
 from unjam.measures.notes import episode_notes
 from unjam.reports.results import read_progress, read_results
 from unjam.training.config import RunConfig, load_config, planned_steps
@@ -23,8 +23,8 @@ from unjam.training.trial_log import REQUEST_FILE
 if TYPE_CHECKING:
     from unjam.training.train import TrainResult
 
-PROGRESS_LINE_INTERVAL = 5
-"""iterations between two plain lines of progress without a terminal"""
+PROGRESS_LINES, MAX_SILENCE = 20, 600.0
+"""without a terminal: number of plain lines of progress, after equally many steps, and longest time between two [s]"""
 STEP_OVERRUN_RATIO = 1.1
 """ratio of planned to requested steps above which a note is printed, as only whole iterations are trained"""
 EVALUATION_LABEL = "evaluating on test seeds"
@@ -130,8 +130,9 @@ class _TrainingProgress(output.ProgressReporter):
         self._config, self._folder, self._steps = config, folder, planned_steps(config)
         super().__init__(f"training into {folder}", "steps", self._steps)
         self._validation_text, self._worst_road = "-", ""
-        self._start = time.monotonic()
+        self._start = self._last_line = time.monotonic()
         self._first_row: tuple[int, float] | None = None
+        self._next_steps = 0.0
 
     def show_iteration(self, row: dict[str, Any]) -> None:
         """Show the progress row of an iteration."""
@@ -142,13 +143,17 @@ class _TrainingProgress(output.ProgressReporter):
         text = f"return {row['return_mean']:.0f}, validation {self._validation_text} ({expert}{self._worst_road})"
         steps, total = row["environment_steps"], self._steps
         self._bar.update(self._task, completed=steps, description=text)
-        if self._is_plain and (row["iteration"] % PROGRESS_LINE_INTERVAL == 1 or steps >= total):
-            left = self._time_left_text(row["iteration"], steps)
-            err_console.print(f"iteration {row['iteration']}: {steps:,} of {total:,} steps, {text}{left}")
+        now = time.monotonic()
+        left = self._time_left_text(row["iteration"], steps, now)
+        if self._is_plain and (steps >= min(self._next_steps, total) or now - self._last_line > MAX_SILENCE):
+            part = total / PROGRESS_LINES
+            self._next_steps, self._last_line = part * (1 + steps // part), now
+            line = f"iteration {row['iteration']}: {steps:,} of {total:,} steps, {text}{left}"
+            err_console.print(line, soft_wrap=True)
 
-    def _time_left_text(self, iteration: int, steps: int) -> str:
+    def _time_left_text(self, iteration: int, steps: int, now: float) -> str:
         """Return the time that the rest of the training will take; empty at the end, and if nothing is known yet."""
-        now, total = time.monotonic(), self._steps
+        total = self._steps
         if self._first_row is None:
             self._first_row = (0, self._start) if iteration == 1 else (steps, now)  # else it was resumed
         first_steps, start = self._first_row
@@ -218,7 +223,7 @@ def search_command(
     folder = opt.new_folder(out, f"search-{Path(base.scenario).stem}")
     on_message = (lambda line: None) if json else err_console.print
     if not json:
-        plan = f"{trials} trainings, {workers} at once: {_plan_text(base)} each, into {folder}"
+        plan = f"{format_count(trials, 'training')}, {workers} at once: {_plan_text(base)} each, into {folder}"
         err_console.print(f"searching {', '.join(space)} in {plan}", soft_wrap=True)
     resume = output.suggest_resume(folder, *output.arguments_without("--out"), "--out", folder)
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), resume:
@@ -234,7 +239,7 @@ def search_command(
     for trial in found[:5]:
         console.print(describe_trial(trial))
     untrained = sum(trial.gain is not None and trial.gain <= 0 for trial in found)
-    console.print(f"{untrained} of {len(found)} trainings kept the untrained network")
+    console.print(f"{untrained} of {format_count(len(found), 'training')} kept the untrained network")
     if any(trial.gain is not None and trial.gain > 0 for trial in found):
         output.print_next_command("train with the best", "train", "--config", best)
     else:

@@ -12,7 +12,7 @@ from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, FollowingState
 from unjam.drivers.wrappers import FilteredDriver
-from unjam.errors import InputError, invalid_value
+from unjam.errors import InputError, format_count, invalid_value
 from unjam.files import reject_damaged
 from unjam.parameters import build_dataclass
 from unjam.physics.idm import IDMParameters
@@ -118,7 +118,8 @@ def describe_worst_cases(certificate: dict[str, Any], driver: FilteredDriver) ->
     braking = f"at most {driver.safety.leader_braking:g} m/s2"
     return (
         f"{worst['steps']:,} steps behind adversarial leaders that brake with {braking}, "
-        f"from {worst['leader_stops']:,} states at {speeds} m/s with gaps of {gaps} m: {worst['contacts']} contacts, "
+        f"from {format_count(worst['leader_stops'], 'state')} at {speeds} m/s with gaps of {gaps} m: "
+        f"{format_count(worst['contacts'], 'contact')}, "
         f"minimum gap {worst['min_gap']:.2f} m"
     )
 
@@ -163,7 +164,9 @@ def _check_sample(states: FollowingState, time_step: float) -> None:
         raise invalid_value("certify: control step", time_step, f"at most {LEADER_STOP_SECONDS:g} s")
     fewest = 1 + _steps_of_mean(time_step)
     if len(states.speed) < fewest:
-        raise InputError(f"certify: a sample of {len(states.speed)} states is not allowed; allowed: {fewest} or more")
+        raise InputError(
+            f"certify: a sample of {format_count(len(states.speed), 'state')} is not allowed; allowed: {fewest} or more"
+        )
     for name, values, largest in zip(STATE_NAMES, states, (MAX_SPEED, MAX_SPEED, MAX_OBSERVED_GAP), strict=True):
         if not ((values >= 0.0) & (values <= largest)).all():  # refuses NaN, too
             raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")

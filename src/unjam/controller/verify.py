@@ -23,7 +23,7 @@ from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_recipe, user_code_recipes
 from unjam.drivers.wrappers import FilteredDriver
-from unjam.errors import InputError, MissingPartError
+from unjam.errors import InputError, MissingPartError, format_count
 from unjam.files import parse_json, reject_damaged, sha256_of, to_json
 
 REPLAY_TOLERANCE = 1e-9
@@ -140,7 +140,8 @@ def _describe_weights(controller: Controller) -> PartCheck:
     part, arrays = controller.parts[archive.WEIGHTS_PART], driver_recipe(controller.driver)[1]
     if not arrays:
         return PartCheck("weights", "absent", f"the driver has no network; SHA-256 {sha256_of(part)}")
-    detail = f"{len(arrays)} arrays, finite, of the required shapes, none superfluous; SHA-256 {sha256_of(part)}"
+    arrays_text = format_count(len(arrays), "array")
+    detail = f"{arrays_text}, finite, of the required shapes, none superfluous; SHA-256 {sha256_of(part)}"
     return PartCheck("weights", "checked", detail)
 
 

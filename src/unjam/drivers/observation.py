@@ -31,7 +31,7 @@ from unjam.drivers.local_state import (
 )
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements
 from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference
-from unjam.errors import InputError, RowError, invalid_value, unknown_name
+from unjam.errors import InputError, RowError, format_count, invalid_value, unknown_name
 from unjam.parameters import STRICT, Number, parameter_dataclass
 from unjam.physics.arrays import Array, Floats, as_column, clip, join_columns, namespace, stack_columns
 
@@ -309,7 +309,9 @@ def _feature_columns(function: UserFunction, state: LocalState, size: int | None
     columns = found[:, None] if found.ndim == 1 else found
     if columns.ndim != 2 or columns.shape != (rows, columns.shape[1] if size is None else size):
         allowed = f"({rows},) or ({rows}, m)" if size is None else f"({rows}, {size})" + f" or ({rows},)" * (size == 1)
-        raise InputError(f"{function.label}: feature has shape {found.shape} for {rows} CAVs; allowed: {allowed}")
+        raise InputError(
+            f"{function.label}: feature has shape {found.shape} for {format_count(rows, 'CAV')}; allowed: {allowed}"
+        )
     return columns
 
 

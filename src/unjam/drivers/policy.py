@@ -15,7 +15,7 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import FEATURES, Feature, NetworkInput, PolicyInput, Scale, unit_factor
 from unjam.drivers.requirements import Requirements
 from unjam.drivers.residual import ExpertWrapper
-from unjam.errors import InputError, invalid_value, unknown_name
+from unjam.errors import InputError, format_count, invalid_value, unknown_name
 from unjam.parameters import STRICT, Number, build_dataclass, parameter_dataclass
 from unjam.physics.arrays import Array, namespace
 
@@ -156,7 +156,9 @@ class PolicyDriver(ExpertWrapper):
         numbers = np.asarray(answer) if xp is np else xp.as_tensor(answer)
         if numbers.shape not in ((rows,), (rows, 1)):
             allowed = f"allowed: ({rows},) or ({rows}, 1)"
-            raise InputError(f"driver {self.label}: returns shape {numbers.shape} for {rows} CAVs; {allowed}")
+            raise InputError(
+                f"driver {self.label}: returns shape {numbers.shape} for {format_count(rows, 'CAV')}; {allowed}"
+            )
         if not (is_finite := xp.isfinite(numbers)).all():
             raise InputError(f"driver {self.label}: returns {numbers[~is_finite][0]}; allowed: finite")
         return numbers.reshape(rows), after

@@ -11,7 +11,7 @@ from unjam.environments.agents import RoadAgents
 from unjam.environments.gymnasium_env import RoadStepper, as_action
 from unjam.environments.slots import SlottedRoadEnv
 from unjam.environments.threads import synchronized
-from unjam.errors import InputError
+from unjam.errors import InputError, format_count
 from unjam.worlds.backend import BackendLike
 from unjam.worlds.reward import RewardLike
 
@@ -59,7 +59,9 @@ class ParallelRoadEnv(RoadAgents):
         if options and (others := {*self._road.episode_scenario.possible_cav_ids()}.difference(self.possible_agents)):
             self._road.end_episode()
             allowed = "as many CAVs as in the constructor, or fewer"
-            raise InputError(f"reset: options: {len(others)} more CAVs are not allowed; allowed: {allowed}")
+            raise InputError(
+                f"reset: options: {format_count(len(others), 'more CAV')} cannot be there; allowed: {allowed}"
+            )
         self._agent_by_vehicle.clear()
         self._departed_agents.clear()
         self.agents = self._assign_agents(self._road.world.cav_ids)

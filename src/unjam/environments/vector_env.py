@@ -19,7 +19,7 @@ from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
 from unjam.environments.gymnasium_env import RoadStepper, check_single_cav, episode_seed
-from unjam.errors import InputError, MissingPartError, UnjamError, import_optional, invalid_value
+from unjam.errors import InputError, MissingPartError, UnjamError, format_count, import_optional, invalid_value
 from unjam.measures.step_metrics import step_metrics
 from unjam.parameters import check_integer
 from unjam.physics.arrays import Array, clip, copy_array, namespace, replace_entries
@@ -258,7 +258,9 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         except TypeError:
             raise invalid_value("seed", seed, "an integer, or one for each environment") from None
         if len(seeds) != self.num_envs:
-            raise InputError(f"seed: {len(seeds)} seeds are not allowed; allowed: {self.num_envs}, or a single one")
+            raise InputError(
+                f"seed: {format_count(len(seeds), 'seed')} not allowed; allowed: {self.num_envs}, or a single one"
+            )
         return seeds
 
     def make_batch(self, rows: Sequence[int]) -> Any:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from unjam.drivers.network import Network
-from unjam.errors import InputError, invalid_value, shorten_list, unknown_name
+from unjam.errors import InputError, format_count, invalid_value, shorten_list, unknown_name
 from unjam.files import check_parent_folder
 from unjam.following.calibration import (
     CALIBRATED_PARAMETERS,
@@ -88,7 +88,7 @@ class FittedDrivers:
             lines.append(f"warning: {count} ({', '.join(at_bounds)}): {reason}")
         collisions = sum(each["collisions"] > 0 for each in details)
         if collisions:
-            lines.append(f"{collisions} drivers collide with their leader in the simulation")
+            lines.append(f"in the simulation, {format_count(collisions, 'driver')} had a collision with the leader")
         if "residual_gap_errors" in fit:
             before, best = fit["residual_gap_errors"][0], min(fit["residual_gap_errors"])
             use = "used" if fit["residual_is_better"] else "not used, because it is not better"

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from math import isnan
 from typing import Any
 
+from unjam.errors import format_count
+
 MIN_TIME_GAP_FRACTION = 0.9
 """minimum time gap in every step, as a fraction of the required time gap"""
 DEFAULT_REQUIRED_TIME_GAP = 1.0
@@ -46,8 +48,8 @@ def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tup
     baseline = "not compared" if baseline_braking is None else _rate_text(baseline_braking)
     collided, contacts, braking = row["status"] == "collision", float(row.get("contacts", 0)), row["cav_max_braking"]
     checks = (  # value, largest allowed value, reason
-        (collided * (1.0 + row["collisions"]), 0.0, f"{row['collisions']:.0f} vehicles in contact"),
-        (contacts, 0.0, f"{contacts:.0f} CAVs in contact"),
+        (collided * (1.0 + row["collisions"]), 0.0, f"{format_count(row['collisions'], 'vehicle')} in contact"),
+        (contacts, 0.0, f"{format_count(contacts, 'CAV')} in contact"),
         (-time_gap, TOLERANCE - min_time_gap, f"time gap {time_gap:.2f} s (limit {min_time_gap:g} s)"),
         (short, MAX_SHORT_TIME_GAP_SHARE, f"time gap below {required:g} s in {100 * short:.2g} % of the time"),
         (cut_in, TOLERANCE + MAX_CUT_IN_BRAKING, f"brakes with {cut_in:.1f} m/s2 after a cut-in"),

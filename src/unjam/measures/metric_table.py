@@ -1,8 +1,8 @@
 """The table of all metrics, for terminals and pages alike: drivers, and their differences to a baseline."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,10 +20,16 @@ from unjam.measures.statistics import (
     probability_of_improvement,
 )
 
+Value = TypeVar("Value")
 RowsByDriver = dict[str, list[dict[str, Any]]]
 """rows of metrics by driver: one row for each episode, failed ones included"""
 HUMAN_LABEL = "human"
 """label of the human baseline"""
+CAV_METRICS = {name for name, metric in METRICS.items() if metric.label.startswith("CAV")} | {
+    *("min_ttc", "min_time_gap", "max_jerk", "filter_override_share", "override_share", "yield_share"),
+    *("shield_override_share", "shield_max_braking"),
+}
+"""metrics of CAVs; in the human baseline, those of the human drivers in their places"""
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,19 @@ class TableRow:
     cells: list[TableCell]
 
 
+def driver_rank(label: str) -> int:
+    """Return the rank by which drivers are ordered: the human baseline, formulas of the package, then all others."""
+    name = label.rpartition(": ")[2]  # in a comparison, the folder of results is before it
+    if name == HUMAN_LABEL:
+        return 0
+    return 1 if all(part.partition(":")[0] in DRIVERS for part in name.split("+")) else 2
+
+
+def in_order(by_driver: Mapping[str, Value]) -> dict[str, Value]:
+    """Return the entries by driver in the order of all tables and figures; drivers of one rank keep their order."""
+    return {label: by_driver[label] for label in sorted(by_driver, key=driver_rank)}
+
+
 def choose_baseline(rows_by_driver: RowsByDriver, requested: str = "") -> str:
     """Return the driver to compare with: a requested one, the human baseline, the best expert by return, or empty."""
     if requested and len(rows_by_driver) > 1:
@@ -55,9 +74,7 @@ def choose_baseline(rows_by_driver: RowsByDriver, requested: str = "") -> str:
     if len(rows_by_driver) < 2 or HUMAN_LABEL in rows_by_driver:
         return HUMAN_LABEL if len(rows_by_driver) > 1 else ""
     returns = {
-        label: metric_estimate(rows, "return").mean
-        for label, rows in rows_by_driver.items()
-        if all(part.partition(":")[0] in DRIVERS for part in label.split("+"))
+        label: metric_estimate(rows, "return").mean for label, rows in rows_by_driver.items() if driver_rank(label) == 1
     }
     return max(returns, key=lambda label: np.nan_to_num(returns[label], nan=-np.inf), default="")
 
@@ -67,14 +84,18 @@ def metric_table(
 ) -> tuple[list[str], list[TableRow]]:
     """Return the headings; and verdicts, probabilities of improvement over the baseline, and metrics by `names`.
 
-    A row has a cell per driver, then the paired differences to the baseline; none without a baseline.
+    A row has a cell per driver, then the paired differences to the baseline; none without a baseline. Rows about CAVs
+    are left out if there are none.
     """
+    has_cavs = any(map(driver_rank, rows_by_driver))
     compared = {label: rows for label, rows in rows_by_driver.items() if baseline and label != baseline}
     headings = [*rows_by_driver, *(f"{label} − {baseline}" for label in compared)]
     pairs = {label: len(pair_rows(rows, rows_by_driver[baseline])) for label, rows in compared.items()}
-    verdicts = [TableCell(verdict or "–") for verdict in feasibility_by_driver(rows_by_driver).values()]
-    description = "The first violated limit; see docs/safety.md."
-    table = [TableRow("feasible", "", description, [*verdicts, *(TableCell("") for _ in compared)])]
+    table = list[TableRow]()
+    if has_cavs:
+        verdicts = [TableCell(verdict or "–") for verdict in feasibility_by_driver(rows_by_driver).values()]
+        description = "The first violated limit; see docs/safety.md."
+        table.append(TableRow("feasible", "", description, [*verdicts, *(TableCell("") for _ in compared)]))
     if compared:
         description = f"Share of seeds with a larger return than {baseline}; a tie counts half. Wilson's interval."
         improvements = [
@@ -85,6 +106,8 @@ def metric_table(
         table.append(TableRow("probability of improvement", "in return", description, cells))
     for name in names:
         metric = METRICS[name]
+        if name in CAV_METRICS and not has_cavs:
+            continue
         estimates = [(metric_estimate(rows, name), len(rows)) for rows in rows_by_driver.values()]
         if not any(each.count for each, _ in estimates):
             continue  # it is not defined on this road

@@ -46,7 +46,7 @@ def early_end_notes(rows_by_driver: RowsByDriver) -> list[str]:
 def _early_end_text(rows: Sequence[dict[str, Any]]) -> str:
     counts = count_early_ends(rows)
     reasons = ", ".join(f"{reason} ({count})" if len(counts) > 1 else reason for reason, count in counts.items())
-    return f"{sum(counts.values())} of {len(rows)} episodes ended early: {reasons}"
+    return f"{sum(counts.values())} of {format_count(len(rows), 'episode')} ended early: {reasons}"
 
 
 def check_baseline(rows: Sequence[dict[str, Any]], planned_episodes: int = 0) -> None:
@@ -79,7 +79,7 @@ def _repeated_drive_notes(rows_by_driver: RowsByDriver) -> list[str]:
     if not drives or len(drives) == len(rows):
         return []
     alike = "those of the same drive differ in the noise of human drivers alone, and intervals are too narrow"
-    return [f"{len(rows)} episodes of {format_count(len(drives), 'recorded drive')}: {alike}"]
+    return [f"{format_count(len(rows), 'episode')} of {format_count(len(drives), 'recorded drive')}: {alike}"]
 
 
 def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
@@ -89,7 +89,7 @@ def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
         backlog = sum(row["insertion_backlog_veh"] for row in complete)
         demand = backlog + sum(row["vehicles"] for row in complete)
         if backlog > MAX_BACKLOG_SHARE * demand:
-            count = f"{backlog:.0f} of {demand:.0f} vehicles"
+            count = f"{backlog:,.0f} of {format_count(demand, 'vehicle')}"
             notes.append(f"{label}: {count} had not entered by the end: they wait in the insertion backlog")
     return notes
 
@@ -116,7 +116,8 @@ def warning_notes(rows_by_driver: RowsByDriver) -> tuple[list[str], list[str]]:
         episodes[each["kind"]] += 1
     lost, others = list[str](), list[str]()
     for kind, count in counts.most_common():
-        frequency = f" ({count} warnings of this kind in {episodes[kind]} of {len(rows)} episodes)"
+        share = f"{episodes[kind]} of {format_count(len(rows), 'episode')}"
+        frequency = f" ({format_count(count, 'warning')} of this kind in {share})"
         note = examples[kind] + (frequency if len(rows) > 1 or count > 1 else "")
         if LOST_DEMAND_PATTERN.search(kind):
             lost.append(f"demand is missing, SUMO warns: {note}")
@@ -124,5 +125,5 @@ def warning_notes(rows_by_driver: RowsByDriver) -> tuple[list[str], list[str]]:
             others.append(f"SUMO warns: {note}")
     if len(others) > MAX_WARNING_KINDS:
         rest = len(others) - MAX_WARNING_KINDS
-        others[MAX_WARNING_KINDS:] = [f"SUMO gives {rest} less frequent kinds of warnings"]
+        others[MAX_WARNING_KINDS:] = [f"SUMO gives {format_count(rest, 'less frequent kind')} of warnings"]
     return lost, others

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
+from unjam.errors import format_count
 from unjam.measures.effect import FLOW_METRIC, FUEL_METRIC, LAG_METRIC, POWER_FUEL_METRIC, TIME_METRIC, is_measured
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import HUMAN_LABEL, RowsByDriver, estimate_cell, metric_table
@@ -30,13 +31,25 @@ class RoadMetrics:
     """metrics that are compared with the baseline; the first one decides"""
     others: tuple[str, ...]
     """metrics that a short table shows besides"""
+    headline: tuple[str, ...]
+    """metrics of a driver that is compared with none; the first two are the most important"""
 
 
-CLOSED_ROAD = RoadMetrics(("mean_speed", FLOW_METRIC, "speed_std_fleet_steady"), ("time_to_dissolve",))
-OPEN_ROAD = RoadMetrics((TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC), ("mean_speed",))
-RECORDED_ROAD = RoadMetrics(
-    (POWER_FUEL_METRIC, FUEL_METRIC, FLOW_METRIC, "cav_mean_gap"), (LAG_METRIC, "amplification_medium")
+CLOSED_ROAD = RoadMetrics(
+    ("mean_speed", FLOW_METRIC, "speed_std_fleet_steady"),
+    ("time_to_dissolve",),
+    ("mean_speed", "speed_limit_ratio_steady", "speed_std_fleet_steady", POWER_FUEL_METRIC),
 )
+OPEN_ROAD = RoadMetrics(
+    (TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC), ("mean_speed",), (TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC)
+)
+RECORDED_ROAD = RoadMetrics(
+    (POWER_FUEL_METRIC, FLOW_METRIC, "cav_mean_gap"),
+    (LAG_METRIC, "amplification_medium"),
+    (POWER_FUEL_METRIC, FLOW_METRIC, LAG_METRIC),
+)
+PRICES = {FLOW_METRIC: "less flow", FUEL_METRIC: "more fuel by emission model"}
+"""what a verdict adds if it is shown besides a better metric; the second one where fuel by power decides"""
 COMMON_METRICS = ("min_time_gap", "cav_max_braking", "human_max_braking", "collisions")
 
 
@@ -114,7 +127,8 @@ def verdicts(rows_by_driver: RowsByDriver, baseline: str = "") -> list[Verdict]:
 def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible: str, names: Sequence[str]) -> Verdict:
     rows, others = rows_by_driver[label], rows_by_driver[reference]
     name_of_others = "human drivers" if reference == HUMAN_LABEL else reference
-    differences = {name: paired_difference(rows, others, name) for name in names}
+    checked = (*names, FUEL_METRIC) if names[0] == POWER_FUEL_METRIC else names
+    differences = {name: paired_difference(rows, others, name) for name in checked}
     pairs = max(each.count for each in differences.values())
     if not pairs:
         return Verdict(label, "", f"no episode can be compared with {name_of_others}", None)
@@ -126,7 +140,7 @@ def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible:
             changes[name],
         )
         for name, difference in differences.items()
-        if difference.count
+        if difference.count and name in names
     )
     comparison = _comparison(differences, changes, pairs, name_of_others)
     return Verdict(label, feasible, comparison, changes[names[0]], (*texts,))
@@ -137,14 +151,13 @@ def _comparison(
 ) -> str:
     """Return whether the first metric is shown to be better or worse, and what is shown to be worse then."""
     first = next(iter(differences))
-    label, seeds = METRICS[first].label.partition(",")[0], f"{pairs} paired seed{'' if pairs == 1 else 's'}"
+    label, seeds = METRICS[first].label.partition(",")[0], format_count(pairs, "paired seed")
     if changes[first] is None:
         reason = "" if isfinite(differences[first].low) else ", which are too few"
         return f"{label} undecided compared with {name_of_others}, {seeds}{reason}"
     if not changes[first]:
         return f"{label} worse than that of {name_of_others}, {seeds}"
-    prices = {FLOW_METRIC: "less flow", FUEL_METRIC: "more fuel by emission model"}
-    price = " and ".join(text for name, text in prices.items() if changes.get(name) is False)
+    price = " and ".join(text for name, text in PRICES.items() if changes.get(name) is False)
     return f"{label} better than that of {name_of_others}{price and f', but {price}'}, {seeds}"
 
 

@@ -1,5 +1,6 @@
 """Read the speeds of recorded vehicles: plain tables of speeds, drives on I-24, and the leaders of trajectories."""
 
+import re
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,8 +21,13 @@ from unjam.recordings.loaders import (
 from unjam.recordings.tables import check_unique, read_table
 from unjam.sumo_files import file_stamp
 
-SPEED_UNITS = {"speed": 1.0, "speed_kmh": 1.0 / 3.6, "speed_mph": 0.44704}
-"""columns of a table of speeds, one of them, and their unit in m/s"""
+SPEED_COLUMN = re.compile("speed|(?:speed|velocity|vel|v)(?:ms|mps)|(?:speed|velocity|vel|v)?(kmh|kmph|kph|mph)")
+"""columns of speeds in a table, in lower case without other signs, as `Speed [km/h]`; without a unit in m/s"""
+METERS_PER_SECOND = {"mph": 0.44704, **dict.fromkeys(("kmh", "kmph", "kph"), 1.0 / 3.6)}
+"""units of speed"""
+MAX_SPEED_WITHOUT_UNIT = 45.0
+"""highest speed in a column that does not name its unit [m/s]: above, it is probably in km/h or mph"""
+UNIT_HINT = "name the column by its unit: speed_kmh, speed_mph or speed_ms"
 VEHICLE_NAMES = {"pair", "id", "vehicle", "veh", "track", "car", "driver", "trip", "run"}
 VEHICLE_NAMES |= {f"{name}id" for name in VEHICLE_NAMES}
 """columns of a table of speeds that tell its vehicles or drives apart, in lower case without underscores"""
@@ -48,25 +54,29 @@ def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, 
         names = set(frame.columns)
     frame = frame.rename(columns={name: "time" for name in ("t", "Time") if "time" not in names and name in names})
     check_unique(path, (name for name in map(str, frame.columns) if name == "time"))
-    columns = [name for name in SPEED_UNITS if name in names]
+    columns = [name for name in map(str, frame.columns) if SPEED_COLUMN.fullmatch(alphanumeric(name))]
     has_leaders = detect_format(frame) != "table" or names & {"leader_speed", "v_lead"}
     if not has_leaders and (len(columns) != 1 or "time" not in frame):
         shown = shorten_list(sorted(names - {"line"}))
         raise InputError(
-            f"{path.name}: its columns are {shown}; required: time, and one of {', '.join(SPEED_UNITS)}; or a format "
-            "of unjam fit-drivers"
+            f"{path.name}: its columns are {shown}; required: time, and one of speed, speed_kmh and speed_mph; or a "
+            "format of unjam fit-drivers"
         )
     if has_leaders:
         read = trajectories_of_table(frame, path, options)
     else:
-        read = split_trajectories(_follower_table(frame, columns[0], path.stem), path, options)
+        table = _follower_table(frame, columns[0], path.stem)
+        if alphanumeric(columns[0]) == "speed" and (fastest := table["speed"].max()) > MAX_SPEED_WITHOUT_UNIT:
+            allowed = f"<= {MAX_SPEED_WITHOUT_UNIT:g} m/s without a unit; {UNIT_HINT}"
+            raise InputError(f"{path.name}: {columns[0]}: {fastest:g} is not allowed; allowed: {allowed}")
+        read = split_trajectories(table, path, options)
     found = tuple(LeaderRecording(each.name, each.time_step, each.leader_speed) for each in read.trajectories)
     for each in found:
         changes = np.abs(np.diff(each.speed)) / each.time_step
         if float(np.mean(changes > MAX_ACCELERATION)) > RARE_SHARE:
             raise InputError(
-                f"{path.name}: accelerations of {each.name} beyond {MAX_ACCELERATION:g} m/s2 are not allowed; are its "
-                f"speeds in m/s? other units have columns of their own: {', '.join(list(SPEED_UNITS)[1:])}"
+                f"{path.name}: accelerations of {each.name} beyond {MAX_ACCELERATION:g} m/s2 are not allowed; if its "
+                f"speeds are not in m/s, {UNIT_HINT}"
             )
     return found
 
@@ -78,5 +88,6 @@ def _follower_table(frame: pd.DataFrame, column: str, stem: str) -> pd.DataFrame
     names = [name for name in names if 1 < len(frame[[name]].drop_duplicates()) < len(frame)]
     vehicles = stem + "-" + join_row_values(frame, tuple(names)) if names else stem
     table = to_numeric(frame.loc[:, ["line", "time", column]], ["time", column])
-    speed = table[column] * SPEED_UNITS[column]
+    match = SPEED_COLUMN.fullmatch(alphanumeric(column))
+    speed = table[column] * METERS_PER_SECOND.get(match[1] if match else "", 1.0)
     return table.assign(pair=vehicles, speed=speed, leader_speed=speed, gap=0.0)

@@ -85,7 +85,9 @@ class ReadResult:
     def summary_lines(self) -> list[str]:
         """Return the lines of a summary: rows that are used, skipped and dropped."""
         used = sum(len(each.speed) for each in self.trajectories)
-        lines = [f"{len(self.trajectories)} trajectories with {used:,} of {self.rows:,} rows"]
+        lines = [
+            f"{format_count(len(self.trajectories), 'trajectory', 'trajectories')} with {used:,} of {self.rows:,} rows"
+        ]
         lines += [
             f"skipped: {format_count(count, 'row')}: {reason}" for reason, count in self.skipped_rows.items() if count
         ]

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from unjam.errors import one_line, printable
+from unjam.measures.statistics import Estimate
 from unjam.reports.results import PlotEpisode, seconds_by_part
 
 SPEED_COLORMAP = "viridis"
@@ -108,17 +109,19 @@ def _reduce_colors(png: bytes) -> bytes:
 
 @rc_context(PLOT_STYLE)
 def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
-    """Draw three quantities over time, a line per driver.
+    """Draw quantities over time, a line per driver.
 
-    On closed and recorded roads: the CAV's speed and gap, and the std of speed across all vehicles; on other open
-    roads: the mean speed, the std, and the insertion backlog.
+    On closed and recorded roads: the CAV's speed and gap, or without CAVs the mean speed, and the std of speed across
+    all vehicles; on other open roads: the mean speed, the std, and the insertion backlog.
     """
-    figure = new_figure(6.2)
-    panels = figure.subplots(3, 1, sharex=True)
     has_same_vehicles = all(episode.has_same_vehicles for episode in episodes)
-    for episode, color in zip(episodes, LINE_COLORS, strict=False):
+    has_cav_panels = has_same_vehicles and any(episode.controlled_columns for episode in episodes)
+    all_series = [_time_series(episode, has_cav_panels, has_same_vehicles) for episode in episodes]
+    figure = new_figure(0.2 + 2.0 * len(all_series[0]))
+    panels = figure.subplots(len(all_series[0]), 1, sharex=True)
+    for episode, series, color in zip(episodes, all_series, LINE_COLORS, strict=False):
         stride = max(1, len(episode.times) // MAX_PLOT_TIMES)
-        for axes, (label, values) in zip(panels, _time_series(episode, has_same_vehicles).items(), strict=True):
+        for axes, (label, values) in zip(panels, series.items(), strict=True):
             axes.plot(episode.times[::stride], values[::stride], color=color, lw=1.2)
             axes.set_ylabel(label)
         panels[0].plot([], [], color=color, lw=1.2, label=short_label(episode.driver))
@@ -133,50 +136,50 @@ def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     return figure
 
 
-def _time_series(episode: PlotEpisode, has_same_vehicles: bool) -> dict[str, np.ndarray]:
+def _time_series(episode: PlotEpisode, has_cav_panels: bool, has_same_vehicles: bool) -> dict[str, np.ndarray]:
     """Return the quantities of `time_series_figure` by label; each of shape (T + 1,)."""
     speeds = np.where(np.isnan(episode.speeds).all(axis=1, keepdims=True), 0.0, episode.speeds)
     waves = {"speed std across\nvehicles [m/s]": np.nanstd(speeds, axis=1)}
-    if has_same_vehicles:
+    if has_cav_panels:
         cav = episode.cav_columns[0]
         return {"CAV's speed [m/s]": episode.speeds[:, cav], "CAV's gap [m]": episode.gaps[:, cav], **waves}
     backlog = episode.backlog if len(episode.backlog) else np.zeros(len(speeds))
-    return {"mean speed [m/s]": np.nanmean(speeds, axis=1), **waves, "insertion backlog\n[vehicles]": backlog}
-
-
-FAR = 1.5
-"""distance from the returns of a training beyond which a driver is not drawn, as a share of their range"""
+    backlogs = {} if has_same_vehicles else {"insertion backlog\n[vehicles]": backlog}
+    return {"mean speed [m/s]": np.nanmean(speeds, axis=1), **waves, **backlogs}
 
 
 @rc_context(PLOT_STYLE)
-def learning_curve_figure(runs: dict[str, list[dict[str, Any]]], references: dict[str, float]) -> Figure:
-    """Draw return against environment steps: of each run by its label, and of drivers that do not learn.
+def learning_curve_figure(
+    runs: dict[str, list[dict[str, Any]]], experts: dict[str, float], test_returns: dict[str, Estimate]
+) -> Figure:
+    """Draw returns on validation seeds against environment steps; below, those on test seeds after the trainings.
 
-    A driver far outside the range of the runs is only in the legend: otherwise their changes could not be seen.
+    Above are each run by its label, and as horizontal lines the experts by theirs; below is a mean with its CI for
+    each driver. Returns on different seeds are not comparable.
     """
-    figure = new_figure(3.8)
-    axes = figure.subplots()
+    figure = new_figure(3.8 + (0.6 + 0.22 * len(test_returns) if test_returns else 0.0))
+    heights = [3.4, 0.4 + 0.22 * len(test_returns)] if test_returns else [1.0]
+    axes, *others = figure.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     for (label, rows), color in zip(runs.items(), cycle(LINE_COLORS[2:]), strict=False):
         steps = np.array([row["environment_steps"] for row in rows]) / 1000
         prefix = f"{label}: " if len(runs) > 1 else ""
-        training, label = [row["return_mean"] for row in rows], f"{prefix}training, with exploration"
+        training, label = [row["return_mean"] for row in rows], f"{prefix}training seeds, with exploration"
         axes.plot(steps, training, color=color, lw=1, alpha=0.45, label=label)
         validations = [(0.0, rows[0]["return_expert"])]  # the untrained policy equals its expert
         validations += [(step, row["return_validation"]) for step, row in zip(steps, rows, strict=True)]
         points = np.array([point for point in validations if point[1] is not None], float).reshape(-1, 2)
-        label = f"{prefix}validation, deterministic"
+        label = f"{prefix}validation seeds, deterministic"
         axes.plot(*points.T, color=color, lw=1.8, marker="o", ms=3.5, label=label)
-    low, high = axes.dataLim.intervaly
-    high = max(high, low + 0.02 * abs(low))  # returns that are nearly equal
-    styles = cycle(("--", ":", "-.", (0, (1, 3))))
-    for (label, value), style in zip(references.items(), styles, strict=False):
-        if low - FAR * (high - low) <= value <= high + FAR * (high - low):
-            axes.axhline(value, color=TEXT_COLOR, lw=1.1, ls=style, label=label)
-        else:
-            side = "below" if value < low else "above"
-            axes.plot([], [], color=TEXT_COLOR, lw=1.1, ls=style, label=f"{label}: {value:,.0f}, {side} this range")
+    for (label, value), style in zip(experts.items(), cycle(("--", ":", "-.", (0, (1, 3))))):
+        axes.axhline(value, color=TEXT_COLOR, lw=1.1, ls=style, label=f"{label}, validation seeds")
     axes.set(xlabel="environment steps [thousands]", ylabel="return of an episode")
     axes.margins(x=0.01, y=0.06)
+    for below in others:
+        for number, found in enumerate(test_returns.values()):
+            ends = np.nan_to_num([[found.mean - found.low], [found.high - found.mean]])
+            below.errorbar([found.mean], [number], xerr=ends, fmt="o", ms=4, color=TEXT_COLOR, capsize=3)
+        below.set_yticks(range(len(test_returns)), list(map(short_label, test_returns)))
+        below.set(xlabel="return on test seeds, after training: mean and 95 % CI", ylim=(len(test_returns) - 0.5, -0.5))
     figure.legend(loc="outside upper left", ncols=3)
     return figure
 

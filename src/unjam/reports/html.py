@@ -19,9 +19,11 @@ from unjam.errors import printable
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, check_parent_folder
 from unjam.measures.metric_table import metric_table
 from unjam.measures.statistics import metric_estimate
+from unjam.measures.verdict import short_table_metrics
 from unjam.reports import figures, space_time, summary
 from unjam.reports.model import error_figure, example_figure, model_section, rollout_figure, wave_figure
 from unjam.reports.results import PlotEpisode, Results, damaged_results_error, original_command, read_results
+from unjam.reports.summary import ReportColumn
 from unjam.reports.video import split_lines
 from unjam.scenarios.road import format_drawn_values
 from unjam.scenarios.scenario import VEHICLE_LENGTH
@@ -109,8 +111,10 @@ def render_report(results: Sequence[Results]) -> str:
         warning=summary.mismatch_warning(results),
         notes=[(name, note) for name, result in sources for note in summary.report_notes(result)],
         cards=summary.key_figures(single) if single else [],
-        figures={name: figures.data_uri(figure) for name, figure in _report_figures(sources, panels).items()},
+        figures={name: figures.data_uri(figure) for name, figure in _report_figures(sources, columns, panels).items()},
         panels=panels,
+        space_time=[figures.data_uri(space_time.space_time_figure(panels, [panel])) for panel in panels],
+        has_cavs=any(panel.controlled_columns for panel in panels),
         drawn=drawn,
         road_values=list(dict.fromkeys(roads)),
         has_lane_maps=space_time.has_lane_maps(panels),
@@ -120,6 +124,7 @@ def render_report(results: Sequence[Results]) -> str:
         columns=columns,
         episodes=list(dict.fromkeys((min(counts), max(counts)))),
         headings=headings,
+        short_table=metric_table(rows, "", short_table_metrics(rows)),
         baseline=baseline,
         table=table,
         sources=[(name, result, original_command(result)) for name, result in sources],
@@ -129,15 +134,17 @@ def render_report(results: Sequence[Results]) -> str:
     )
 
 
-def _report_figures(sources: Sequence[tuple[str, Results]], panels: Sequence[PlotEpisode]) -> dict[str, Figure]:
+def _report_figures(
+    sources: Sequence[tuple[str, Results]], columns: Sequence[ReportColumn], panels: Sequence[PlotEpisode]
+) -> dict[str, Figure]:
     found: dict[str, Figure] = {}
     if panels:
-        found |= {"space_time": space_time.space_time_figure(panels), "time_series": figures.time_series_figure(panels)}
-    results = [result for _, result in sources]
+        found["time_series"] = figures.time_series_figure(panels)
     if runs := {name: result.progress for name, result in sources if result.progress}:
-        found["learning_curve"] = figures.learning_curve_figure(runs, _reference_returns(results))
-    if len(results) == 1 and results[0].progress:
-        progress, model = results[0].progress, results[0].model
+        returns = {column.name: metric_estimate(column.rows, "return") for column in columns}
+        found["learning_curve"] = figures.learning_curve_figure(runs, _expert_returns(sources), returns)
+    if len(sources) == 1 and sources[0][1].progress:
+        progress, model = sources[0][1].progress, sources[0][1].model
         found["training_time"] = figures.training_time_figure(progress)
         if model is not None and "waves" in model:
             found["model_waves"] = wave_figure(model)
@@ -147,24 +154,14 @@ def _report_figures(sources: Sequence[tuple[str, Results]], panels: Sequence[Plo
     return found
 
 
-def _reference_returns(results: Sequence[Results]) -> dict[str, float]:
-    """Return the mean returns of drivers that do not learn, by label.
-
-    The return of the expert is that on the validation seeds, with which the curve starts. Other drivers are not
-    evaluated on validation seeds; theirs is that on the test seeds.
-    """
+def _expert_returns(sources: Sequence[tuple[str, Results]]) -> dict[str, float]:
+    """Return the return of the expert of each run on the validation seeds, with which its curve starts."""
     returns: dict[str, float] = {}
-    has_several_roads = len({result.metadata.get("scenario") for result in results}) > 1
-    for result in results:
-        expert = result.metadata.get("expert", "none")
-        road = f" ({result.metadata.get('scenario')})" if has_several_roads else ""
-        if result.progress and expert != "none":
-            label = f"{figures.short_label(expert)}, validation{road}"
-            returns.setdefault(label, result.progress[0]["return_expert"])
-        for label, rows in result.rows.items():
-            if label not in (result.trained_label, expert):
-                mean = metric_estimate(rows, "return").mean
-                returns.setdefault(f"{figures.short_label(label)}, test seeds{road}", mean)
+    has_several_roads = len({result.metadata.get("scenario") for _, result in sources}) > 1
+    for _, result in sources:
+        if result.progress and (expert := result.metadata.get("expert", "none")) != "none":
+            road = f" ({result.metadata.get('scenario')})" if has_several_roads else ""
+            returns.setdefault(f"{figures.short_label(expert)}{road}", result.progress[0]["return_expert"])
     return returns
 
 

@@ -9,6 +9,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from unjam.errors import format_count
 from unjam.reports.figures import LINE_COLORS, MUTED_COLOR, PLOT_STYLE, TEXT_COLOR, new_figure
 from unjam.reports.results import PlotEpisode, Results
 from unjam.reports.space_time import space_time_figure
@@ -155,7 +156,7 @@ def model_section(result: Results) -> dict[str, Any] | None:
     facts = result.model
     if facts is None or not result.progress:
         return None
-    networks = f"plus an ensemble of {facts['members']} networks for the remaining errors"
+    networks = f"plus an ensemble of {format_count(facts['members'], 'network')} for the remaining errors"
     if "waves" in facts:
         base = _base_label(facts).removesuffix(" alone")
         return {

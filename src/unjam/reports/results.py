@@ -15,7 +15,7 @@ from safetensors.numpy import load
 from unjam.errors import InputError, resume_hint
 from unjam.files import INVALID_DATA_ERRORS, read_json_lines, sha256_of
 from unjam.folders import reject_unsafe_files
-from unjam.measures.metric_table import HUMAN_LABEL
+from unjam.measures.metric_table import driver_rank
 from unjam.measures.metrics import METRICS
 from unjam.worlds.record import Episode, Floats
 
@@ -60,7 +60,7 @@ class PlotEpisode(Episode):
     @property
     def controlled_columns(self) -> list[int]:
         """Columns of the CAVs, which in the human baseline are driven as all others."""
-        return [] if self.driver.rpartition(": ")[2] == HUMAN_LABEL else self.cav_columns
+        return self.cav_columns if driver_rank(self.driver) else []
 
     @property
     def has_same_vehicles(self) -> bool:

@@ -22,6 +22,10 @@ MAX_TIME_BINS, MAX_POSITION_BINS = 240, 100
 """maximum numbers of cells of a lane map, in time and along the road"""
 MIN_SAMPLES_PER_CELL = 4
 """mean number of samples in a cell that leaves hardly any cell empty"""
+PANEL_WIDTH = 4.75
+"""width of a figure of one driver [inch]: a page has up to three next to each other, and on a phone one per row"""
+SCALE_QUANTILE = 0.98
+"""quantile of all speeds that has the brightest color; faster vehicles have it too"""
 MAX_LANE_MAPS = 4
 """maximum number of lane maps; of more lanes, those with the most traffic are drawn"""
 HUMAN_LINE_STYLE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.35}
@@ -29,9 +33,9 @@ CAV_LINE_STYLE: dict[str, Any] = {"colors": figures.CAV_PLOT_COLOR, "linewidths"
 
 
 def speed_scale(episodes: Sequence[PlotEpisode]) -> Normalize:
-    """Return one scale of speed for all figures of these episodes."""
-    max_speed = max(float(np.nanmax(episode.speeds, initial=0.0)) for episode in episodes)
-    return Normalize(0.0, max(1.0, np.ceil(max_speed)))
+    """Return one scale of speed for all figures of these episodes; a few fast vehicles do not stretch it."""
+    speeds = np.concatenate([episode.speeds[~np.isnan(episode.speeds)] for episode in episodes])
+    return Normalize(0.0, max(1.0, np.ceil(np.quantile(speeds, SCALE_QUANTILE))) if speeds.size else 1.0)
 
 
 class PanelRow(NamedTuple):
@@ -42,18 +46,22 @@ class PanelRow(NamedTuple):
     draw: Callable[[Axes, PlotEpisode, Normalize], None]
 
 
-def episode_grid(episodes: Sequence[PlotEpisode], rows: Sequence[PanelRow], height: float) -> Figure:
+def episode_grid(
+    episodes: Sequence[PlotEpisode], rows: Sequence[PanelRow], height: float, shown: Sequence[PlotEpisode] = ()
+) -> Figure:
     """Draw rows of panels for each episode, all with one scale of speed; up to three episodes next to each other.
 
-    `height` is that of all rows of one episode [inch].
+    `height` is that of all rows of one episode [inch]; `shown` are the episodes to draw with the scales of all, by
+    default all of them.
     """
-    count = len(episodes)
+    shown, width = shown or episodes, PANEL_WIDTH if shown else figures.FIGURE_WIDTH
+    count = len(shown)
     columns = 2 if count == 4 else min(count, 3)
     blocks = -(-count // columns)
-    figure, heights = figures.new_figure(height * blocks + 0.3), [row.height for row in rows] * blocks
+    figure, heights = figures.new_figure(height * blocks + 0.3, width), [row.height for row in rows] * blocks
     panels = figure.subplots(len(heights), columns, sharex=True, squeeze=False, height_ratios=heights)
     scale, longest = speed_scale(episodes), max(episode.times[-1] for episode in episodes)
-    for number, episode in enumerate(episodes):
+    for number, episode in enumerate(shown):
         block, column = divmod(number, columns)
         for index, row in enumerate(rows):
             axes = panels[block * len(rows) + index, column]
@@ -69,7 +77,8 @@ def episode_grid(episodes: Sequence[PlotEpisode], rows: Sequence[PanelRow], heig
     for axes in panels.flat:
         axes.set_visible(bool(axes.collections))
     figure.align_ylabels(panels[:, 0])
-    bar = figure.colorbar(ScalarMappable(scale, figures.SPEED_COLORMAP), ax=panels, shrink=0.8, pad=0.02, aspect=30)
+    colors = ScalarMappable(scale, figures.SPEED_COLORMAP)
+    bar = figure.colorbar(colors, ax=panels, shrink=0.8, pad=0.02, aspect=30, extend="max")
     bar.set_label("speed [m/s]")
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
     return figure
@@ -87,8 +96,8 @@ def add_vehicle_lines(axes: Axes, times: np.ndarray, positions: np.ndarray, max_
 
 
 @rc_context(figures.PLOT_STYLE)
-def trajectory_figure(episodes: Sequence[PlotEpisode]) -> Figure:
-    """Draw the position of every vehicle over time, and the speed; a panel per driver.
+def trajectory_figure(episodes: Sequence[PlotEpisode], shown: Sequence[PlotEpisode] = ()) -> Figure:
+    """Draw the position of every vehicle over time, and the speed; a panel per driver; `shown` as in `episode_grid`.
 
     A stop-and-go wave is a dark band that runs against the direction of travel. Sections where the road crosses
     itself are shaded. On a merge road the ramp has a panel below that of the main road; on a user network, the
@@ -96,7 +105,7 @@ def trajectory_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     """
     branches = list(dict.fromkeys(branch for episode in episodes for branch in episode.branches)) or [""]
     rows = [_branch_row(episodes, branch, number == 0) for number, branch in enumerate(branches)]
-    return episode_grid(episodes, rows, 3.1 + 0.9 * (len(rows) - 1))
+    return episode_grid(episodes, rows, 3.1 + 0.9 * (len(rows) - 1), shown)
 
 
 def _branch_row(episodes: Sequence[PlotEpisode], branch: str, is_main: bool) -> PanelRow:
@@ -202,17 +211,20 @@ def has_lane_maps(episodes: Sequence[PlotEpisode]) -> bool:
     return bool(episodes) and len({tuple(each.lane_names) for each in episodes}) == 1 and bool(episodes[0].lane_names)
 
 
-def space_time_figure(episodes: Sequence[PlotEpisode]) -> Figure:
-    """Draw positions and speeds over time: a map for each lane, or without lanes a line for each vehicle."""
-    return lane_map_figure(episodes) if has_lane_maps(episodes) else trajectory_figure(episodes)
+def space_time_figure(episodes: Sequence[PlotEpisode], shown: Sequence[PlotEpisode] = ()) -> Figure:
+    """Draw positions and speeds over time: a map for each lane, or without lanes a line for each vehicle.
+
+    `shown` as in `episode_grid`.
+    """
+    return (lane_map_figure if has_lane_maps(episodes) else trajectory_figure)(episodes, shown)
 
 
 @rc_context(figures.PLOT_STYLE)
-def lane_map_figure(episodes: Sequence[PlotEpisode]) -> Figure:
+def lane_map_figure(episodes: Sequence[PlotEpisode], shown: Sequence[PlotEpisode] = ()) -> Figure:
     """Draw the mean speed in cells of time and road, a row per lane from left to right, a column per driver.
 
     Speeds are Edie's: total distance over total time in a cell. Cells without vehicles are white; red lines are
-    CAVs, dashed lines show where ramps join.
+    CAVs, dashed lines show where ramps join. `shown` as in `episode_grid`.
     """
     lanes = _busiest_lanes(episodes)
     extents = [_lane_range(episodes, lane) for lane in lanes]
@@ -221,7 +233,7 @@ def lane_map_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     rows = [
         _lane_row(episodes[0], lane, (longest, *extent), max_span) for lane, extent in zip(lanes, extents, strict=True)
     ]
-    return episode_grid(episodes, rows, 0.4 + 1.75 * sum(row.height for row in rows))
+    return episode_grid(episodes, rows, 0.4 + 1.75 * sum(row.height for row in rows), shown)
 
 
 def _busiest_lanes(episodes: Sequence[PlotEpisode]) -> list[int]:

@@ -9,11 +9,11 @@ import pandas as pd
 
 from unjam.errors import format_count, printable
 from unjam.measures.effect import LAG_METRIC, POWER_FUEL_METRIC
-from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, estimate_cell
+from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, driver_rank, estimate_cell
 from unjam.measures.metrics import METRICS
 from unjam.measures.notes import early_end_notes
 from unjam.measures.statistics import format_difference, gain_verdict, metric_estimate, pair_rows, paired_difference
-from unjam.measures.verdict import Verdict, is_better, verdicts
+from unjam.measures.verdict import Verdict, is_better, road_metrics, verdicts
 from unjam.reports.results import PlotEpisode, Results
 
 CLOSE_TIME_GAP = 1.0
@@ -24,7 +24,7 @@ MAX_LIMIT_RATIO = 1.01
 """ratio of mean speed to the limit above which the report has a note"""
 COMPARED_METRICS = (
     *("mean_speed", "mean_speed_steady", "outflow_veh_per_h", "travel_time", "delay", "insertion_backlog_veh"),
-    *("fuel_ml_per_km", POWER_FUEL_METRIC, "share_standing", "speed_std_fleet", "speed_std_fleet_steady"),
+    *(POWER_FUEL_METRIC, "share_standing", "speed_std_fleet", "speed_std_fleet_steady"),
     *("time_to_dissolve", "min_ttc"),
     *("human_max_braking", "human_braking_beyond_3_5", "human_braking_beyond_4_5", "human_braking_beyond_9"),
     *("cav_mean_gap", LAG_METRIC, "amplification_long", "amplification_medium", "amplification_short", "collisions"),
@@ -46,7 +46,7 @@ class ReportColumn:
 
 
 def report_columns(results: Sequence[Results]) -> list[ReportColumn]:
-    """Return all drivers of a single folder; of several folders, shared baselines only once."""
+    """Return all drivers in the order of `driver_rank`; those that several folders share, only once."""
     columns: dict[str, ReportColumn] = {}
     for result, folder in zip(results, folder_names(results), strict=True):
         baseline = result.baseline or HUMAN_LABEL
@@ -58,7 +58,7 @@ def report_columns(results: Sequence[Results]) -> list[ReportColumn]:
             others = None if label == baseline else result.rows.get(baseline)
             verdict = replace(found[label], driver=name) if label in found else None
             columns.setdefault(name, ReportColumn(name, rows, result.plot_episodes.get(label), others, verdict))
-    return list(columns.values())
+    return sorted(columns.values(), key=lambda column: driver_rank(column.name))
 
 
 def common_baseline(results: Sequence[Results]) -> str:
@@ -88,7 +88,7 @@ def report_title(results: Sequence[Results]) -> str:
     """Return the title of the page."""
     names = ", ".join(dict.fromkeys(result.metadata["scenario"] for result in results))
     if len(results) > 1:
-        return f"{names}: comparison of {len(results)} results"
+        return f"{names}: comparison of {format_count(len(results), 'result')}"
     if results[0].trained_label is None:
         return f"{names}: {', '.join(results[0].rows)}"
     expert = results[0].metadata["expert"]
@@ -136,36 +136,39 @@ def main_finding(result: Results) -> str:
     if expert in experts:
         gain = paired_difference(rows, experts[expert], "return")
         sentences.append(
-            f"Return difference to its expert, {expert}, on {gain.count} test seeds: {format_difference(gain)}. "
-            f"{gain_verdict(gain)}"
+            f"Return difference to its expert, {expert}, on {format_count(gain.count, 'test seed')}: "
+            f"{format_difference(gain)}. {gain_verdict(gain)}"
         )
     if best != expert:
         gain = paired_difference(rows, experts[best], "return")
         sentences.append(f"Return difference to {best}, the expert with the highest return: {format_difference(gain)}.")
     mean = metric_estimate(rows, "return").mean
-    return " ".join(sentences) or f"On {len(rows)} test seeds the mean return of the trained controller is {mean:.0f}."
+    seeds = format_count(len(rows), "test seed")
+    return " ".join(sentences) or f"On {seeds} the mean return of the trained controller is {mean:.0f}."
 
 
 def _drive_finding(result: Results) -> str:
-    scenario = result.metadata["scenario"]
-    ratios = {label: metric_estimate(rows, "speed_limit_ratio_steady") for label, rows in result.rows.items()}
-    percent = {label: f"{100 * ratio.mean:.0f}\u00a0%" for label, ratio in ratios.items()}
-    if len(ratios) > 1:
-        text = ", ".join(f"{label} {percent[label] if ratios[label].count else 'failed'}" for label in ratios)
-        return f"Mean speed of all vehicles in steady state on {scenario}, relative to the limit: {text}."
-    [(label, rows)] = result.rows.items()
-    speed = metric_estimate(rows, "mean_speed")
-    if speed.count == 0:
-        return f"{label} on {scenario}: no episode of {len(rows)} succeeded."
-    return (
-        f"{label} on {scenario}, {format_count(len(rows), 'episode')}: the mean speed of all vehicles is "
-        f"{speed.mean:.2f} m/s, and in steady state {percent[label]} of the limit."
+    names, texts = road_metrics(result.rows).headline[:2], list[str]()
+    for label, rows in result.rows.items():
+        has_failed = all(row["status"] == "failed" for row in rows)
+        means = "all episodes failed" if has_failed else ", ".join(_mean_text(rows, name) for name in names)
+        texts.append(f"{label}: {means}")
+    episodes = format_count(max(map(len, result.rows.values())), "episode")
+    return f"Means of {episodes} on {result.metadata['scenario']}: {'; '.join(texts)}."
+
+
+def _mean_text(rows: Sequence[dict[str, Any]], name: str) -> str:
+    """Return a mean with its unit; what follows a comma in the name of the metric is after it, in parentheses."""
+    (label, _, detail), found = METRICS[name].label.partition(", "), metric_estimate(rows, name)
+    value = (
+        f"{label} {found.mean:.{METRICS[name].digits}f} {METRICS[name].unit}".strip() if found.count else f"{label} –"
     )
+    return f"{value} ({detail})" if detail else value
 
 
 def report_notes(result: Results) -> list[str]:
     """Return caveats of the main finding."""
-    labels = [result.trained_label] if result.trained_label else list(result.rows)
+    labels = [result.trained_label] if result.trained_label else list(filter(driver_rank, result.rows))
     notes = dict.fromkeys([*result.metadata.get("notes", []), *early_end_notes(result.rows)])
     return [*(f"{note}." for note in notes), *(note for label in labels for note in _driver_notes(result, label))]
 
@@ -199,19 +202,11 @@ def key_figures(result: Results) -> list[dict[str, str]]:
     if len(result.rows) > 1:
         return []
     [(label, rows)] = result.rows.items()
-    is_closed = all(episode.is_closed for episode in result.plot_episodes.values())
-    figures = (
-        ("Mean speed / limit, steady", "speed_limit_ratio_steady", 0, "%", 100.0),
-        ("Speed std across vehicles, steady", "speed_std_fleet_steady", 2, "m/s", 1.0)
-        if is_closed
-        else ("Flow", "outflow_veh_per_h", 0, "veh/h", 1.0),
-        ("Fuel", "fuel_ml_per_km", 0, "ml/km", 1.0),
-    )
     cards = []
-    for title, name, digits, unit, scale in figures:
-        found = metric_estimate(rows, name)
-        value = f"{scale * found.mean:.{digits}f} {unit}" if found.count else "–"
-        cards.append({"label": title, "value": value, "detail": label})
+    for name in road_metrics(result.rows).headline:
+        metric, found = METRICS[name], metric_estimate(rows, name)
+        value = f"{found.mean:.{metric.digits}f} {metric.unit}".strip() if found.count else "–"
+        cards.append({"label": metric.label, "value": value, "detail": label})
     return cards
 
 

@@ -12,7 +12,8 @@ from unjam.errors import DiskError, InputError, import_optional, invalid_value
 from unjam.files import atomic_write, check_parent_folder
 from unjam.processes import PrivateFolder
 from unjam.reports.figures import CAV_PLOT_COLOR, TEXT_COLOR, color_table
-from unjam.reports.results import to_plot_episode
+from unjam.reports.results import PlotEpisode, to_plot_episode
+from unjam.reports.space_time import speed_scale
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.ordered_road import poses_along
 from unjam.worlds.record import Episode
@@ -164,8 +165,8 @@ def _write_mp4(frames: Iterator[Image.Image], path: Path, rate: float) -> None:
     atomic_write(path, content)
 
 
-def _video_frames(episode: Episode, title: str, stride: int) -> Iterator[Image.Image]:
-    max_speed = float(np.nanmax(episode.speeds, initial=1.0))
+def _video_frames(episode: PlotEpisode, title: str, stride: int) -> Iterator[Image.Image]:
+    max_speed = float(speed_scale([episode]).vmax or 1.0)
     steps, title = range(0, len(episode.speeds), stride), fill(title, MAX_TITLE_WIDTH)
     for step, scene in zip(steps, episode_scenes(episode, steps), strict=True):
         speeds = scene.speeds[~np.isnan(scene.speeds)]

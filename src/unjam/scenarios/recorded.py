@@ -17,7 +17,7 @@ from pydantic import model_validator
 
 from unjam.drivers.command import Limits
 from unjam.drivers.safety import Actuator
-from unjam.errors import InputError
+from unjam.errors import InputError, format_count, shorten_list
 from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
 from unjam.physics.arrays import Floats
 from unjam.physics.idm import IDMParameters, equilibrium_gap
@@ -129,15 +129,17 @@ class Recorded(Scenario):
         """All recordings of all files."""
         from unjam.recordings.leader_files import read_leaders
 
-        files, found, problems = recording_files(Path(self.recordings)), list[LeaderRecording](), list[str]()
+        files, found, problems = recording_files(Path(self.recordings)), list[LeaderRecording](), dict[str, str]()
         for path in files:
             try:
                 found += read_leaders(path)
             except InputError as error:
-                problems.append(str(error))
+                problems[path.name] = str(error)
         if problems:
-            hint = "" if len(files) == 1 else "; a pattern like 'drives/*.csv' leaves files out"
-            raise InputError(f"{'; '.join(problems)}{hint}")
+            first, *others = problems
+            more = f"; also refused: {shorten_list(others)}" if others else ""
+            way = "to go on, move it elsewhere, or select others by a pattern like 'drives/2021-03*'"
+            raise InputError(f"{problems[first]}{more}{f'; {way}' if len(files) > 1 else ''}")
         return found
 
     @property
@@ -170,10 +172,8 @@ class Recorded(Scenario):
         """What was read of the recordings, so that a wrong unit or a gap in time is seen."""
         path, files, found = Path(self.recordings), recording_files(Path(self.recordings)), self._leaders
         seconds, speeds = [each.seconds for each in found], np.concatenate([each.speed for each in found])
-        source = (
-            path.name if path.is_file() else f"{len(files)} {'file' if len(files) == 1 else 'files'} of {path.name}"
-        )
-        parts = f"{len(found)} parts of {min(seconds):.0f} to" if len(found) > 1 else ""
+        source = path.name if path.is_file() else f"{format_count(len(files), 'file')} of {path.name}"
+        parts = f"{format_count(len(found), 'part')} of {min(seconds):.0f} to" if len(found) > 1 else ""
         text = f"{parts} {max(seconds):.0f} s with speeds of {speeds.min():.1f} to {speeds.max():.1f} m/s"
         drawn = {"random": ", drawn at random", "name": ", in the order of their names"}[self.order]
         return f"recordings: {source}: {text.strip()}{drawn if len(files) > 1 else ''}"

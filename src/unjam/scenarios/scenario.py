@@ -16,6 +16,7 @@ from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.drivers.user_driver import UserFunction
+from unjam.errors import format_count
 from unjam.parameters import (
     STRICT,
     NonNegative,
@@ -330,7 +331,7 @@ class Scenario(Subclassable):
     def population_description(self) -> str:
         """The number and origin of the calibrated drivers, as one phrase."""
         drivers = self.driver_population.drivers if self.driver_population else ()
-        return f"{len(drivers)} calibrated drivers of {self.population}"
+        return f"{format_count(len(drivers), 'calibrated driver')} of {self.population}"
 
     @property
     def human_description(self) -> str:

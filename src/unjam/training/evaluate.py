@@ -24,7 +24,7 @@ from unjam.files import atomic_write, make_folder, remove_leftovers, sha256_of, 
 from unjam.manifest import manifest
 from unjam.measures.effect import effects_by_driver
 from unjam.measures.feasibility import feasibility_by_driver
-from unjam.measures.metric_table import RowsByDriver, choose_baseline
+from unjam.measures.metric_table import RowsByDriver, choose_baseline, in_order
 from unjam.measures.metrics import METRICS, measure
 from unjam.measures.notes import count_early_ends, episode_notes
 from unjam.measures.statistics import Estimate, paired_difference, summarize
@@ -94,11 +94,13 @@ class DriveResult(Evaluation):
     """caveats, as controllers on a road that they were not made for"""
     baseline: str = ""
     """label of the driver that the others are compared with; empty: human drivers, or else the best expert"""
+    first_driver: str = ""
+    """label of the driver that was given first; empty: that of the first rows"""
 
     @property
     def mean(self) -> dict[str, float]:
-        """Mean of every metric over the episodes of the first driver."""
-        return next(iter(self.means().values()))
+        """Mean of every metric over the episodes of the driver that was given first."""
+        return self.means()[self.first_driver or next(iter(self.rows))]
 
     def table(self, brief: bool = False) -> "pd.DataFrame":
         """Return a row per metric with the mean and both ends of the 95 % CI of each driver; `brief`: what matters.
@@ -295,7 +297,7 @@ def drivers_to_compare(config: RunConfig, folder: Path) -> dict[str, Driver]:
             # The description of a packaged driver has all tuned parameters: its name is shorter.
             is_packaged = name.startswith(PACKAGED_PREFIX) and name != config.expert
             drivers[name if is_packaged else unique_label(driver, {**expert, **drivers})] = driver
-    return {**drivers, **expert, TRAINED_LABEL: make_driver(str(folder), scenario.control_step)}
+    return in_order({**drivers, **expert, TRAINED_LABEL: make_driver(str(folder), scenario.control_step)})
 
 
 def evaluation_steps(config: RunConfig, folder: Path) -> int:
@@ -311,10 +313,11 @@ def evaluate_run(
     workers: WorkerPool,
     progress: EvaluationProgress | None = None,
     out: Path | None = None,
+    notes: Sequence[str] = (),
 ) -> Evaluation:
     """Evaluate a run's controller and others on the same test seeds, and save the results in its folder or in `out`.
 
-    `config.evaluation` may be another than that of the run.
+    `config.evaluation` may be another than that of the run. The `notes` are stored before all others.
     """
     scenario, drivers = config.make_scenario(), drivers_to_compare(config, folder)
     seeds = held_out_seeds(config.evaluation.episodes)
@@ -327,6 +330,7 @@ def evaluate_run(
         "expert": config.make_expert().describe() if config.expert != "none" else "none",
         "controllers": _controller_hashes({TRAINED_LABEL: str(folder)}),
         "notes": [
+            *notes,
             *episode_notes(evaluation.rows),
             *backend_notes(config.episode_backend, scenario),
             *scenario.notes,
@@ -426,7 +430,7 @@ def drive(
     seeds = held_out_seeds(episodes) if test_seeds else [(seed + index,) for index in range(episodes)]
     pool = WorkerPool(min(workers or os.cpu_count() or 1, episodes * len(drivers)))
     with lock_new_folder(folder) if folder is not None else nullcontext(), pool:
-        evaluation = evaluate(road, drivers, seeds, pool, reward, progress, backend)
+        evaluation = evaluate(road, in_order(drivers), seeds, pool, reward, progress, backend)
         notes = [
             *episode_notes(evaluation.rows),
             *controller_notes(scenario_recipe(road), drivers, evaluation.plot_episodes),
@@ -446,4 +450,5 @@ def drive(
             report = write_report_page([folder], folder / "report.html")
     used_folder = folder if has_results else None
     made_by = scenario, backend_label(backend)
-    return DriveResult(evaluation.rows, evaluation.plot_episodes, *made_by, used_folder, report, notes, baseline)
+    first = next(iter(drivers))
+    return DriveResult(evaluation.rows, evaluation.plot_episodes, *made_by, used_folder, report, notes, baseline, first)

@@ -16,7 +16,7 @@ from optuna import Study, create_study
 from optuna.samplers import TPESampler
 from optuna.trial import TrialState, create_trial
 
-from unjam.errors import InputError, UnjamError, invalid_value
+from unjam.errors import InputError, UnjamError, format_count, invalid_value
 from unjam.files import atomic_write, to_json
 from unjam.learners.settings import unused_tables
 from unjam.manifest import manifest
@@ -111,7 +111,9 @@ def search(
     ]
     atomic_write(folder / SEARCH_FILE, to_json({"manifest": manifest(), "trials": rows}, indent=1))
     if results[0].gain is None:
-        raise UnjamError(f"all {len(results)} trainings failed; their logs are in {folder / 'configs'}")
+        raise UnjamError(
+            f"no training of {format_count(len(results), 'trial')} ended; their logs are in {folder / 'configs'}"
+        )
     atomic_write(folder / BEST_CONFIG_FILE, to_toml(trial_config(base, results[0].values)))
     return results
 

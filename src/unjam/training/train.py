@@ -105,7 +105,7 @@ class TrainResult:
         """Return a figure of the learning curve: the return in training and in validation by environment steps."""
         from unjam.reports.figures import learning_curve_figure
 
-        return learning_curve_figure({"": read_progress(self.folder)}, {})
+        return learning_curve_figure({"": read_progress(self.folder)}, {}, {})
 
 
 def train(

@@ -17,7 +17,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.observation import NetworkInput, feature
 from unjam.drivers.requirements import Requirements
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, NoCavError
+from unjam.errors import InputError, NoCavError, format_count
 from unjam.parameters import check_integer
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import BackendLike, WorldOptions, check_support, open_backend, open_world
@@ -187,7 +187,9 @@ def _check_requirements(requirements: Requirements, scenario: Scenario, label: s
 def check_has_cavs(episode: Episode, driver: Driver) -> None:
     """Raise `NoCavError` if a driver had no CAV."""
     if not episode.cav_ids and not driver.is_native:
-        raise NoCavError(f"no CAV was on the road in {episode.control_steps} control steps: let more vehicles be CAVs")
+        raise NoCavError(
+            f"no CAV was on the road in {format_count(episode.control_steps, 'control step')}: make more vehicles CAVs"
+        )
 
 
 def can_drive(driver: Driver, scenario: Scenario) -> bool:

@@ -15,6 +15,7 @@
     const markWidth = () => scroll.classList.toggle("wide", scroll.scrollWidth > scroll.clientWidth + 1);
     markWidth();
     window.addEventListener("resize", markWidth);
+    scroll.closest("details")?.addEventListener("toggle", markWidth);
     const quote = (cell) => `"${cell.textContent.replace(/\s+/g, " ").trim().replace(/"/g, '""')}"`;
     const lines = [...scroll.querySelectorAll("tr")].map((row) => [...row.cells].map(quote).join(","));
     const csv = new Blob([lines.join("\n") + "\n"], { type: "text/csv" });

@@ -15,7 +15,7 @@ from unjam.drivers.car_following import MIN_IDM_GAP
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import FollowingState
-from unjam.errors import EpisodeError
+from unjam.errors import EpisodeError, format_count
 from unjam.physics.arrays import Array, clamp_min
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import gap_on_loop, next_speed
@@ -159,7 +159,7 @@ class OrderedTraffic(Traffic[OrderedRoad]):
     def _check_all_present(self) -> None:
         present, expected = self._simulation.vehicle_count(), len(self.road.vehicle_ids)
         if present != expected:
-            raise EpisodeError(f"{present} vehicles on the road; expected: {expected}")
+            raise EpisodeError(f"{format_count(present, 'vehicle')} on the road; expected: {expected}")
 
     def _command_humans(self) -> None:
         """Command speeds of the IDM with noise, as Flow does it; on a crossing SUMO drives."""
