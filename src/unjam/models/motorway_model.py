@@ -28,13 +28,8 @@ from unjam.worlds.batch.motorway.traffic import (
     enable_acc,
     make_vehicles,
 )
-from unjam.worlds.batch.motorway.vehicles import (
-    MotorwayVehicles,
-    find_road_neighbors,
-    find_rows,
-    neighbors_on_lane,
-    vehicle_numbers,
-)
+from unjam.worlds.batch.motorway.vehicles import MotorwayVehicles, find_rows, vehicle_numbers
+from unjam.worlds.lane_neighbors import find_road_neighbors, neighbors_on_lane
 from unjam.worlds.record import Episode
 
 Index = NDArray[np.intp]
@@ -79,7 +74,8 @@ def motorway_samples(episode: Episode, number: int, scenario: Motorway, base: st
     noisy = before._replace(**perception, driving_error=errors[2])
     base_speed = _speeds_after_step(before, road, scenario, len(steps), np.zeros)
     noisy_speed = _speeds_after_step(noisy, road, scenario, len(steps), generator.standard_normal)
-    leader = neighbors_on_lane(find_road_neighbors(before, road.geometry).leaders, before.lane)
+    neighbors = find_road_neighbors(before.road, before.lane, before.position, road.geometry)
+    leader = neighbors_on_lane(neighbors.leaders, before.lane)
     next_speed = episode.speeds[later]
     keeps_lane = episode.lane_indices[later] == episode.lane_indices[now]
     is_used = (leader >= 0) & before.is_eidm & keeps_lane & ~np.isnan(base_speed + noisy_speed + next_speed)

@@ -14,17 +14,8 @@ import numpy as np
 
 from unjam.physics.arrays import Array, clamp_min
 from unjam.scenarios.motorway_road import MotorwayGeometry, MotorwaySections
-from unjam.worlds.batch.motorway.vehicles import (
-    ADVICE_FIELDS,
-    NO_ADVICE,
-    NO_VEHICLE,
-    MotorwayDrivers,
-    MotorwayVehicles,
-    as_rows,
-    find_neighbors,
-    find_road_neighbors,
-    neighbors_on_lane,
-)
+from unjam.worlds.batch.motorway.vehicles import ADVICE_FIELDS, NO_ADVICE, MotorwayDrivers, MotorwayVehicles, as_rows
+from unjam.worlds.lane_neighbors import NO_VEHICLE, find_neighbors, find_road_neighbors, neighbors_on_lane
 
 NO_NEIGHBOR_GAP = 1e6
 """gap without a neighbor [m]"""
@@ -92,7 +83,7 @@ def lane_change_context(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, 
     target_lane = np.where((lane == 0) & is_merging, 1, NO_VEHICLE)
     if geometry.lane_count > 1:
         target_lane = np.where(lane == 1, 2, np.where(lane == 2, 1, target_lane))
-    neighbors = find_road_neighbors(vehicles, geometry)
+    neighbors = find_road_neighbors(vehicles.road, lane, position, geometry)
     drivers, length = vehicles.drivers, geometry.vehicle_length
     section_end = np.where(is_merging, sections.merge_end, geometry.length)
     section_end = np.where(sections.is_before, sections.merge_start, section_end)
@@ -382,8 +373,7 @@ def _has_change_conflict(vehicles: MotorwayVehicles, changes_lane: Array, geomet
         return conflict
     rows = np.flatnonzero(np.isin(vehicles.road, vehicles.road[merges]))
     vehicles, merges = vehicles.select(rows), merges[rows]
-    neighbors = find_neighbors(vehicles._replace(lane=np.where(merges, 1, vehicles.lane)), 2)
-    ahead, behind = (each[1] for each in neighbors)
+    ahead, behind = (each[1] for each in find_neighbors(vehicles.road, np.where(merges, 1, vehicles.lane), 2))
     position, min_distance = vehicles.position, 2.0 * (geometry.vehicle_length + vehicles.minimum_gap)
     is_tight_ahead = (ahead >= 0) & merges[ahead] & (position[ahead] - position < min_distance)
     is_tight_behind = (behind >= 0) & merges[behind] & (position - position[behind] < min_distance)

@@ -19,15 +19,13 @@ from unjam.worlds.batch.motorway.lane_changes import change_lanes
 from unjam.worlds.batch.motorway.vehicles import (
     ADVICE_FIELDS,
     NO_ADVICE,
-    LaneNeighbors,
     MotorwayVehicles,
     as_rows,
-    find_road_neighbors,
-    neighbors_on_lane,
     sort_vehicles,
     sorted_rows,
 )
 from unjam.worlds.batch.noise import DrawNormal
+from unjam.worlds.lane_neighbors import LaneNeighbors, find_road_neighbors, neighbors_on_lane
 
 LONG_BEFORE_START = -1000.0
 """long before an episode starts [s]"""
@@ -175,7 +173,8 @@ class BatchMotorways:
         """The neighbors of the vehicles."""
         lane = self.vehicles.lane  # a new column if vehicles enter, leave, change lanes or are sorted
         if self._cached_neighbors is None or self._cached_neighbors[0] is not lane:
-            self._cached_neighbors = lane, find_road_neighbors(self.vehicles, self.geometry)
+            found = find_road_neighbors(self.vehicles.road, lane, self.vehicles.position, self.geometry)
+            self._cached_neighbors = lane, found
         return self._cached_neighbors[1]
 
     def replace_roads(self, roads: Sequence[int], source: Self, source_roads: Sequence[int]) -> None:

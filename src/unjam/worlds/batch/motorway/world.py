@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, batch_commanded_accelerations, commanded_time_gaps
-from unjam.drivers.local_state import LocalState, observe_neighbor
+from unjam.drivers.local_state import LocalState
 from unjam.drivers.roadside import MeasuredVehicles, RoadSections, RoadsideMessages, SpeedMeasurement
 from unjam.errors import InputError
 from unjam.physics.arrays import Array, Floats, replace_padded_rows
@@ -20,8 +20,9 @@ from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.worlds.batch.human_idm import CONTACT_GAP
 from unjam.worlds.batch.motorway.record import NO_END_STEP, MotorwayLog
 from unjam.worlds.batch.motorway.traffic import NO_SPEED_CAP, BatchMotorways, LearnedCorrection, enable_acc
-from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, find_rows, neighbors_on_lane, vehicle_numbers
+from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, find_rows, vehicle_numbers
 from unjam.worlds.batch.noise import ArrayFactory
+from unjam.worlds.lane_neighbors import neighbors_on_lane, observe_lane
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import Outcome, time_gap
 from unjam.worlds.worker_pool import EpisodeTask
@@ -251,16 +252,10 @@ class MotorwayBatch:
 
     def _exact_state(self) -> LocalState:
         traffic, vehicles = self._traffic, self._traffic.vehicles
-        rows, neighbors, geometry = find_rows(self._cav_numbers, vehicles), traffic.neighbors, traffic.geometry
+        rows, geometry = find_rows(self._cav_numbers, vehicles), traffic.geometry
         roads, _, lane, position, speed = (each[rows] for each in vehicles[:5])
-
-        def neighbor_state(neighbors: NDArray[np.intp], lane_offset: int, direction: float) -> tuple[Floats, Floats]:
-            row = neighbors_on_lane(neighbors[:, rows], lane + lane_offset)
-            gap = direction * (vehicles.position[row] - position) - geometry.vehicle_length
-            return observe_neighbor(row >= 0, gap, vehicles.speed[row], speed)
-
-        sides = ((neighbors.leaders, 1.0), (neighbors.followers, -1.0))
-        own, left, right = ([neighbor_state(each, offset, sign) for each, sign in sides] for offset in (0, 1, -1))
+        motion = vehicles.position, vehicles.speed, np.broadcast_to(geometry.vehicle_length, vehicles.speed.shape)
+        own, left, right = (observe_lane(traffic.neighbors, rows, lane + each, *motion) for each in (0, 1, -1))
         limit = geometry.speed_limits(lane, geometry.sections(lane, position))
         lane_speeds, road_speeds = self._road_sections.speeds_ahead(self._messages.latest, lane, position, roads)
         if self.roads[0].roadside.source == "none":
