@@ -38,10 +38,7 @@ def backend_label(backend: Any) -> str:
 
 
 def call_backend(label: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the result of a function of a user's backend; raise `InputError` with its last executed line if it fails.
-
-    Errors of unjam itself, such as those of a driver, pass through.
-    """
+    """Return the result of a user's backend; raise errors of unjam, and others as `InputError` with their last line."""
     try:
         with ending_forks():
             return function(*arguments)
@@ -169,10 +166,8 @@ class CheckedWorld:
                     raise self._error(problem, f"{recorded:.2f}, as in the record")
 
     def _count_overrides(self, episode: Episode) -> Episode:
-        """Return the record with all commands that were not carried out as overridden ones in its audit.
-
-        Where CAVs have an ACC, SUMO's human model or a slow actuator, the command is not the actual acceleration.
-        """
+        """Return the record with all commands that were not carried out as overridden ones in its audit."""
+        # Elsewhere the command is not the actual acceleration.
         if not self._scenario.actuator.is_instant or self._scenario.actuation not in ("raw", "shielded"):
             return episode
         flags = np.concatenate([np.zeros(0, bool), *map(self._is_ignored, episode.trajectories)])
@@ -181,12 +176,10 @@ class CheckedWorld:
         return replace(episode, audit=replace(audit, following=following))
 
     def _is_ignored(self, trip: Trajectory) -> Any:
-        """Return in which control steps a CAV did not carry out its command, and no added braking was recorded.
-
-        A standing vehicle cannot brake harder, and none exceeds its top speed.
-        """
+        """Return in which control steps a CAV did not carry out its command, and no added braking was recorded."""
         speed, actual = trip.states.speed[1:], np.diff(trip.states.speed) / self._scenario.control_step
         slower = trip.applied_acceleration - actual
         is_standing, is_fastest = speed < OVERRIDE_TOLERANCE, speed > self._scenario.top_speed - OVERRIDE_TOLERANCE
+        # A standing vehicle cannot brake harder, and none exceeds its top speed.
         is_braked = is_fastest | (trip.shield_braking > OVERRIDE_TOLERANCE)
         return (np.abs(slower) > COMMAND_TOLERANCE) & ~np.where(slower > 0, is_braked, is_standing)

@@ -61,10 +61,7 @@ class RoadWorld(World[Episode], Protocol):
         return self.local_state()
 
     def last_applied_acceleration(self) -> Array:
-        """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2].
-
-        Their shape is (CAVs,); that of a single CAV may be a float if the world `is_scalar`.
-        """
+        """Return the CAVs' accelerations in the last control step after the filter [m/s2], (CAVs,) or a float."""
         ...
 
     def scene(self) -> RoadScene:

@@ -1,7 +1,4 @@
-"""A worker process that runs episodes on request, one after the other. Free of torch.
-
-Started by `unjam.worlds.worker_pool` as `python -m unjam.worlds.worker`.
-"""
+"""A worker process that runs episodes on request, `python -m unjam.worlds.worker`, without torch."""
 
 import gc
 import sys

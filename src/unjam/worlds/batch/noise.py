@@ -19,10 +19,7 @@ WorldSeeds = Sequence[Sequence[np.random.SeedSequence]]
 
 
 def draw_single_normal(generator: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return standard normal numbers in single precision, several times faster than `generator.standard_normal`.
-
-    Source: Box and Muller 1958, Ann. Math. Stat. 29:610.
-    """
+    """Return single-precision normal numbers, much faster than NumPy (Box and Muller 1958, Ann. Math. Stat.)."""
     size = prod(shape)
     uniform = generator.random((2, (size + 1) // 2), np.float32)
     radius, angle = np.sqrt(-2.0 * np.log(1.0 - uniform[0])), 2.0 * np.pi * uniform[1]

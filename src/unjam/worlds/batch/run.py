@@ -43,8 +43,7 @@ def start_batch_drive(
 ) -> DriveLoop:
     """Return the loop of a driver that starts to drive all CAVs of a batch.
 
-    `to_array` makes the world's arrays, which the driver must accept; `explore` is the factor of exploration noise.
-    Without a `memory`, the driver remembers only the warm-up.
+    `to_array` makes arrays that the driver must accept. Without a `memory`, it remembers only the warm-up.
     """
     world.measured_fields = driver.requirements().measured_fields
     has_fixed_rows = world.cav_count > 0  # otherwise CAVs enter later
@@ -70,10 +69,10 @@ def run_batch(
 ) -> list[Episode]:
     """Return the episodes of tasks, which are simulated at once; equal to `run_episode` in SUMO except for rounding.
 
-    The tasks differ at most in road length, seed and driver, and on motorways in exploration; otherwise, or if
-    `unjam.worlds.batch.support` says why they are not supported, raise `InputError`. Warm-ups of `upcoming`, similar
-    tasks that will follow, are simulated together with theirs. `allow_statistical` allows scenarios with episodes that
-    equal SUMO's only in distribution.
+    Tasks differ at most in road length, seed and driver, and on motorways in exploration; else, or if they are not
+    supported, raise `InputError`. Warm-ups of `upcoming` tasks are simulated with theirs. `allow_statistical` allows
+    scenarios with episodes that equal SUMO's only in distribution.
+
     """
     first = tasks[0]
     if any(_shared_settings(task) != _shared_settings(first) for task in tasks):

@@ -126,10 +126,7 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         return [state for _, state in self._tracked_leaders(names)]
 
     def _collisions(self) -> tuple[Sequence[str], bool]:
-        """Return the vehicles that collided in the last step; the episode ends if a controlled CAV is one of them.
-
-        Collisions among human drivers are those of their model: they are counted, and SUMO removes the vehicles.
-        """
+        """Return the vehicles that collided; only a controlled CAV ends the episode: SUMO removes human drivers."""
         colliding, _ = super()._collisions()
         return colliding, self.is_controlled and not self.road.cav_ids.isdisjoint(colliding)
 

@@ -32,10 +32,7 @@ def neighbor_state(
     speeds: Floats,
     leader_gaps: Callable[[NDArray[np.intp], NDArray[np.intp]], Floats],
 ) -> LocalState:
-    """Return the local states of some rows of vehicles; a missing neighbor is -1, or beyond `MAX_OBSERVED_GAP`.
-
-    `leader_gaps` returns the gaps from rows of vehicles to the rows of their leaders [m].
-    """
+    """Return the local states of some rows, given rows of neighbors (-1: none) and a function for gaps [m]."""
     values = [speeds[rows]]
     for neighbors, gaps in ((leaders, leader_gaps(rows, leaders)), (followers, leader_gaps(followers, rows))):
         values += observe_neighbor(neighbors >= 0, gaps, speeds[neighbors], speeds[rows])
@@ -54,10 +51,7 @@ class ActiveVehicles:
         self.arrivals = self.teleports = 0
 
     def update(self, simulation: Simulation, is_cav: Callable[[str], bool]) -> tuple[list[str], Sequence[str]]:
-        """Update after a simulation step, and return the names of vehicles that left and of those that entered.
-
-        `is_cav` decides whether a vehicle that has just entered is a CAV.
-        """
+        """Update after a step, and return the vehicles that left and that entered, which `is_cav` judges."""
         entered, arrived = simulation.departed_vehicles(), simulation.arrived_vehicles()
         teleporting = simulation.teleporting_vehicles()
         self.arrivals += len(arrived)
@@ -86,8 +80,8 @@ class ActiveVehicles:
 class OpenTraffic(Traffic[OpenRoadT]):
     """Common part of the roads with ends.
 
-    A vehicle becomes a CAV at the first control step after its entry; until then a human drives it. Its trip ends with
-    the last control step after which it is still on the road.
+    A vehicle becomes a CAV at the first control step after its entry. Its trip ends with the last control step after
+    which it is still on the road.
     """
 
     _fuel_interval = 1
@@ -334,11 +328,7 @@ class MultiLaneTraffic(OpenTraffic[OpenRoadT]):
         return False
 
     def _command_cavs(self, speeds: dict[str, float]) -> None:
-        """Give a CAV with its own ACC a set-speed cap, or none if it may drive freely.
-
-        SUMO still drives such a CAV: it brakes as hard as its ACC must, and makes room for vehicles that change lanes.
-        A CAV with a commanded speed does neither. Without a leader, the ACC accelerates as commanded.
-        """
+        """Give a CAV with its own ACC, which SUMO still drives, a set-speed cap, or none if it may drive freely."""
         cruise, simulation, names = self.scenario.cruise, self._simulation, list(speeds)
         if self.scenario.actuation != "cruise":
             super()._command_cavs(speeds)

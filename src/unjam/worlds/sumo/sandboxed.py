@@ -38,11 +38,7 @@ MAX_ANSWER_SECONDS = 150.0
 
 
 def open_simulation(is_sandboxed: bool) -> Simulation:
-    """Open a simulation, a sandboxed one or one in this process.
-
-    If libsumo already holds one there, unjam's or the user's, it runs in its own process, too, with a warning: another
-    thread may use libsumo at the same time.
-    """
+    """Open a sandboxed simulation or one in this process; in its own, with a warning, if libsumo holds one here."""
     if not is_sandboxed:
         try:
             return Simulation()

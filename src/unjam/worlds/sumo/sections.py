@@ -48,20 +48,17 @@ class LaneSections:
         return lane in self._lanes
 
     def measure(self, lane_positions: Sequence[tuple[str, float]], speeds: Floats) -> tuple[Floats, Floats]:
-        """Return the number of vehicles in each section, and the sum of their speeds [m/s].
-
-        `lane_positions` are the vehicles' lanes and positions along them [m].
-        """
+        """Return the number of vehicles in each section, and the sum of their speeds [m/s]; positions in [m]."""
         count = len(self.speed_limits)
         cells = [self._section_at(*each) if each[0] in self else count for each in lane_positions]
         vehicles, total = (np.bincount(cells, weight, count + 1)[:count] for weight in (None, speeds))
         return vehicles.astype(np.float64), total.astype(np.float64)
 
     def sections_ahead(self, lane: str, position: float, route: Sequence[str]) -> list[int]:
-        """Return a vehicle's own section and those ahead; `route` has its edge and the following ones.
+        """Return a vehicle's own section and those ahead, which contain the centers of the next 100 m ranges.
 
-        The sections ahead contain the centers of the next 100 m ranges. If a lane does not follow the route, its
-        adjacent lane does; beyond the end of the route is `NO_SECTION`.
+        `route` has its edge and the following ones. Where a lane does not follow it, an adjacent lane does; beyond its
+        end is `NO_SECTION`.
         """
         sections, edges, length = [self._section_at(lane, position)], iter(route[1:]), self._lanes[lane].length
         end = min((position // ROAD_SECTION_LENGTH + 1) * ROAD_SECTION_LENGTH, length)

@@ -76,10 +76,7 @@ class Traffic(SimulatedRoad, Generic[RoadT]):
             raise EpisodeError(f"positions differ from SUMO's odometer by {error:.2g} m")
 
     def record(self, driver_log: DriverLog) -> Episode:
-        """Return the record since the start, with SUMO's warnings; this ends SUMO.
-
-        Raise `LostWorkerError` if other code has changed the simulation.
-        """
+        """Return the record since the start, with SUMO's warnings; this ends SUMO."""
         self._simulation.check()
         episode = self._make_record(driver_log)
         return replace(episode, warnings=self._simulation.finish())

@@ -122,10 +122,7 @@ class FigureEightMovement:
         to_array: ArrayFactory,
         human_model: HumanSpeedModel | None = None,
     ) -> None:
-        """Take roads that cross themselves once, the direction with the right of way first.
-
-        Humans drive the CAVs, which have these indices, until `hand_over`. `human_model` replaces the road's IDM.
-        """
+        """Take roads that cross themselves once; humans drive the CAVs, which have these indices, until `hand_over`."""
         idm = partial(commanded_speed, parameters=scenario.humans, step=scenario.simulation_step)
         self._human_model, self._cav_indices = human_model or idm, cav_indices
         self._models, self._models_with_cavs = (
@@ -155,10 +152,7 @@ class FigureEightMovement:
         self._models = self._models_with_cavs
 
     def move(self, speed: Array, position: Array, leader: Leader, noise: Array, cav_speeds: Array) -> Array:
-        """Return the speeds after a step [m/s], shape (vehicles, W).
-
-        `noise` is added to each speed; `cav_speeds` are commands, shape (CAVs, W), or None if the CAVs are human.
-        """
+        """Return the speeds after a step, (vehicles, W), with `noise` [m/s], and commands (CAVs, W) or None."""
         commanded = clamp_min(self._human_model(speed, *leader) + noise, 0.0)
         is_commanded = ~self._is_on_crossing(position)
         if cav_speeds is not None:
@@ -239,10 +233,7 @@ class FigureEightMovement:
         last: _Vehicle,
         foe: _Vehicle,
     ) -> _Approach:
-        """Return the plans of all vehicles for one side, `last` being the last vehicle past its start.
-
-        `free_speed` is the maximum speed without other vehicles, `follow_speed` that behind the leader [m/s].
-        """
+        """Return the plans of all vehicles for one side, `last` being the last vehicle past its start."""
         xp, models, speed_limit = namespace(speed), self._models, self._models.speed_limit
         is_approaching, is_on_lane = distance <= side.approach_distance, distance <= side.lane_length
         front = xp.where(is_on_lane, -distance, self._sumo_loop_length - distance)
@@ -379,10 +370,7 @@ def may_follow_commands(
     motion: tuple[Floats, Floats],
     commanded_speeds: Floats,
 ) -> NDArray[np.bool_]:
-    """Return whether the right of way lets vehicles follow their commands; all have the shape (steps, vehicles).
-
-    `memories` are those of `crossing_memories`; `motion` is speeds [m/s] and positions [m].
-    """
+    """Return whether the right of way allows speeds; `motion`: speeds and positions; all (steps, vehicles)."""
     speed, position, commanded = (each.T for each in (*motion, commanded_speeds))
     roads = [road] * len(commanded_speeds)
     movement = FigureEightMovement(scenario, roads, cav_indices, np.asarray, lambda *_: commanded)

@@ -1,9 +1,9 @@
-"""SUMO's extended intelligent driver model (EIDM) as formulas on arrays.
+"""SUMO's extended intelligent driver model (EIDM) as formulas on arrays of shape (n,) for n vehicles; m/s, m and s.
 
 It is the improved IDM of Treiber and Kesting, with coolness towards vehicles that cut in, a bounded jerk, slow starts,
-and errors in the estimation of gaps and speeds. Arrays have shape (n,) for n vehicles; units are m/s, m and s. Each
-`step` of the simulation has `EIDM_SUBSTEPS` steps of the model. All drivers act in each: SUMO's reaction time is one.
+and errors in the estimation of gaps and speeds. All drivers act in each of the `EIDM_SUBSTEPS` of a simulation step.
 Sources: SUMO's MSCFModel_EIDM (`_v`, `finalizeSpeed`, `slowToStartTerm`); Salles, Kaufmann and Reuss 2020.
+
 """
 
 from math import exp, sqrt
@@ -195,7 +195,8 @@ def finalize_eidm_speed(
 ) -> tuple[Array, Array]:
     """Return the speeds after a step with bounded jerk and slow starts, and the time of the last start [s].
 
-    `acceleration` is that of the previous step; the step ends at `end_time`; speeds are those of `eidm_speed_bounds`.
+    `acceleration` is that of the previous step; speeds are those of `eidm_speed_bounds`.
+
     """
     is_rolling = speed > 2.0 * CLUTCH_ENGAGE_SPEED
     change, previous_change = desired - speed, acceleration * step

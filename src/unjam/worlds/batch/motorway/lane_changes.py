@@ -1,11 +1,11 @@
 """SUMO's lane changes of human drivers on a motorway, all in one step.
 
-SUMO decides for one vehicle after the other, from front to back. Here, vehicles on the ramp's lane, which must change,
-come first, and then all that gain by a change, which agrees in distribution. From each lane, only one change is
-possible: left from the ramp's lane and the right lane, right from the left lane. Vehicles that must change ask others
-to make room, to go, or to change, too.
+SUMO decides for one vehicle after the other. Here, vehicles on the ramp's lane, which must change, come first, and then
+all that gain by a change, which agrees in distribution. From each lane, only one change is possible: left from the
+ramp's lane and the right lane, right from the left lane. Vehicles that must change ask others to make room.
 Sources: SUMO's MSLaneChanger (`getRealLeader`, `getRealFollower`, `checkChange`) and MSLCM_LC2013 (`_wantsChange`,
 `anticipateFollowSpeed`, `informLeader`, `informFollower`, `slowDownForBlocked`).
+
 """
 
 from typing import NamedTuple

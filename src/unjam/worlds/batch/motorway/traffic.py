@@ -46,10 +46,7 @@ difference of the speed after that step [m/s]; arrays of shape (n,)"""
 
 
 class InsertionQueue:
-    """The vehicles of W equal roads that wait to enter, by origin in the order of their entry times.
-
-    Origins are the ramps from upstream to downstream, and then the lanes of the main road from right to left.
-    """
+    """The vehicles of W roads that wait, by origin: ramps from upstream on, then main lanes from the right on."""
 
     def __init__(self, roads: Sequence[MotorwayRoad]) -> None:
         self._roads, self._geometry = list(roads), roads[0].geometry

@@ -1,7 +1,7 @@
 """The vehicles of W motorways in one table, those of each road from front to back, with their drivers.
 
-Arrays have shape (n,) for all n vehicles that are on a road now; units are m/s, m and s. Records and their columns are
-never changed in place: functions return new ones.
+Arrays have shape (n,) for the n vehicles on a road now; m/s, m and s. Functions return new records and columns.
+
 """
 
 from collections.abc import Callable
@@ -145,7 +145,8 @@ class MotorwayDrivers(NamedTuple):
     def safe_speed(self, gap: Array, leader_speed: Array, leader_braking: Array, step: float) -> Array:
         """Return the maximum speed from which drivers that brake a headway later stop behind leaders that brake.
 
-        Source: SUMO's MSCFModel (`maximumSafeFollowSpeed`), for all drivers; gaps are beyond the minimum gap.
+        Source: SUMO's MSCFModel (`maximumSafeFollowSpeed`); gaps are beyond the minimum gap.
+
         """
         braking = self.parameters.comfortable_deceleration
         change, delay = braking * step, self.parameters.time_headway / step

@@ -1,7 +1,4 @@
-"""W motorways as one world: CAVs reduce the set speeds of their own ACCs, as in SUMO.
-
-The rows of CAVs are in the order in which they entered, regardless of their road.
-"""
+"""W motorways as one world: CAVs, in rows by order of entry, reduce the set speeds of their own ACCs, as in SUMO."""
 
 from collections.abc import Collection, Sequence
 from typing import NamedTuple, Self, cast
@@ -58,10 +55,7 @@ class MotorwayBatch:
         replay: ReplayOptions | None = None,
         keep_record: bool = True,
     ) -> None:
-        """Take empty roads, one for each seed; `explore` is the factor of exploration noise on each.
-
-        `keep_record`: whether to keep whole episodes, some 10 MB for each road and 1,000 control steps.
-        """
+        """Take empty roads, one for each seed; whole episodes take 10 MB a road and 1,000 control steps."""
         self._exploration_scales = np.ones(len(seeds)) if explore is None else np.array(explore)
         self.scenario, self._seeds, self._replay, self._keep_record = scenario, seeds, replay, keep_record
         drawn = [scenario.draw_from_seed(seed) for seed in seeds]
@@ -160,8 +154,8 @@ class MotorwayBatch:
     def replace_roads(self, roads: Sequence[int], source: Self, source_roads: Sequence[int]) -> None:
         """Continue on some roads with those of another batch that has just been started, which are empty.
 
-        `roads` and `source_roads` have equal lengths. Both batches keep no record, and have the same scenario. Roadside
-        information must not be that of detectors: their intervals are those of the batch.
+        Both batches keep no record and have the same scenario, without detectors, whose intervals are those of the
+        batch.
         """
         rows = np.flatnonzero(~np.isin(self.cav_roads, roads))
         self._cav_numbers, self.cav_count = self._cav_numbers[rows], len(rows)

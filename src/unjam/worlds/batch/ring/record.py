@@ -28,8 +28,6 @@ def make_ring_episodes(
 ) -> tuple[Episode, ...]:
     """Return the record of each ring until its last control step.
 
-    Vehicles that touched may be separate again at the end, because a control step has several simulation steps.
-
     Args:
         rings: scenario, road, seed, number of control steps, and whether there was a collision.
         start_positions: front bumpers at the start [m], shape (vehicles, W).
@@ -37,6 +35,7 @@ def make_ring_episodes(
         find_contacts: see `FindContacts`.
         driver_log: the driver's decisions.
         penetration_rate: as reported to the CAVs; None: not reported.
+
     """
     last = driver_log.last_observation
     decisions = [tuple(map(as_numpy, decision)) for decision in driver_log.decisions]
@@ -56,6 +55,7 @@ def make_ring_episodes(
         position = motion[1][:, -1]
         # The leader's position is not wrapped: a vehicle that touches its leader may be a little beyond it.
         gaps = np.append(position[1:], position[0] + road.loop_length) - position - VEHICLE_LENGTH
+        # Vehicles that touched may be separate again: a control step has several simulation steps.
         touches = find_contacts(position, gaps, road.loop_length)
         is_touched = np.roll(touches & (gaps < CONTACT_GAP), 1)  # on a crossing, `touches` contains both vehicles
         collisions = max(2 * int(has_crashed), int((touches | is_touched).sum()))

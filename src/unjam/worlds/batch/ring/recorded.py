@@ -15,10 +15,7 @@ from unjam.worlds.ordered_road import without_loop
 
 
 class RecordedBatch(RingBatch):
-    """W recorded roads of one platoon, each with its own seed and recording; they equal SUMO's except for rounding.
-
-    After the end of its recording, a road is simulated behind a vehicle of constant speed, and no longer counted.
-    """
+    """W recorded roads of one platoon, each with its own seed and recording; they equal SUMO's except for rounding."""
 
     _road_arrays = (*RingBatch._road_arrays, "_next_samples", "_road_ends")
 
@@ -33,6 +30,7 @@ class RecordedBatch(RingBatch):
         super().__init__(scenarios, seeds, to_array, **options)
         recorded = [np.asarray(road.replayed_speeds) for road in self.roads]
         longest = max(map(len, recorded))
+        # After the end of its recording, a road is simulated behind a vehicle of constant speed, and no longer counted.
         padded = [np.pad(speeds, (0, longest - len(speeds)), "edge") for speeds in recorded]
         self._replayed_speeds, self._next_samples = to_array(np.stack(padded, 1)), to_array(np.ones(len(recorded)))
         self._columns = np.arange(len(recorded))

@@ -1,8 +1,8 @@
-"""W rings as one world, stepped as arrays without the simulator.
+"""W rings as one world, stepped as arrays of shape (vehicles, W), in road order, without the simulator.
 
-Arrays have the vehicles of a ring along their first axis, in road order, and the rings along their second. The first
-row of the vehicles' speeds is repeated at the end, so that the leaders' speeds are a slice. The CAVs' rows are those of
-the first CAV of every ring, then of the second one, and so on.
+The first row of the vehicles' speeds is repeated at the end, so that the leaders' speeds are a slice. The CAVs' rows
+are those of the first CAV of every ring, then of the second one, and so on.
+
 """
 
 from collections.abc import Collection, Sequence
@@ -61,8 +61,8 @@ class WarmUpState(NamedTuple):
 class RingBatch:
     """W closed roads of one kind, each with its own seed; rings equal SUMO's except for rounding.
 
-    With quick noise, human drivers follow only the vehicle ahead. In SUMO they also look at the last vehicle of the
-    next lanes, see `unjam.worlds.batch.human_idm`.
+    With quick noise, human drivers follow only the vehicle ahead, and not also the last ones on the next lanes.
+
     """
 
     is_scalar, remaining_rows = False, None
@@ -168,8 +168,8 @@ class RingBatch:
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
         """Run the warm-up, unless `warm_up_states` are set; then hand the CAVs over, unless they stay human.
 
-        Return what the CAVs observed at the control steps of the last minute of the warm-up, NumPy arrays of shape
-        (CAVs * W, moments), oldest first; None without a warm-up that may be remembered.
+        Return what the CAVs observed in the last minute of the warm-up, NumPy arrays of shape (CAVs * W, moments),
+        oldest first; None without a warm-up that may be remembered.
         """
         history = self._restore(self.warm_up_states) if self.warm_up_states else self._drive_warm_up()
         if bool(self.crashed_roads.any()):
@@ -223,8 +223,8 @@ class RingBatch:
     def replace_roads(self, roads: Any, source: Self, source_roads: Any) -> None:
         """Continue on some roads with those of another batch that has just been started; one CAV on each.
 
-        `roads` and `source_roads` are lists of equal length. Both batches keep no record, and have the same kind of
-        arrays, noise and scenario.
+        Both batches keep no record, and have the same kind of arrays, noise and scenario.
+
         """
         for name in self._road_arrays:
             setattr(self, name, replace_columns(getattr(self, name), roads, getattr(source, name), source_roads))
