@@ -15,7 +15,6 @@ class RoadAgents(ParallelEnv[str, Any, Any]):
     """Agents of a road, each with the spaces of one CAV; nothing is drawn."""
 
     def __init__(self, road: RoadStepper, possible_agents: Iterable[str]) -> None:
-        """Give all agents their spaces; there are none before the first reset."""
         self._road, self.render_mode = road, None
         self.possible_agents, self.agents = list(possible_agents), []
         self.observation_spaces = {agent: deepcopy(road.observation_space) for agent in self.possible_agents}
@@ -37,7 +36,6 @@ class RoadAgents(ParallelEnv[str, Any, Any]):
 
     @staticmethod
     def _check_actions(actions: object) -> None:
-        """Raise `InputError` unless the actions of a step are a dict."""
         if not isinstance(actions, Mapping):
             raise invalid_value("step: actions", actions, "a dict with an action for each agent")
 

@@ -173,11 +173,8 @@ def fit_drivers(
 ) -> Population:
     """Calibrate a population with a driver for each driver of `trajectories`.
 
-    The parameters minimize the error of the gap that is simulated behind the recorded leader. A residual is used only
-    if it reduces this error for validation drivers.
-
-    Raises:
-        InputError: there are too few drivers for a residual, the time steps differ, or a simulated gap is not finite.
+    A residual is used only if it reduces the error of simulated gaps for validation drivers. Raise `InputError` if
+    there are too few drivers for it, the time steps differ, or a simulated gap is not finite.
     """
     settings = settings or FitDriversSettings()
     for name in settings.individual:
@@ -213,11 +210,7 @@ def _calibrate_in_rounds(
     settings: FitDriversSettings,
     on_progress: DriverProgress,
 ) -> tuple[IDMParameters, dict[str, CalibratedIDM]]:
-    """Return the common IDM and the IDM of each driver, by name; both are calibrated in turn.
-
-    One IDM that is calibrated to drivers with different time headways reacts too weakly. Therefore the common
-    parameters are calibrated with individual time headways, and the common time headway is calibrated at the end.
-    """
+    """Return the common IDM and that of each driver, calibrated in turn: one IDM for all reacts too weakly."""
     groups = [[each for each in trajectories if each.driver == name] for name in names]
     has_own_headways = "time_headway" in settings.individual
     weights = (0.0, 1.0 if has_own_headways else 0.0)

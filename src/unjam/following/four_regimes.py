@@ -72,8 +72,7 @@ class FourRegimesSettings:
 def make_four_regimes(settings: FourRegimesSettings) -> list[FollowingTrajectory]:
     """Return trajectories with `settings.samples` accelerations in total; their `kind` is the name of their regime.
 
-    Successive trajectories have the regimes in the order of `REGIMES`. The speed of the leader is constant. The initial
-    gap is that with which the driver has the initial acceleration of the regime.
+    Regimes are in the order of `REGIMES`. Leaders have constant speeds; initial gaps give the regime's acceleration.
     """
     generator = np.random.default_rng(settings.seed)
     length = max(1, round(settings.seconds / settings.time_step))

@@ -1,8 +1,7 @@
 """Networks as driver models: alone (`vanilla`), or as a residual added to a base (`knowledge`, Eq. 4 of the paper).
 
-The loss of `fit_one_step` is the error of single accelerations; small errors can accumulate when such a network drives.
-The loss of `fit_multi_step` is the error of the gap in a simulation behind the recorded leader; the gradient passes
-through all steps.
+`fit_one_step` fits single accelerations, small errors of which can accumulate; `fit_multi_step` fits the gap in a
+simulation behind the recorded leader, with the gradient through all steps.
 """
 
 import itertools
@@ -141,11 +140,8 @@ def fit_one_step(
 ) -> tuple[FollowingNetwork, LossHistory]:
     """Fit a network to the accelerations of single samples, minus those of the base if there is one.
 
-    The network has the weights of the epoch with the smallest error on `validation`. `seed` determines the initial
-    weights and the order of the samples.
-
-    Raises:
-        UnjamError: a loss is not finite.
+    It has the weights of the epoch with the smallest error on `validation`. Raises `UnjamError` if a loss is not
+    finite.
     """
     torch.set_num_threads(1)
     network = FollowingNetwork(settings, samples, seed)
@@ -206,15 +202,9 @@ def fit_multi_step(
 ) -> tuple[FollowingNetwork, list[float]]:
     """Return a residual for calibrated drivers that reduces the difference between simulated and recorded gaps.
 
-    With it come the RMS gap errors at each validation, averaged over the validation trajectories [m]; the first is that
-    of the base.
-
-    The initial residual is zero. The network has the weights with the smallest error on uncut `validation`
-    trajectories, possibly the initial ones. `limits` are those of the acceleration [m/s2]; `seed` determines the
-    initial weights and the order of the segments.
-
-    Raises:
-        UnjamError: a loss is not finite.
+    It starts at zero, and has the weights with the smallest error on uncut `validation` trajectories. With it come the
+    mean RMS gap errors at each validation [m], first of the base. `limits` are those of the acceleration [m/s2]. Raises
+    `UnjamError` if a loss is not finite.
     """
     torch.set_num_threads(1)
     network = FollowingNetwork(settings, following_samples(training.trajectories), seed, zero_init=True)

@@ -65,10 +65,7 @@ class ModelRollouts:
         }
 
     def roll_out(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Experience | None:
-        """Return experience of the policy `network` in the model; None if k* is too short, or there is none.
-
-        All `parts` of an iteration together have `model_ratio` times as many control steps as its environment episodes.
-        """
+        """Return one of `parts` of the experience of `network` in the model; None if k* is too short."""
         model, driver = self.world_model, full_policy(self.task, self.spec.policy, network)
         control_steps = int(min(self.k_star, model.max_control_steps)) // driver.action_repeat * driver.action_repeat
         seed, *seeds = (self._seed(iteration, purpose, part) for purpose in (STARTS_SEED, NOISE_SEED, EXPLORATION_SEED))

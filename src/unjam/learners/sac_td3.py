@@ -122,7 +122,6 @@ class OffPolicyLearner(SB3Learner):
     def __init__(
         self, spec: AgentSpec, settings: OffPolicySettings, algorithm: type, policy: type[BasePolicy], **kwargs: Any
     ) -> None:
-        """Make SB3's algorithm; `kwargs` are its own beyond those that `settings` share."""
         super().__init__(
             spec,
             algorithm,
@@ -216,7 +215,6 @@ class SAC(OffPolicyLearner):
         return Normal(mean.squeeze(1), log_std.squeeze(1).exp())
 
     def _shared_tensors(self) -> Tensors:
-        """Return the filled part of the replay buffer and, if it is learned, the temperature."""
         learned = {} if self.sb3.log_ent_coef is None else {"log_ent_coef": self.sb3.log_ent_coef}
         return super()._shared_tensors() | learned
 

@@ -1,8 +1,7 @@
 """The road model of motorways: the batch's human drivers with known entry times, plus what networks learn.
 
-The base is the batch: each vehicle's own driver model and lane changes. Perception errors are noise. One ensemble
-learns the rest, where vehicles keep their lane, from samples of environment episodes: vehicles are stepped
-once as the base does, and the remaining difference in speed is the target.
+Perception errors are noise. One ensemble learns the rest where vehicles keep their lane: in samples of environment
+episodes, vehicles are stepped once as the base does, and the remaining difference in speed is the target.
 """
 
 from collections.abc import Callable, Sequence
@@ -143,10 +142,7 @@ def _speeds_after_step(
 def learned_correction(
     model: RoadModel, generator: torch.Generator, steps: int, has_noise: bool = True
 ) -> LearnedCorrection | None:
-    """Return what the model adds to the speeds of the batch's human drivers in a control step of `steps` steps.
-
-    With the base `none` it replaces the batch's car following, and perception errors by noise of the same strength.
-    """
+    """Return what the model adds to human drivers' speeds in a control step; base `none` replaces all but noise."""
     residual = residual_function(model, generator)
     if model.base != "none":
         return residual
@@ -163,10 +159,7 @@ def learned_correction(
 def fit_motorway_model(
     model: RoadModel, samples: Sequence[MotorwaySamples], settings: ModelSettings, seed: Seed, group_size: int = 1
 ) -> ModelFit:
-    """Fit `model` to what the base leaves, see `fit_human_model`; perception errors do not count as model error.
-
-    `group_size` consecutive episodes have the same vehicles, and are held out together.
-    """
+    """Fit `model` as `fit_human_model`; `group_size` consecutive episodes with equal vehicles are held out together."""
     rows = HumanRows(*(np.concatenate(parts) for parts in zip(*(each.human_rows for each in samples), strict=True)))
     rows = rows._replace(episode=rows.episode // group_size)
     sigma = float(np.sqrt(np.mean([each.noise_variance for each in samples])))

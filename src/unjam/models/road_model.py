@@ -1,8 +1,7 @@
 """The road model: samples of whole closed roads, and the human drivers on them as a base plus one learned ensemble.
 
-All human drivers differ from the base in the same way: one ensemble learns it from all of them. SUMO's drivers add
-noise after they have moved, so that their distance gives the intended speed. Noise moves commanded drivers too: only
-its strength is known. Steps in which the known right of way constrains a driver are not used for training.
+SUMO's drivers add noise after they have moved, so that their distance gives the intended speed. Noise moves commanded
+drivers too: only its strength is known. Steps in which the right of way constrains a driver are not used.
 """
 
 from collections.abc import Sequence
@@ -157,7 +156,6 @@ def base_human_model(base: str, scenario: Scenario) -> HumanSpeedModel:
 
 
 def _inputs(*columns: Array) -> Tensor:
-    """Return the inputs of the networks, shape (R, 4), for vehicles of any shape."""
     flat = [values.ravel() for values in columns]
     return torch.from_numpy(np.stack(flat, 1)) if isinstance(flat[0], np.ndarray) else torch.stack(flat, 1)
 
@@ -238,9 +236,9 @@ def fit_human_model(
 ) -> ModelFit:
     """Fit `model` further, in place, to the residual of the base of the rows' intended speeds, see `fit_ensemble`.
 
-    The errors are those of `ModelFit` for the speed alone. `sigma` is the standard deviation of the rows' noise [m/s];
-    unless the intended speeds are without noise (`is_noise_known`), its variance is subtracted from the mean squared
-    errors. Networks are used if they reduce the base's mean squared error by the share `min_error_reduction`.
+    `sigma` is the standard deviation of the rows' noise [m/s]; unless the intended speeds are without noise, its
+    variance is subtracted from squared errors. Networks must reduce the base's squared error by the share
+    `min_error_reduction`.
     """
     generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
     is_holdout = is_holdout_episode(rows.episode, settings.holdout)

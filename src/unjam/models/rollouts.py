@@ -116,8 +116,7 @@ class ModelTransition(NamedTuple):
 class ModelDynamics:
     """Base plus residual of a random member of the ensemble in each step, Eq. 4, for state and reward.
 
-    Noise is a random holdout error of the model, drawn independently for each row and step: it has their standard
-    deviations, correlations and tails. Noise alone never causes a collision.
+    Noise is a random holdout error of the model for each row and step; it alone never causes a collision.
     """
 
     def __init__(
@@ -135,10 +134,7 @@ class ModelDynamics:
         self._reward = tensor_reward(reward or scenario.reward)
 
     def step(self, state: LocalState, acceleration: Tensor, drawn_values: Tensor) -> ModelTransition:
-        """Return the transitions under `acceleration` [m/s2], (n,), which the safety filter limits.
-
-        `drawn_values`, (n, m), are those that the rows' episodes drew.
-        """
+        """Return the transitions under `acceleration` [m/s2], (n,), with `drawn_values`, (n, m), of the episodes."""
         scenario = self._scenario
         acceleration = scenario.safety.limit(acceleration, FollowingState(*state[:3]), scenario.control_step)
         base_state = base_step(self._model.base, scenario, state, acceleration)
@@ -198,9 +194,8 @@ def rollout_length(eps_m: float, settings: ModelSettings) -> int:
 def return_bound(eps_pi: float, eps_m: float, k: int, gamma: float, max_reward: float) -> float:
     """Return C, the bound on model return minus environment return (paper, below Eq. 13).
 
-    `eps_pi` is the total variation between the policy and the one that collected the data, `eps_m` that between next
-    states of model and environment; `k` the rollout length, `gamma` the discount and R_max the largest |reward| of
-    control steps.
+    `eps_pi` is the total variation of the policy since the data, `eps_m` that of next states in the model; `k` the
+    rollout length, `gamma` the discount of control steps.
     """
     horizon = 1.0 / (1.0 - gamma)
     policy_term = gamma ** (k + 1) * eps_pi * horizon**2 + gamma**k * eps_pi * horizon
@@ -365,8 +360,7 @@ def roll_out(
 ) -> RolloutBatch:
     """Drive the full policy in the model for `control_steps`, rounded down to whole actions of the network.
 
-    `generator` draws the exploration noise; None: no exploration. Raises `UnjamError` if the model, or `InputError`
-    if a driver of the user, returns a value that is not finite.
+    `generator` draws the exploration noise, if any. Raises `UnjamError` or `InputError` for values that are not finite.
     """
     speed, repeat = starts.state.speed, driver.action_repeat
     driver = replace(driver, expert=tensor_driver(driver.expert, speed.device))

@@ -71,10 +71,7 @@ class WholeRoadModel(WorldModel[RoadModel, SamplesT]):
         raise NotImplementedError
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:
-        """Return a holdout episode as recorded, in the model, and in its base alone, as facts for `model.json`.
-
-        `run_episode` runs an episode where environment episodes run.
-        """
+        """Return a holdout episode as recorded, in the model, and in its base alone, as facts for `model.json`."""
         raise NotImplementedError
 
     def roll_out(self, plan: RolloutPlan) -> Iterator[Rollouts]:
@@ -128,10 +125,7 @@ class ClosedRoadModel(WholeRoadModel[RoadSamples]):
         human_model: HumanSpeedModel,
         seed: Seed,
     ) -> list[Episode]:
-        """Return the episodes that follow recorded states; `seed` is that of all noise, and of sensor errors.
-
-        `driver` controls all CAVs and explores; its `memory` has all rows of the first CAV, then of the second.
-        """
+        """Return the episodes that follow recorded states; `memory` has all rows of the first CAV, then the next."""
         road = cast(LoopScenario, self.scenario)
         by_episode = {each.episode: each for each in self.samples}
         samples = [by_episode[self.data.recordings[index].episode] for index, _ in start_indices]

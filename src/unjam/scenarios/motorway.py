@@ -220,10 +220,7 @@ class Motorway(Scenario):
 
     @property
     def free_flow_time(self) -> float:
-        """Mean travel time of human drivers in free flow [s]: as measured, or at the speed limits.
-
-        At the speed limits, it is the mean of all routes, weighted with their demand before and after the peak.
-        """
+        """Mean travel time of human drivers in free flow [s]: as measured, or at speed limits, by off-peak demand."""
         geometry = self.geometry
         if measured := FREE_FLOW_TIMES.get(geometry._replace(vehicle_length=0.0)):
             return measured
@@ -241,17 +238,13 @@ class Motorway(Scenario):
         return ("allowed_speed", *to_merge, *ahead, "adjacent_gaps", "adjacent_speeds", "penetration_rate")
 
     def _select_cavs(self, draws: dict[str, float]) -> frozenset[str]:
-        """Return the CAVs: the vehicles with the lowest draws."""
         if self.cavs is None:
             return frozenset(name for name, draw in draws.items() if draw < self.penetration_rate)
         early = sorted(list(draws)[: len(draws) // 2], key=draws.__getitem__)
         return frozenset(early[: self.cavs])
 
     def _draw_types(self, generator: np.random.Generator) -> tuple[dict[str, VehicleType], Callable[[str], str]]:
-        """Return all vehicle types, and a function that replaces a human driver's type by that of a truck or an ACC.
-
-        What other settings draw, on a generator of their own, does not change the cars with human drivers.
-        """
+        """Return all vehicle types, and a function that replaces types by trucks or ACCs by draws of its own."""
         (others,) = generator.spawn(1)
         humans = {f"human_type_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
         lane_changing, trucks, acc = self.lane_changing, self.trucks, self.ordinary_acc
@@ -354,7 +347,6 @@ class Motorway(Scenario):
 
 
 def _with_acc(human_type: str) -> str:
-    """Return the name of the vehicle type of a human driver's car with an ordinary ACC."""
     return f"acc_{human_type}"
 
 

@@ -119,14 +119,12 @@ class Recorded(Scenario):
 
     @cached_property
     def _longest_recording(self) -> float:
-        """Duration of the longest recording [s]."""
         if not self.recordings:
             return ARTIFICIAL_SECONDS
         return max(each.seconds for each in self._leaders)
 
     @cached_property
     def _leaders(self) -> list[LeaderRecording]:
-        """All recordings of all files."""
         from unjam.recordings.leader_files import read_leaders
 
         files, found, problems = recording_files(Path(self.recordings)), list[LeaderRecording](), list[str]()

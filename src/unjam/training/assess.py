@@ -1,7 +1,6 @@
 """Assessment of CAVs on a user's network: controllers at several penetration rates, compared with two baselines.
 
-The baselines are human drivers alone, and ACC vehicles without a controller. A controller is selected for each
-penetration rate on selection seeds and tested on others; a rule decides whether it is recommended.
+These are human drivers alone, and ACC vehicles without a controller.
 """
 
 import json
@@ -121,10 +120,7 @@ def make_request(
     drivers: Sequence[str] = DEFAULT_CONTROLLERS,
     options: dict[str, Any] | None = None,
 ) -> AssessmentRequest:
-    """Return a checked request; raise `InputError` if an argument is wrong.
-
-    The human baseline is always included, with or without a penetration rate of 0.
-    """
+    """Return a checked request, with the human baseline; raise `InputError` if an argument is wrong."""
     if not file.endswith(".sumocfg"):
         raise invalid_value("scenario", file, "your own .sumocfg file")
     for name in [name for name in options or {} if name in CAV_SELECTION_OPTIONS]:
@@ -175,11 +171,11 @@ def assess(
     progress: Callable[[Any, int], None] | None = None,
     on_message: MessageCallback = lambda line: None,
 ) -> Assessment:
-    """Run an assessment, and write rows, `assessment.json` and the page into a new folder.
+    """Run an assessment, and write rows, `assessment.json` and the page into a new folder, at its end.
 
-    Files are written at the end. Without `minutes`, the result does not depend on the number of workers. `progress` is
-    called repeatedly with the control steps of an episode, `on_message` with a line for each batch of episodes. Raise
-    `InputError` if the folder is not empty, or no driver can drive on this road.
+    Without `minutes`, the result does not depend on the number of workers. `progress` is called with the control steps
+    of an episode, `on_message` with a line for each batch. Raise `InputError` if the folder is not empty, or no driver
+    can drive on this road.
     """
     make_new_folder(folder)
     budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()

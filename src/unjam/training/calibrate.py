@@ -1,7 +1,6 @@
 """Calibration of the human drivers and the demand of a user's network, so that detectors measure what they did.
 
-`unjam calibrate`, with Optuna, in SUMO. It varies factors on the values in the network's own files, so that differences
-between vehicle types remain. Tuning seeds select the factors, test seeds evaluate them.
+It varies factors on the values in the network's own files, so that differences between vehicle types remain.
 """
 
 import re
@@ -107,15 +106,10 @@ class Corridor:
 
 
 def load_corridor(file: str, detectors: Path, begin: float | None = None, end: float | None = None) -> Corridor:
-    """Return a network and its detector measurements, both checked.
+    """Return a network, a .sumocfg file, and its detector measurements, a CSV file, from `begin` to `end` [s].
 
-    Args:
-        file: a .sumocfg file.
-        detectors: a CSV file, as for `measures.detectors.read_detectors`.
-        begin: start time [s]; None: that of the configuration.
-        end: end time [s]; None: that of the configuration, or of the last interval.
-
-    Raise `InputError` if an argument is wrong, a detector is not on the network, or nothing can be varied.
+    None: times of the configuration, or of the last interval. Raise `InputError` if an argument is wrong, a detector is
+    not on the network, or nothing can be varied.
     """
     if not file.endswith(".sumocfg"):
         raise invalid_value("scenario", file, "your own .sumocfg file")
@@ -170,7 +164,7 @@ def _detector_loops(network: Path, kind: str, row: Measurement) -> list[Inductio
 def scale_vehicle_types(files: SumoFiles, factors: CalibrationFactors) -> dict[str, dict[str, str]]:
     """Return the changed attributes of all passenger types multiplied by `factors`, by id.
 
-    A reaction time never falls below the simulation step, because vehicles would collide. Raise `InputError` if an
+    Reaction times stay at least as long as the simulation step, or vehicles would collide. Raise `InputError` if an
     attribute is not a number.
     """
     scaled: dict[str, dict[str, str]] = {}
@@ -198,10 +192,7 @@ def _scale_attribute(field: str, text: str, factor: float, minimum: float) -> st
 
 
 def parse_factor_space(texts: list[str]) -> SearchSpace:
-    """Return a search space from texts `tau=0.5..2` or `tau=0.5..2:log`; without any, `FACTOR_RANGES`.
-
-    Raise `InputError` for unknown names and for values that are not positive ranges.
-    """
+    """Return a search space from `tau=0.5..2` or `tau=0.5..2:log`, without any `FACTOR_RANGES`; or `InputError`."""
     space: SearchSpace = {}
     for name, values in (parse_search_space(texts) if texts else FACTOR_RANGES).items():
         if name not in FACTOR_RANGES:

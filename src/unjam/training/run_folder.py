@@ -1,7 +1,7 @@
 """The folder of a run: its creation, resumption and checkpoints.
 
-torch is only imported to read or write a checkpoint, so that errors are reported quickly. A checkpoint is a file that
-is written at the end of each iteration, and named by iteration and hash; the newest two are kept.
+A checkpoint is written after each iteration, and named by iteration and hash; the newest two are kept. torch is only
+imported for checkpoints, so that errors are reported quickly.
 """
 
 import json
@@ -129,10 +129,7 @@ def _check_row_model(config: RunConfig, scenario: Scenario, expert: Driver) -> N
 
 
 def make_new_folder(folder: Path, alternative: str = "") -> None:
-    """Make a folder; raise `InputError` if it is not empty. `alternative` is what else is allowed, for the message.
-
-    Leftovers of a process that was killed before it had written anything do not count.
-    """
+    """Make a folder, or raise `InputError` if it has more than leftovers; the message names an `alternative`."""
     try:
         if folder.exists() and not (
             folder.is_dir() and all(is_leftover(path) or path.name == LOCK_FILE for path in folder.iterdir())
@@ -146,10 +143,7 @@ def make_new_folder(folder: Path, alternative: str = "") -> None:
 
 @contextmanager
 def lock_new_folder(folder: Path, resumable_file: str = "") -> Iterator[None]:
-    """Make a folder and lock it for this process; remove it if it stays empty.
-
-    Raise `InputError` if it is locked, or not empty and without the file `resumable_file`.
-    """
+    """Make and lock a folder, and remove it if it stays empty; `InputError` if locked, or used and not resumable."""
 
     def check() -> None:
         if not (resumable_file and (folder / resumable_file).is_file()):
@@ -197,8 +191,8 @@ def _write_manifest(folder: Path) -> None:
 def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
     """Return the configuration of a run folder; raise `InputError` if it is none, or of another format.
 
-    Also if the configuration names untrusted Python code: without `check_trust` only if its roads do, whose code runs
-    here; nothing else of it may be run then.
+    Also if it names untrusted Python code: without `check_trust` only if its roads do, and no other code may be run
+    then.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
@@ -289,10 +283,9 @@ def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> 
 def restore_newest_checkpoint(
     folder: Path, progress_folders: Iterable[Path], expected: dict[str, Any] | None = None
 ) -> "tuple[dict[str, Any], Tensors] | None":
-    """Return the newest checkpoint of a run; None before the first one.
+    """Return the newest checkpoint of a run, and remove everything later; None before the first one.
 
-    Everything later is removed: rows of progress in `progress_folders`, and incomplete files. Raise `InputError` if no
-    checkpoint is valid, or if its fingerprint differs from the `expected` one.
+    Raise `InputError` if no checkpoint is valid, or if its fingerprint differs from the `expected` one.
     """
     checkpoint = load_checkpoint(folder / "checkpoint")
     if checkpoint and expected and "fingerprint" in checkpoint[0]:
@@ -345,7 +338,6 @@ def check_run_files(folder: Path, config: RunConfig, command: str) -> None:
 
 
 def _remove_old_checkpoints(folder: Path) -> None:
-    """Remove all but the newest two checkpoints, and incomplete ones."""
     remove_leftovers(folder)
     for old in _checkpoint_files(folder)[:-MAX_CHECKPOINTS]:
         with suppress(DiskError):

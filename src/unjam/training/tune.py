@@ -1,7 +1,6 @@
 """Tuning of an expert's parameters with as many environment steps as a training: the baseline for trained controllers.
 
-`unjam tune`, with Optuna, on its own seeds, under the same limits and safety filter. Infeasible settings do not count,
-and those that amplify oscillations of the leader more than allowed are not tried.
+Infeasible settings do not count, and those with too large a string gain are not tried.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -220,10 +219,7 @@ def _run_drivers(
     settings: tuple[str, str],
     runners: Mapping[str, TuningRunner],
 ) -> list[dict[str, EpisodeRows]]:
-    """Return the rows of each driver by road, with the runner of the road, on tuning seeds from `first` on.
-
-    `settings` are reward and backend.
-    """
+    """Return the rows of each driver by road on tuning seeds from `first` on; `settings`: reward and backend."""
     results: list[dict[str, EpisodeRows]] = [{} for _ in drivers]
     seeds, (reward, backend) = tuning_seeds(count, first), settings
     for road, scenario in roads.items() if drivers else ():

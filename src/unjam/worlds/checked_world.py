@@ -58,7 +58,6 @@ class CheckedWorld:
     """The world of a user's backend, whose states, speeds and record are checked; all else is that of the backend."""
 
     def __init__(self, world: Any, label: str, scenario: Scenario) -> None:
-        """Take a world that has not started."""
         self._world, self._label, self._scenario = world, label, scenario
         unknown = {"loop_length"} if not scenario.is_closed else set[str]()
         self._finite_fields = set(COMMON_FIELDS) - unknown - (set() if scenario.has_coordinate else {"route_position"})
@@ -112,7 +111,6 @@ class CheckedWorld:
         return array
 
     def _check_finite(self, name: str, values: np.ndarray, ids: Any, step: int | None = None) -> None:
-        """Raise `InputError` unless values of shape (vehicles,) are finite."""
         if not (is_finite := np.isfinite(values)).all():
             row = int(is_finite.argmin())
             raise self._error(f"{name} of {ids[row]} is {values[row]}", "finite", step)
@@ -150,7 +148,6 @@ class CheckedWorld:
             raise self._error(problem, f"{expected[row]:.1f} m, the sum of its speeds")
 
     def _check_last_state(self, episode: Episode) -> None:
-        """Raise `InputError` unless the record ends with the state of the world."""
         ids, state = list(self.cav_ids), self.exact_state()
         rows = {name: row for row, name in enumerate(ids)}
         names = ("speed", "leader_gap", "route_position")

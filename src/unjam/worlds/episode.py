@@ -140,7 +140,6 @@ class _TorchSeeder(MetaPathFinder):
         self._seed = seed
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
-        """Return the specification of torch with a loader that seeds, and None for other modules."""
         if fullname != "torch":
             return None
         self.remove()
@@ -157,7 +156,6 @@ class _TorchSeeder(MetaPathFinder):
         return specification
 
     def remove(self) -> None:
-        """Leave the list of finders."""
         if self in sys.meta_path:
             sys.meta_path.remove(self)
 

@@ -148,7 +148,6 @@ class OpenRoadLog:
     """Speeds, snapshots, CAV trips, braking, backlog and fuel of an episode on a road with ends."""
 
     def __init__(self, scenario: Scenario, names: Sequence[str], speeds: Floats) -> None:
-        """Start with the vehicles on the road now, and their speeds [m/s]."""
         self.traffic, self.trips = TrafficLog(), TripLog()
         self.backlog: list[int] = []
         self.fuel: list[float] = []

@@ -175,7 +175,6 @@ class OrderedRoadLog:
         )
 
     def _audit(self, speeds: Floats, positions: Floats) -> Audit:
-        """Return the audit of every simulation step; arrays of shape (vehicles, moments)."""
         step, time_gap = self.scenario.simulation_step, self.scenario.safety.time_gap
         states = self._local_states(speeds, positions).map(lambda values: values.T)
         followed = states.speed, states.leader_speed, states.leader_gap
@@ -217,7 +216,6 @@ class OrderedRoadRecorder:
     """Collects the rows of a `OrderedRoadLog` while an episode runs; `series` has them by name, one after the other."""
 
     def __init__(self, scenario: Scenario, road: OrderedRoad, start_positions: Floats, speeds: Iterable[float]) -> None:
-        """Start with the positions of front bumpers, not wrapped [m], and the speeds [m/s] of all vehicles."""
         self._arguments = scenario, road, start_positions
         names = "noise_free_speeds", "requested_accelerations", "safe_accelerations", "commanded_speeds"
         self.series = {name: array("d") for name in names} | {"speeds": array("d", speeds)}

@@ -78,7 +78,6 @@ def _nan_mean(values: Array) -> Array:
 
 
 def _nan_sum(values: Array) -> Array:
-    """Sum over the last axis without NaN."""
     if type(values) is float:
         return 0.0 if isnan(values) else values
     xp = namespace(values)

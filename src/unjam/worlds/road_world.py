@@ -76,7 +76,6 @@ class SimulatedRoad(RoadWorld):
     remaining_rows: Sequence[int] | None = None  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def __init__(self, scenario: Scenario, seed: Sequence[int], drawn: DrawnRoad | None = None) -> None:
-        """Draw the road of a seed, unless it is `drawn` already."""
         self.road, (noise_seed, exploration_seed, _, sensor_seed) = drawn or scenario.draw_from_seed(seed)
         self.scenario, self.seed, self.limits = scenario, tuple(seed), scenario.acceleration_limits
         self.has_crashed = False

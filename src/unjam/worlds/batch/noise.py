@@ -41,7 +41,6 @@ class SeededNoise:
     def __init__(
         self, seeds: WorldSeeds, vehicle_count: int, exploration_shape: tuple[int, int], to_array: ArrayFactory
     ) -> None:
-        """Take the numbers of vehicles, and of control steps and CAVs."""
         self._human_generators = [np.random.default_rng(noise) for noise, *_ in seeds]
         self._exploration_seeds = [exploration for _, exploration, *_ in seeds]
         self._block = np.empty((len(seeds), NOISE_BLOCK_STEPS, vehicle_count))

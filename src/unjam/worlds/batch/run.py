@@ -84,7 +84,6 @@ def run_batch(
 def _run_at_once(
     tasks: Sequence[EpisodeTask], to_array: ArrayFactory, upcoming: Sequence[EpisodeTask], allow_statistical: bool
 ) -> Sequence[Episode]:
-    """Return the episodes of tasks without rewards; arguments as of `run_batch`."""
     first, scenarios = tasks[0], [task.scenario for task in tasks]
     for task in tasks:
         check_can_drive(task.driver, task.scenario)
@@ -159,7 +158,6 @@ def warm_up_states(keys: Sequence[_WarmUpKey], upcoming: Sequence[_WarmUpKey]) -
 
 
 def _warm_up(keys: Sequence[_WarmUpKey]) -> dict[_WarmUpKey, WarmUpState]:
-    """Return the states of rings of one class after their warm-up, simulated in batches."""
     states, size = dict[_WarmUpKey, WarmUpState](), support.required_batch_kind(keys[0][0]).max_roads
     for first in range(0, len(keys), size):
         batch = keys[first : first + size]

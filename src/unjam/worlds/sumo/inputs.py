@@ -185,7 +185,6 @@ def _idm_attributes(parameters: IDMParameters) -> XMLAttributes:
 
 
 def _single_lane_cav_attributes(scenario: Scenario) -> XMLAttributes:
-    """Return the attributes of the CAVs on a road with one lane."""
     if scenario.actuation == "flow":  # without a gap CAVs would creep up to contact
         attributes = _human_attributes(scenario, scenario.humans)
         return {"color": SUMO_CAV_COLOR, **attributes, "minGap": max(attributes["minGap"], MIN_CAV_GAP)}
@@ -204,8 +203,8 @@ def _cav_attributes(scenario: Scenario) -> XMLAttributes:
             "decel": cruise.deceleration,
             "minGap": cruise.minimum_gap,
         }
-    # Such a Krauss vehicle follows commands until one would lead to a crash. With a safety filter, it has a car's limits,
-    # which other vehicles expect, and SUMO only makes it yield.
+    # Such a Krauss vehicle follows commands until one would lead to a crash. With a safety filter, it has a car's
+    # limits, which other vehicles expect, and SUMO only makes it yield.
     car_acceleration = max(SUMO_ACCELERATION, scenario.acceleration_limits.highest)
     return {
         "color": SUMO_CAV_COLOR,

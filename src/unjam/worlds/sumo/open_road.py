@@ -92,11 +92,9 @@ class OpenTraffic(Traffic[OpenRoadT]):
     # What the kinds of roads do in their own way:
 
     def _network_file(self) -> Path:
-        """Return SUMO's network file."""
         return network_file(cast(BuiltRoad, self.road).network)
 
     def _is_cav(self, name: str) -> bool:
-        """Return whether a vehicle that has just entered is a CAV."""
         return name in self.road.cav_ids
 
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
@@ -106,7 +104,6 @@ class OpenTraffic(Traffic[OpenRoadT]):
         """Command the speeds of human drivers, unless SUMO drives them."""
 
     def _command_cavs(self, speeds: dict[str, float]) -> None:
-        """Command the speeds of CAVs after the next step [m/s]."""
         self._simulation.command_speeds(speeds.keys(), speeds.values())
 
     def _collisions(self) -> tuple[Sequence[str], bool]:
@@ -139,7 +136,6 @@ class OpenTraffic(Traffic[OpenRoadT]):
         return {name: self._log.traffic.snapshots(name, columns) for name in names}
 
     def _branches(self, vehicles: Sequence[str]) -> Sequence[str]:
-        """Return the origin of each vehicle; empty if unknown."""
         return [""] * len(vehicles)
 
     def _make_log(self) -> OpenRoadLog:
@@ -224,7 +220,6 @@ class OpenTraffic(Traffic[OpenRoadT]):
         return speeds, safe
 
     def _simulate(self, cav_speeds: dict[str, float]) -> None:
-        """Simulate one step with these commanded speeds of CAVs [m/s]."""
         self._command_humans()
         self._command_cavs(cav_speeds)
         self._simulation.step()

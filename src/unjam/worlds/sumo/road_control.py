@@ -41,7 +41,6 @@ class RampControl:
     def __init__(
         self, simulation: Simulation, speed_caps: SpeedCaps, scenario: Motorway, ramp: RampGeometry, ramp_edge: str
     ) -> None:
-        """Start with an unlimited speed and no metering."""
         self._simulation, self._speed_caps, self._ramp, self._edge = simulation, speed_caps, ramp, ramp_edge
         self._limits, self._meter = scenario.speed_limit_control, scenario.ramp_meter
         self._lanes, self._speed_limit, self._step = scenario.lanes, scenario.speed_limit, scenario.simulation_step

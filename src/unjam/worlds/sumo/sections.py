@@ -89,7 +89,6 @@ class RoadsideService:
     """Roadside information for CAVs; in a junction, that of the last lane before it."""
 
     def __init__(self, simulation: Simulation, messages: RoadsideMessages, step: float) -> None:
-        """Start without measurements; `step` is the time between two measurements [s]."""
         self._simulation, self._messages, self._sections = simulation, messages, LaneSections(simulation)
         self._monitor = CongestionMonitor(1 + int(self._sections.cross_sections.max()), step)
         self._last_sections: defaultdict[str, list[int]] = defaultdict(lambda: [NO_SECTION] * SECTIONS_AHEAD)

@@ -248,7 +248,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         return list(zip(map(self._sumo.vehicle.getSpeedFactor, ids), map(self.max_speed, ids), strict=True))
 
     def neighbors(self, name: str, max_distance: float) -> NeighborStates:
-        """Return a vehicle's neighbors as SUMO sees them; beyond `max_distance` [m], with this gap and its own speed."""
+        """Return a vehicle's neighbors as SUMO sees them; beyond `max_distance` [m], this gap and its own speed."""
         vehicle, speed = self._sumo.vehicle, self._get_speed(name)
         leader, leader_gap = vehicle.getLeader(name, max_distance) or ("", 0.0)
         follower, follower_gap = vehicle.getFollower(name, max_distance)

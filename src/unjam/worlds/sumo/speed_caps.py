@@ -10,7 +10,6 @@ class SpeedCaps:
     """The caps of all vehicles; a vehicle without one has its own maximum speed."""
 
     def __init__(self, simulation: Simulation) -> None:
-        """Start without caps."""
         self._simulation = simulation
         self._caps: dict[str, dict[Hashable, float]] = {}
         """caps by vehicle and source [m/s]"""

@@ -42,7 +42,6 @@ class Traffic(SimulatedRoad, Generic[RoadT]):
         options: WorldOptions,
         drawn: DrawnRoad | None = None,
     ) -> None:
-        """Put the vehicles on the road; nothing moves yet."""
         super().__init__(scenario, seed, drawn)
         self.options, self._simulation = options, simulation
         simulation.load(self.inputs(scenario, self.road), scenario.simulation_step, sumo_seed(self.seed))

@@ -156,7 +156,6 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         return states
 
     def _neighbors(self, name: str) -> NeighborStates:
-        """Return a vehicle's neighbors; SUMO computes them once per step."""
         if name not in self._cached_neighbors:
             self._cached_neighbors[name] = self._simulation.neighbors(name, MAX_OBSERVED_GAP)
         return self._cached_neighbors[name]

@@ -155,7 +155,6 @@ class BatchMotorways:
         correction: LearnedCorrection | None = None,
         steps_per_control_step: int = 1,
     ) -> None:
-        """Take empty roads; `correction` is that of a control step."""
         self._correction, self._steps_per_control_step = correction, steps_per_control_step
         self.geometry = roads[0].geometry
         columns = dict.fromkeys(MotorwayVehicles._fields, np.zeros(0)) | {"is_eidm": np.zeros(0, bool)}

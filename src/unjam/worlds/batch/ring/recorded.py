@@ -26,7 +26,6 @@ class RecordedBatch(RingBatch):
         to_array: ArrayFactory = np.asarray,
         **options: Any,
     ) -> None:
-        """Put the vehicles on the roads; arguments as of `RingBatch`."""
         super().__init__(scenarios, seeds, to_array, **options)
         recorded = [np.asarray(road.replayed_speeds) for road in self.roads]
         longest = max(map(len, recorded))
