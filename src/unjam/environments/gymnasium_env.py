@@ -82,7 +82,6 @@ class RoadStepResult(NamedTuple):
     reward: float
     reward_terms: dict[str, float]
     terminated: bool
-    """whether there was a collision"""
     truncated: bool
     """whether the horizon is reached, or no CAV will be on the road again"""
 
@@ -110,7 +109,6 @@ class RoadStepper:
         """that of the constructor; `episode_scenario` is that of the last reset, with its options"""
         reward = reward or self.scenario.reward
         self._reward, self.has_user_reward = make_reward(reward), not is_packaged_reward(reward)
-        """whether the reward is a user's function"""
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
         inputs = as_features(features)
         if not expert and (useless := [name for name in ("expert_acceleration", "expert_memory") if name in inputs]):
@@ -127,7 +125,6 @@ class RoadStepper:
         self._backend_context, self._world_context = ExitStack(), ExitStack()
         bound = np.full(observation_size(self._driver.features, driver), MAX_OBSERVATION, np.float32)
         self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
-        """observation space of one CAV"""
         low, high = (np.full(1, limit, np.float32) for limit in self.scenario.acceleration_limits)
         self.action_space = spaces.Box(low, high, dtype=np.float32)
         """action space of one CAV: an acceleration [m/s2]"""

@@ -95,7 +95,6 @@ CALIBRATION_GRID_SIZE = 32
 CALIBRATION_TOLERANCE = 1e-3
 """absolute tolerance of the search for a single parameter, in the unit of the parameter"""
 CAV_FOLLOWER_SETTINGS = CalibrationSettings(candidates=4, generations=40)
-"""settings of `calibrate_human_drivers`"""
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,6 @@ MIN_RESIDUAL_DRIVERS = 5
 MIN_SUSPICIOUS_PARAMETERS = 3
 """number of parameters at a bound from which on a warning suspects wrong units or data"""
 FILTER_FIELDS = ("kind", "split", "driver")
-"""fields by which trajectories can be selected"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -45,7 +44,6 @@ class FitDriversSettings:
     """Settings for the calibration of a population."""
 
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
-    """settings of each calibration of the IDM"""
     individual: Annotated[tuple[str, ...], Field(min_length=1)] = ("time_headway",)
     """names of the IDM parameters that are individual; the others are the same for all drivers. On NGSIM, calibrated to
     half a minute of each driver, individual time headways predict the other half better than one IDM for all drivers;
@@ -55,7 +53,6 @@ class FitDriversSettings:
     residual: bool = False
     """whether a network learns an acceleration that is added to the IDM of every driver"""
     multi_step: MultiStepSettings = field(default_factory=MultiStepSettings)
-    """settings of this network"""
     seed: NonNegativeInt = 0
     """seed of the residual, and of its validation drivers"""
 

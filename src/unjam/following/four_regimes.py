@@ -22,7 +22,6 @@ MIN_REGIME_GAP = 0.1
 """smallest gap with which the acceleration is computed [m]; noise can make the gap itself smaller"""
 
 UniformRange = tuple[float, float]
-"""smallest and largest value of a uniform distribution"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)

@@ -54,13 +54,10 @@ class NetworkSettings:
     """Settings of a network that learns single accelerations (`fit_one_step`); the defaults are those of the paper."""
 
     hidden: HiddenSizes = (128, 128)
-    """sizes of the hidden layers"""
     learning_rate: Positive = 1e-4
-    """learning rate of Adam"""
     batch_size: PositiveInt = 1024
     """number of samples in a gradient step"""
     epochs: PositiveInt = 200
-    """maximum number of epochs"""
     patience: PositiveInt = 200
     """number of epochs without a smaller validation error after which the fit ends"""
     authority: Positive = 8.0

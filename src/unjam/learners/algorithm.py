@@ -16,7 +16,6 @@ from unjam.worlds.record import Episode
 
 Tensors = dict[str, Tensor]
 TaskEpisodes = Sequence[Sequence[Episode]]
-"""the episodes of each task"""
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,6 @@ class OffPolicyResidualMixin(BasePolicy):
 
     critic_kwargs: dict[str, Any]
     reward_offset: Tensor
-    """subtracted from rewards"""
 
     def __init__(self, *args: Any, settings: PolicySettings, inputs: int, action_limit: float, **kwargs: Any) -> None:
         self.settings, self.inputs, self.authority = settings, inputs, settings.authority * action_limit

@@ -25,7 +25,6 @@ class SB3Learner(Learner):
     """An algorithm of SB3 for residuals; subclasses make it and fill its buffer."""
 
     gamma: float
-    """discount from one action of the network to the next"""
     sb3: Any
     """SB3's algorithm: its `train()` needs a filled buffer, a logger, and the spaces of an environment"""
 

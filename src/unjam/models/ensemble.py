@@ -223,7 +223,6 @@ class OneStepRMSE(NamedTuple):
     """One-step root mean squared errors on the holdout [m/s, m, reward]."""
 
     base: float
-    """error of the base alone"""
     model: float
     """error of a member of the ensemble; that of the base where it is better"""
     change: float

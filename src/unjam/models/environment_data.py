@@ -38,15 +38,12 @@ class Transitions(NamedTuple):
 
     states: LocalState
     acceleration: Floats
-    """applied acceleration [m/s2]"""
     drawn_values: Floats
     """scaled values that the episode drew, shape (R, m)"""
     next_states: LocalState
     reward: Floats
     crashed: NDArray[np.bool_]
-    """whether the step ended in a collision"""
     is_holdout: NDArray[np.bool_]
-    """rows that no network is trained on"""
 
     def select(self, rows: NDArray[np.int64]) -> "Transitions":
         """Return the transitions with these indices."""

@@ -33,7 +33,6 @@ from unjam.worlds.record import Episode
 
 Index = NDArray[np.intp]
 MAX_SAMPLE_INTERVAL = 60
-"""maximum number of control steps between samples"""
 MIN_ERROR_REDUCTION = 0.3
 """share by which networks must reduce the base's mean squared error: a record has no lane-change memory of human
 drivers, which rollouts have, and its mean effect would be added twice. Networks that reduced it by a fifth made model
@@ -47,7 +46,6 @@ class MotorwaySamples:
     """Human drivers on a motorway at some steps of an environment episode."""
 
     episode: int
-    """number of the episode"""
     seed: tuple[int, ...]
     """seed of the episode: it determines the vehicles and their entry times"""
     episode_return: float

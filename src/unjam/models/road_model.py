@@ -60,13 +60,11 @@ class RoadSamples:
     """N vehicles of a closed road, in its order, at M steps at which a residual was due; arrays (M, N), SI units."""
 
     episode: int
-    """number of the environment episode"""
     interval: int
     """control steps between samples"""
     size: int
     """drawn by the episode: length of the ring, radius of the figure eight [m]"""
     length: float
-    """length of the road [m]"""
     is_human: Floats
     """1 for human drivers, 0 for CAVs, shape (N,)"""
     speeds: Floats
@@ -75,7 +73,6 @@ class RoadSamples:
     intended_speeds: Floats
     """distance divided by time in the next control step: the speed before noise"""
     next_speeds: Floats
-    """speeds after that step"""
     crossing_memory: CrossingMemory | None
     """waiting times and entry steps on a road that crosses itself"""
 
@@ -121,9 +118,7 @@ class HumanRows(NamedTuple):
     intended_speed: Floats
     """speed of the movement, before noise except for commanded drivers"""
     next_speed: Floats
-    """speed after the step"""
     episode: Floats
-    """number of the episode"""
 
 
 class RoadModel(Ensemble):

@@ -39,9 +39,7 @@ from unjam.worlds.reward import Outcome, Reward, make_reward
 from unjam.worlds.world import DriverLog, ProgressCallback
 
 GAP_SLICE = slice(len(SPEED_FIELDS), len(STATE_FIELDS))
-"""the gaps in `STATE_FIELDS`"""
 CLIPPED_QUANTITIES = ("speed", "gap", "reward")
-"""quantities that are clipped to physical bounds"""
 
 
 def check_device(device: Device, name: str = "device") -> None:
@@ -230,7 +228,6 @@ class RolloutBatch:
     drawn_values: Tensor
     """scaled values that the episodes drew, shape (n, m)"""
     control_steps: int
-    """total number of valid control steps"""
     clipped_share: dict[str, float]
     """share of the control steps in which each of `CLIPPED_QUANTITIES` was clipped"""
 

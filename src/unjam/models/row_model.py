@@ -38,7 +38,6 @@ from unjam.worlds.reward import Outcome, Reward, make_reward, time_gap
 SPEED_FIELDS = ("speed", "leader_speed", "follower_speed")
 GAP_FIELDS = ("leader_gap", "follower_gap")
 STATE_FIELDS = (*SPEED_FIELDS, *GAP_FIELDS)
-"""the five predicted quantities of the state"""
 TARGET_NAMES = (*STATE_FIELDS, "reward")
 """outputs of the networks: the difference of each quantity to the base's prediction [m/s, m, reward]"""
 NOISE_SAMPLES = 4096
@@ -136,7 +135,6 @@ class RowModel(Ensemble):
     noise: Tensor
     """errors on the holdout, shape (NOISE_SAMPLES, 6)"""
     reward_range: Tensor
-    """smallest and largest residual of the reward"""
 
     def __init__(
         self, settings: ModelSettings, drawn_count: int, seed: Seed, device: torch.device | str = "cpu"

@@ -40,15 +40,11 @@ class Rollouts(NamedTuple):
     """Model rollouts, either rows or whole episodes."""
 
     control_steps: int
-    """total number"""
     returns: Floats
-    """of each rollout"""
     crashed: Sequence[bool]
-    """whether it ended in a collision"""
     rows: RolloutBatch | None = None
     episodes: Sequence[Episode] = ()
     facts: Mapping[str, Any] = MappingProxyType({})
-    """other facts about them"""
 
 
 class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):

@@ -53,7 +53,6 @@ from unjam.worlds.episode import check_can_drive
 from unjam.worlds.worker_pool import WorkerPool
 
 DEFAULT_CONTROLLERS = (DEFAULT_DRIVER, "follower-stopper", "pi")
-"""default controllers, which suit open roads"""
 ACC_PROPERTIES = ("acceleration", "deceleration", "keep_right", "speed_gain")
 """settings of the CAVs' ACC that replace a property of the vehicle"""
 SPEEDS_AHEAD = {"lane_speeds", "road_speeds", "congestion"}
@@ -61,7 +60,6 @@ SPEEDS_AHEAD = {"lane_speeds", "road_speeds", "congestion"}
 MIN_BASELINE_EPISODES = 20
 """episodes of the baseline to which early ends are related before the last one: two of them are too many"""
 PLOT_EPISODE_COUNT = 2
-"""episodes of the budget that are kept for figures"""
 ZERO_PENETRATION_RATE = 1e-12
 """penetration rate of human-only traffic: zero is not allowed on user networks"""
 SELECTION_FOLDER = "selection"
@@ -79,10 +77,8 @@ class AssessmentRequest:
     network: UserNetwork
     """user network with human drivers alone"""
     drivers: dict[str, Driver]
-    """the controllers"""
     penetration_rates: tuple[float, ...]
     episodes: int
-    """total budget"""
     minutes: float | None
     """time budget, checked between batches"""
     precision: float
@@ -158,7 +154,6 @@ class Assessment:
     controller_results: list[ControllerResult]
     """results of the controller that was selected for each penetration rate; empty if all were rejected"""
     acc_results: list[AccResult]
-    """results of ACC vehicles alone at each penetration rate"""
     document: dict[str, Any]
     """the content of `assessment.json`: everything except the rows"""
     page: Path

@@ -48,7 +48,6 @@ CALIBRATION_FINALISTS = 3
 CALIBRATION_TEST_SEEDS = 10
 """seeds on which the best and the original factors are evaluated"""
 FLOW_FACTOR = "flow"
-"""factor on the number of vehicles, of all types"""
 FACTOR_RANGES: SearchSpace = {
     "tau": FloatDistribution(0.5, 2.0, log=True),
     "accel": FloatDistribution(0.5, 2.0, log=True),
@@ -59,7 +58,6 @@ FACTOR_RANGES: SearchSpace = {
 }
 """factors on the attributes of passenger vehicle types, and on flows"""
 SUMO_TYPE_DEFAULTS = {"tau": 1.0, "accel": 2.6, "decel": 4.5, "minGap": 2.5, "speedFactor": 1.0}
-"""defaults of passenger types"""
 SPEED_PERCENTILE, MAX_SPEED_LIMIT_RATIO = 95, 1.6
 """percentile of the measured speeds relative to the speed limits, and its maximum: speeds in mph would have 2.2"""
 NORMAL_DISTRIBUTION = re.compile(r"(normc?)\(([^()]*)\)")
@@ -82,10 +80,8 @@ class Corridor:
     measurements: tuple[Measurement, ...]
     """intervals between `begin` and `end`"""
     excluded_count: int
-    """number of other intervals"""
     loops: tuple[InductionLoop, ...]
     loop_numbers: tuple[tuple[int, ...], ...]
-    """numbers of the loops of each measurement"""
 
     def scenario(self, file: Path) -> UserNetwork:
         """Return the human-only traffic of a variant of the network, until the last measurement."""
@@ -221,12 +217,9 @@ class CalibrationResult:
     vehicle_types: dict[str, dict[str, str]]
     """changed attributes of vehicle types, by id"""
     original: list[Agreement]
-    """agreement of the original network on the test seeds"""
     calibrated: list[Agreement]
-    """agreement of the calibrated network on the test seeds"""
     trials: list[CalibrationTrial]
     file: Path
-    """the new configuration"""
 
     def estimates(self) -> dict[str, dict[str, Estimate]]:
         """Return the mean of each measure with its CI: original, calibrated, and the paired difference."""

@@ -39,7 +39,6 @@ if TYPE_CHECKING:  # the command line imports this module and must start quickly
 
 Executor = Literal["local", "ray"]
 MessageCallback = Callable[[str], None]
-"""called with a line of progress"""
 IterationCallback = Callable[[dict[str, Any]], object]
 """called with each row of progress; it returns False to end the training"""
 MAX_ATTEMPTS = 3
@@ -50,13 +49,10 @@ class CommandLine(NamedTuple):
     """A command line of unjam."""
 
     arguments: Sequence[str]
-    """arguments of the command `unjam`"""
     log: Path
-    """file to which its output is appended"""
     resume_marker: Path | None = None
     """file that exists if the command was started before"""
     resume_arguments: Sequence[str] = ()
-    """arguments that resume it"""
 
     def argv(self) -> list[str]:
         """Return the whole command line, which depends on whether it was started before."""

@@ -82,7 +82,6 @@ class ExportResult:
     graph: Path | None
     """the ONNX graph with its description as metadata; without it, the graph is also in the controller's file"""
     model: Path | None
-    """the model of Stable-Baselines3"""
     driver: str
     sample_steps: int
     """length of the recorded sample"""

@@ -31,18 +31,15 @@ MAX_REPLAY_STEPS = 500
 MAX_ERROR_ROWS = 20_000
 """control steps for the one-step errors, at most"""
 MAX_REPLAYS = 200
-"""replays of recorded accelerations, at most"""
 EXAMPLE_COUNT = 3
 """replays that are shown one by one"""
 MAX_REPLAY_TIMES = 100
-"""stored times of a replay, at most"""
 BINS_PER_FIELD = 10
 """bins with equal numbers of control steps, by gap and by speed"""
 BINNED_FIELDS = ("leader_gap", "speed")
 ROLLOUT_LENGTHS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """lengths for which the bound is computed [control steps]"""
 EXAMPLE_FIELDS = ("leader_gap", "leader_speed")
-"""quantities of the examples"""
 
 
 def update_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:

@@ -58,7 +58,6 @@ class SearchTrial:
     gain: float | None
     """validation return of the best controller minus that of the expert; None if it failed"""
     last_gain: float | None
-    """gain of the last checkpoint"""
 
 
 def search(

@@ -48,7 +48,6 @@ ACC_DRIVER = "cruise"
 UNCHANGED_ACC_DRIVER = "acc with unchanged vehicles"
 """the same, with the properties of the replaced vehicles instead of those that the user has set for CAVs"""
 OptionRunner = Callable[[Sequence[Option], Sequence[EpisodeSeed]], dict[Option, OptionRows]]
-"""runs all options on all seeds, and measures"""
 
 
 class EpisodeBudget:
@@ -89,7 +88,6 @@ class Selection:
 
     rows: dict[Option, OptionRows]
     rejection_reasons: dict[Option, str]
-    """reason why an option is not tested, by option"""
     finalists: list[Option]
     """options that are tested, at most one for each penetration rate"""
 

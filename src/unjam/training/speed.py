@@ -54,9 +54,7 @@ RING_SIZES = {22: 3000, 220: 800, 2200: 200}
 ROLLOUT_SIZES = ((2000, 50), (1200, 10))
 """rows and control steps of model rollouts: with an accurate model, and as in a training iteration on the ring"""
 BATCH_VEHICLES = 90_112
-"""vehicles of a batch: 4,096 rings of 22"""
 BENCHMARK_SCENARIOS = ("ring", "figure-eight", "merge")
-"""scenarios that are compared with plain SUMO"""
 VECTOR_ENVIRONMENTS = ((1024, False), (4096, False), (1024, True))
 """numbers of rings in vector environments, and whether they equal SUMO exactly"""
 ASYNC_ENVIRONMENTS = 2
@@ -74,11 +72,8 @@ BUSY_ON_RAMP: dict[str, Any] = {
 STEPS_PER_ROUND = 100
 METERS_PER_VEHICLE = 245 / 22
 VEHICLES_PER_RING = 22
-"""number of vehicles on each ring of `benchmark_batches`"""
 BATCH_SIZES = {"cpu": (64, 256, 1024, 4096, 16_384), "cuda": (64, 256, 1024, 4096, 16_384, 65_536, 262_144)}
-"""numbers of rings, by device"""
 BENCHMARK_MODEL = ModelSettings(hidden=(32, 32))
-"""the networks of human drivers"""
 SUMO_PART, EPISODE_PART = "SUMO alone", "run_episode"
 """what other parts are related to, after the name of a scenario"""
 ENVIRONMENT_PART = "ring: env.step"

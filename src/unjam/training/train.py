@@ -62,7 +62,6 @@ PROGRESS_METRICS = (
 """metrics of progress: means over the episodes of an iteration"""
 PROGRESS_RETURNS = ("return_mean", "return_expert", "return_validation")
 ALGORITHM_PREFIX = "algorithm/"
-"""of the tensors of the algorithm in checkpoints"""
 ValidationReturns = Sequence[float] | None
 """return on the validation seeds of each task; None without a validation"""
 

@@ -40,9 +40,7 @@ from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 TUNING_FILE = "tuned.json"
 TUNING_EPISODES = 8
-"""episodes of each trial"""
 TUNING_EPISODES_PER_ROAD = 2
-"""episodes of each trial on each of several roads"""
 TUNING_FINALISTS = 5
 """trials that run again on twice as many other seeds, because the best of many trials is partly lucky"""
 SCREENING_BATCH_SIZE = 8
@@ -62,13 +60,11 @@ class TuningResult:
     default: TuningTrial
     """the expert with default parameters, on the seeds of the finalists"""
     trials: list[TuningTrial]
-    """all trials, in order"""
     environment_steps: int
     """control steps in SUMO"""
     batch_steps: int
     """control steps in batches"""
     file: Path
-    """the tuned expert as a controller"""
 
 
 def tune(

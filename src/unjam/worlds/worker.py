@@ -22,7 +22,6 @@ from unjam.worlds.sumo.sandboxed import enter_sandbox
 from unjam.worlds.sumo.simulation import Simulation
 
 PROGRESS_INTERVAL = 0.2
-"""seconds between two reports of progress"""
 
 
 def _answer_request(

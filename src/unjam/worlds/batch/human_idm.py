@@ -41,7 +41,6 @@ CONTACT_GAP = -1e-3
 FREE_GAP = 1e6
 """gap in SUMO's `freeSpeed` without a leader; the leader then drives at the desired speed [m]"""
 HumanParameters = IDMParameters | IDMArrays
-"""parameters of all human drivers, or of each of them"""
 
 
 class Leader(NamedTuple):

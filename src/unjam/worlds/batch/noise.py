@@ -30,7 +30,6 @@ class NoiseState(NamedTuple):
     """State of the human drivers' noise in one world."""
 
     generator: Mapping[str, Any]
-    """state of the bit generator"""
     remaining_block: Floats
     """rest of the last block, the next step at the end, shape (steps, vehicles)"""
 

@@ -14,7 +14,6 @@ from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE, is_harmless_attribute, is
 from unjam.worlds.sumo.networks import XMLAttributes, network_file, xml_element
 
 SUMO_CAV_COLOR = "215,38,61"
-"""red, in SUMO's window"""
 W99_ACCELERATION = 2.0
 """SUMO's default of `cc8`, the acceleration from a standstill of its model W99 [m/s2]"""
 CALIBRATED_TYPE_TEMPLATE = "{}_of_driver_{}"

@@ -36,7 +36,6 @@ class MergingStreams:
         self.positions: Floats = np.zeros(0)
         """positions of the front bumpers, zero at the merge point and negative before it [m]"""
         self.speeds: Floats = np.zeros(0)
-        """speeds [m/s]"""
         self._branches = np.zeros(0, np.intp)
         """0: the main road; 1: the ramp"""
 

@@ -85,7 +85,6 @@ class OpenTraffic(Traffic[OpenRoadT]):
     """
 
     _fuel_interval = 1
-    """control steps between two measurements of fuel"""
     _cav_type_template = "cav"
     """vehicle type of a CAV; `{}` stands for its own type"""
 

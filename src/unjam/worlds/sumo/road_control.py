@@ -32,7 +32,6 @@ class ControlledVehicles(NamedTuple):
     speeds: Floats
     """[m/s]"""
     lengths: Floats
-    """[m]"""
 
 
 class RampControl:
@@ -48,7 +47,6 @@ class RampControl:
         self._held: list[str] = []
         """vehicles that must stop at the meter, from the first one on"""
         self._known = set[str]()
-        """vehicles of the ramp"""
         self._time, self._wait = 0.0, 0.0
 
     def act(self, vehicles: ControlledVehicles) -> None:

@@ -15,7 +15,6 @@ from unjam.worlds.sumo.networks import NetworkLane
 from unjam.worlds.sumo.simulation import Simulation
 
 NO_SECTION = -1
-"""section beyond the end of a route"""
 MAX_QUEUE_LENGTH = 1000.0
 """distance before a stop line within which slow vehicles may be its queue: no congestion is reported there [m]"""
 MIN_MONITORED_LENGTH = 50.0
@@ -34,7 +33,6 @@ class LaneSections:
             (lane, number) for lane, count in zip(self._lanes.values(), counts, strict=True) for number in range(count)
         ]
         self.speed_limits: Floats = np.array([lane.speed_limit for lane, _ in sections])
-        """speed limits [m/s]"""
         rows: dict[tuple[str, int], int] = {}
         cross_sections = [rows.setdefault((lane.edge, number), len(rows)) for lane, number in sections]
         self.cross_sections = np.array(cross_sections, np.intp)
@@ -92,7 +90,6 @@ class RoadsideService:
         self._simulation, self._messages, self._sections = simulation, messages, LaneSections(simulation)
         self._monitor = CongestionMonitor(1 + int(self._sections.cross_sections.max()), step)
         self._last_sections: defaultdict[str, list[int]] = defaultdict(lambda: [NO_SECTION] * SECTIONS_AHEAD)
-        """sections ahead of each CAV when it was last on a lane"""
         self._desired_speeds: dict[str, tuple[float, float]] = {}
         """desired speed over the speed limit, and maximum speed [m/s], of each CAV"""
 

@@ -117,7 +117,6 @@ class Simulation(AbstractContextManager["Simulation"]):
             return lambda ids: list(map(function, ids))
 
         self.speeds = call_for_each("getSpeed")
-        """speeds of vehicles [m/s]"""
         self.lane_offsets = call_for_each("getLanePosition")
         """positions of vehicles along their lanes [m]"""
         self.distances = call_for_each("getDistance")
@@ -125,14 +124,11 @@ class Simulation(AbstractContextManager["Simulation"]):
         self.fuel = call_for_each("getFuelConsumption")
         """fuel rates of vehicles in the last step [mg/s], by their emission class"""
         self.now: Callable[[], float] = call("simulation", "getTime")
-        """SUMO's time [s]"""
         self.max_speed: Callable[[str], float] = call("vehicle", "getMaxSpeed")
         """maximum speed of a vehicle, whatever the road allows [m/s]"""
         self.set_max_speed: Callable[[str, float], object] = call("vehicle", "setMaxSpeed")
         self.set_time_gap: Callable[[str, float], object] = call("vehicle", "setTau")
-        """sets the time gap that a vehicle keeps [s]"""
         self.vehicles_on_lane: Callable[[str], Sequence[str]] = call("lane", "getLastStepVehicleIDs")
-        """vehicles with their front bumper on a lane"""
         self.vehicle_count: Callable[[], int] = call("vehicle", "getIDCount")
         self.departed_vehicles: Callable[[], Sequence[str]] = call("simulation", "getDepartedIDList")
         """vehicles that entered the road in the last step"""
@@ -142,7 +138,6 @@ class Simulation(AbstractContextManager["Simulation"]):
         """vehicles that SUMO teleported in the last step; below: those that it reinserted"""
         self.reinserted_vehicles: Callable[[], Sequence[str]] = call("simulation", "getEndingTeleportIDList")
         self.colliding_vehicles: Callable[[], Sequence[str]] = call("simulation", "getCollidingVehiclesIDList")
-        """vehicles that collided in the last step"""
         self._vehicles_on_loop = call("inductionloop", "getVehicleData")
         self.pending_vehicles: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
 

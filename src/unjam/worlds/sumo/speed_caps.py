@@ -12,7 +12,6 @@ class SpeedCaps:
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
         self._caps: dict[str, dict[Hashable, float]] = {}
-        """caps by vehicle and source [m/s]"""
         self.own_max_speeds: dict[str, float] = {}
         """maximum speeds of the vehicles that have a cap, without it [m/s]"""
 

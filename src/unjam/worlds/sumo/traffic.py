@@ -23,7 +23,6 @@ ODOMETER_RELATIVE_TOLERANCE = 1e-10
 """the same relative to the distance driven: sums of many steps are rounded"""
 WARMUP_PROGRESS_STEPS = 10
 NO_SPEED_COMMAND = -1.0
-"""speed command with which SUMO drives"""
 
 RoadT = TypeVar("RoadT", bound=Road)
 OpenRoadT = TypeVar("OpenRoadT", bound=OpenRoad)

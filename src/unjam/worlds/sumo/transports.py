@@ -52,7 +52,6 @@ class Libsumo:
         """the error log of the running simulation, by which it is identified; None: it does not run"""
         self._step_count, self._begin_time = 0, 0.0
         self.has_refused = False
-        """whether a step has failed since the start"""
         self._is_claimed = _libsumo_lock.acquire(blocking=False)
         if not self._is_claimed or self._is_loaded():
             self.close()

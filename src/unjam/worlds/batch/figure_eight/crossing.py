@@ -48,9 +48,7 @@ CONFLICT_AREA_START = CROSSING_LINK / 2.0 - CROSSED_LANE_WIDTH / 2.0
 STOPPING_FOE_DELAY = 30.0
 """additional arrival time of foes that can stop before the crossing [s]"""
 LANE_LENGTH_DIGITS = 6
-"""decimal places of lane lengths in SUMO's networks [m]"""
 COMMANDED_SPEED_TOLERANCE = 1e-9
-"""tolerance of a commanded speed [m/s]"""
 
 
 class CrossingMemory(NamedTuple):
@@ -88,7 +86,6 @@ class _Approach(NamedTuple):
     distance: Array
     """distance to the crossing [m]; negative on it"""
     is_approaching: Array
-    """whether SUMO registers them"""
     approach_speed: Array
     """maximum speed in this step before the crossing [m/s]"""
     stop_speed: Array
@@ -96,9 +93,7 @@ class _Approach(NamedTuple):
     go_speed: Array
     """maximum speed of vehicles that may enter [m/s]"""
     arrival_time: Array
-    """time of arrival at the crossing [s]"""
     leave_time: Array
-    """time of leaving the crossing [s]"""
 
 
 def _last_vehicle(speed: Array, distance_past: Array) -> _Vehicle:

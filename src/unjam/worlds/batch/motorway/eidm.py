@@ -28,13 +28,11 @@ START_UP_DURATION, START_UP_SHAPE, START_UP_SHIFT, MIN_START_UP_INTERVAL = 1.2, 
 """duration of a start [s], shape and shift of its profile, and minimum time between two starts [s]"""
 COOLNESS = 0.99
 MAX_JERK = 3.0
-"""maximum jerk [m/s3]"""
 GAP_ERROR_STRENGTH, LEADER_SPEED_ERROR_STRENGTH, DRIVING_ERROR_STRENGTH = 0.1, 0.02, 0.04
 """strengths of the three errors"""
 ESTIMATION_ERROR_TIME, DRIVING_ERROR_TIME = 10.0, 3.0
 """correlation times of the errors [s]"""
 EIDM_EMERGENCY_BRAKING = 9.0
-"""emergency deceleration [m/s2]"""
 EIDM_HALTING_SPEED, LEADER_STANDING_SPEED = 0.1, 0.1
 """speeds below which a vehicle halts, and a leader counts as standing [m/s]"""
 

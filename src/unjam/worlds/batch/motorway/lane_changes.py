@@ -18,7 +18,6 @@ from unjam.worlds.batch.motorway.vehicles import ADVICE_FIELDS, NO_ADVICE, Motor
 from unjam.worlds.lane_neighbors import NO_VEHICLE, find_neighbors, find_road_neighbors, neighbors_on_lane
 
 NO_NEIGHBOR_GAP = 1e6
-"""gap without a neighbor [m]"""
 MERGE_LOOK_AHEAD_TIME, LEFT_LOOK_AHEAD_FACTOR = 10.0, 2.0
 """look-ahead time of a mandatory change [s], and its factor for changes to the left"""
 URGENCY_FACTOR = 2.0
@@ -64,12 +63,9 @@ class LaneChangeContext(NamedTuple):
     """`NO_VEHICLE`: none"""
     leader: Neighbor
     target_leader: Neighbor
-    """on the target lane"""
     target_follower: Neighbor
     follower_drivers: MotorwayDrivers
-    """of the target followers"""
     is_leader_blocking: Array
-    """whether the target leader prevents a change"""
     is_follower_blocking: Array
     sections: MotorwaySections
     step: float

@@ -27,7 +27,6 @@ from unjam.worlds.world import DriverLog
 
 Integers = NDArray[np.intp]
 NO_END_STEP = int(np.iinfo(np.intp).max)
-"""last control step of roads without a collision"""
 _DRIVER_KINDS = (audit.HUMAN_DRIVER, audit.CAV_DRIVER, audit.CAV_AFTER_CUT_IN)
 
 
@@ -60,7 +59,6 @@ class MotorwayLog:
         self._leader, self._leader_since = np.full((2, *shape), -1)
         self._step_count, self._steady_following = 0, list[Floats]()
         self._is_recovering = np.zeros(shape, bool)
-        """whether each CAV recovers from a change of leader"""
         self._following_pairs = np.zeros((len(FollowingState._fields), *shape))
         """each CAV and its leader in the last step, with the fields of `FollowingState`"""
 

@@ -28,7 +28,6 @@ from unjam.worlds.batch.noise import DrawNormal
 from unjam.worlds.lane_neighbors import LaneNeighbors, find_road_neighbors, neighbors_on_lane
 
 LONG_BEFORE_START = -1000.0
-"""long before an episode starts [s]"""
 LIMIT_ADAPTATION_TIME = 4.0
 """time in which EIDM drivers adapt to a higher limit [s]"""
 FREE_DRIVING_GAP = 500.0
@@ -38,7 +37,6 @@ INSERTION_OFFSET = 0.1
 LEADER_BRAKING_THRESHOLD = 0.5
 """braking that drivers never exceed without a leader [m/s2]"""
 NO_SPEED_CAP = 1e6
-"""speed cap of vehicles without one [m/s]"""
 
 LearnedCorrection = Callable[[Array, Array, Array, Array], Array]
 """A learned model of human drivers: from own speed, leader speed, gap, and known speed after a control step, to the

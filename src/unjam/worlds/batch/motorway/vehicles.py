@@ -20,7 +20,6 @@ from unjam.worlds.lane_neighbors import NO_VEHICLE
 NUMBERS_PER_ROAD = 100_000
 """more than the vehicles that enter a road in an episode"""
 NO_ADVICE = 1e6
-"""advised acceleration of vehicles without advice [m/s2]"""
 ADVICE_FIELDS = ("own_advice", "cooperative_advice", "adjacent_advice")
 MIN_IDM_STOP_DISTANCE = 0.01
 """distance below which an IDM stands [m]"""
@@ -35,7 +34,6 @@ class MotorwayVehicles(NamedTuple):
     """All vehicles."""
 
     road: Array
-    """index of the road, an integer"""
     entry: Array
     """index among the entries of the road, an integer"""
     lane: Array
@@ -47,7 +45,6 @@ class MotorwayVehicles(NamedTuple):
     """acceleration in the last step [m/s2]"""
     time_headway: Array
     max_acceleration: Array
-    """maximum acceleration [m/s2]"""
     braking: Array
     """comfortable deceleration [m/s2]"""
     minimum_gap: Array
@@ -72,7 +69,6 @@ class MotorwayVehicles(NamedTuple):
     own_advice: Array
     """acceleration that helps the own change [m/s2]; `NO_ADVICE`: none"""
     cooperative_advice: Array
-    """acceleration that helps the change of another vehicle"""
     adjacent_advice: Array
     """acceleration that avoids passing on the right, or lets a stuck vehicle merge"""
     speed_bias: Array

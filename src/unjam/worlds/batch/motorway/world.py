@@ -34,9 +34,7 @@ class ReplayOptions(NamedTuple):
     control_steps: int
     """number of control steps after which the replay ends"""
     has_driver_errors: bool
-    """whether human drivers make errors"""
     correction: LearnedCorrection | None
-    """correction of the speeds of human drivers"""
 
 
 class MotorwayBatch:
@@ -79,16 +77,12 @@ class MotorwayBatch:
         self._cav_numbers: NDArray[np.intp] = np.zeros(0, np.intp)
         """road and entry of each CAV as one number, in order of entry"""
         self._cav_entry_counts = np.zeros(len(seeds))
-        """number of CAVs that have entered each road"""
         self._start_steps = np.zeros(len(seeds), np.intp)
         """number of control steps of the batch before the episode of each road"""
         self.backlogs = np.zeros(len(seeds), np.intp)
-        """insertion backlog of each road now"""
         self._cav_speeds_before = np.zeros(0)
-        """speeds of the CAVs before the last control step [m/s]"""
         self._is_controlled, self._has_time_gap_commands = False, False
         self._episode_noise: Floats | None = None
-        """per-episode exploration noise of each road"""
         self._log = MotorwayLog(self.roads, scenario)
 
     def _draw_errors(self, shape: tuple[int, ...]) -> Floats:

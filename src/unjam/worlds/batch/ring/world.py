@@ -50,12 +50,10 @@ class WarmUpState(NamedTuple):
     gap: Floats
     """gaps to the vehicle ahead [m], shape (vehicles,)"""
     has_crashed: bool
-    """whether human drivers collided"""
     noise: NoiseState
     history: LocalState | None
     """what the CAVs observed in the last minute, shape (CAVs, moments); None if it is not remembered"""
     crossing_memory: CrossingMemory | None = None
-    """memory of the crossing of a figure eight; None on rings"""
 
 
 class RingBatch:
