@@ -103,20 +103,11 @@ def fit_drivers_from_files(
     out: Path | None = None,
     on_progress: DriverProgress = lambda *done: None,
 ) -> FittedDrivers:
-    """Calibrate a population to the trajectories in files.
+    """Calibrate a population to the trajectories in files, with `overrides` of `FitDriversSettings`.
 
-    Args:
-        overrides: values of `FitDriversSettings` by name; names of nested settings contain dots.
-        format: format of the files, see `read_trajectories`.
-        drop_bad_rows: see `ReadOptions`.
-        driver_columns: see `ReadOptions`.
-        filters: values of `kind`, `split` or `driver`; only trajectories with all these values are used.
-        out: file to which the caller will write the population; its name and folder are checked first.
-        on_progress: called after each driver.
-
-    Raises:
-        InputError: a file, a row or a setting is wrong, or no trajectory is selected.
-        DiskError: the folder of `out` does not exist.
+    `format`, `drop_bad_rows` and `driver_columns` are those of `read_trajectories`; `filters` values of `kind`, `split`
+    or `driver`. Name and folder of `out` are checked first. Raise `InputError` if a file, a row or a setting is wrong,
+    or no trajectory is selected, `DiskError` if the folder of `out` does not exist.
     """
     if out is not None:
         if out.suffix != ".json":

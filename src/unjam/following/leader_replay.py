@@ -94,13 +94,8 @@ def follow_leader(
 ) -> Iterator[Any]:
     """Yield the speed [m/s] and the gap [m] of a follower after each step behind a recorded leader.
 
-    A follower that uses up its gap stays in contact with the leader, and is not faster, until it brakes.
-
-    Args:
-        follow: acceleration function of the follower.
-        start: its initial speed [m/s] and gap [m], shape (..., n).
-        leader: speeds [m/s] and paths [m] of the leaders as in `FollowingTrajectory`, shape (T, n).
-        time_step: time between two samples [s].
+    A follower that uses up its gap stays in contact with the leader, and is not faster, until it brakes. `start` is its
+    speed and gap, (..., n); `leader` speeds [m/s] and paths [m] as in `FollowingTrajectory`, (T, n).
     """
     (speed, gap), (leader_speeds, paths) = start, leader
     position = gap * 0.0

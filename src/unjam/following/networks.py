@@ -18,18 +18,8 @@ from torch import Tensor, nn
 from unjam.adam import Adam
 from unjam.drivers.network import Network
 from unjam.errors import UnjamError
+from unjam.following import leader_replay
 from unjam.following.calibration import HiddenSizes, MultiStepSettings
-from unjam.following.leader_replay import (
-    AccelerationBounds,
-    AccelerationFunction,
-    DriverModel,
-    ResidualFunction,
-    add_residual,
-    as_driver_model,
-    follow_leader,
-    idm_function,
-    simulate_followers,
-)
 from unjam.parameters import STRICT, Positive, PositiveInt, parameter_dataclass
 from unjam.physics.arrays import Floats
 from unjam.physics.idm import IDMArrays, IDMParameters, stack_idm_parameters
@@ -114,7 +104,7 @@ def _to_tensor(values: Floats) -> Tensor:
     return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
 
 
-def batched_network(network: Network) -> ResidualFunction:
+def batched_network(network: Network) -> leader_replay.ResidualFunction:
     """Return a NumPy network as a function of inputs of the shape (..., 3)."""
     return lambda inputs: network(inputs.reshape(-1, len(RESIDUAL_INPUTS))).reshape(inputs.shape[:-1])
 
@@ -131,7 +121,7 @@ class LossHistory(NamedTuple):
 def fit_one_step(
     samples: FollowingSamples,
     validation: FollowingSamples,
-    base: AccelerationFunction | None,
+    base: leader_replay.AccelerationFunction | None,
     settings: NetworkSettings,
     seed: int,
 ) -> tuple[FollowingNetwork, LossHistory]:
@@ -181,19 +171,19 @@ class CalibratedTrajectories:
     """IDM parameters of the driver of each trajectory"""
 
     def model(
-        self, trajectory_index: NDArray[np.int64], limits: AccelerationBounds, as_tensors: bool = False
-    ) -> DriverModel:
+        self, trajectory_index: NDArray[np.int64], limits: leader_replay.AccelerationBounds, as_tensors: bool = False
+    ) -> leader_replay.DriverModel:
         """Return the base for segments of the trajectories with these indices, for NumPy arrays or torch tensors."""
         parameters = stack_idm_parameters([self.drivers[number] for number in trajectory_index])
         if as_tensors:
             parameters = IDMArrays(*map(_to_tensor, parameters))
-        return as_driver_model(idm_function(parameters, limits))
+        return leader_replay.as_driver_model(leader_replay.idm_function(parameters, limits))
 
 
 def fit_multi_step(
     training: CalibratedTrajectories,
     validation: CalibratedTrajectories,
-    limits: AccelerationBounds,
+    limits: leader_replay.AccelerationBounds,
     settings: MultiStepSettings,
     seed: int,
 ) -> tuple[FollowingNetwork, list[float]]:
@@ -212,8 +202,8 @@ def fit_multi_step(
     base = validation.model(whole.trajectory_index, limits)
 
     def gap_error() -> float:
-        model = add_residual(base, batched_network(network.to_numpy_network()), limits)
-        return float(np.sqrt(simulate_followers(model, whole).gap_mse).mean())
+        model = leader_replay.add_residual(base, batched_network(network.to_numpy_network()), limits)
+        return float(np.sqrt(leader_replay.simulate_followers(model, whole).gap_mse).mean())
 
     optimizer = Adam(network.parameters(), lr=settings.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.gradient_steps)
@@ -240,7 +230,11 @@ def fit_multi_step(
 
 
 def _gap_loss(
-    network: nn.Module, base: DriverModel, limits: AccelerationBounds, segments: Segments, settings: MultiStepSettings
+    network: nn.Module,
+    base: leader_replay.DriverModel,
+    limits: leader_replay.AccelerationBounds,
+    segments: Segments,
+    settings: MultiStepSettings,
 ) -> Tensor:
     speeds, leader_speeds, gaps, paths = (_to_tensor(getattr(segments, name)) for name in SEGMENT_FIELDS)
     is_present = torch.as_tensor(segments.is_present)[1:]
@@ -250,8 +244,8 @@ def _gap_loss(
         residuals.append(network(inputs))
         return residuals[-1]
 
-    follow = add_residual(base, recorded_network, limits)(speeds[0], gaps[0])
-    states = list(follow_leader(follow, (speeds[0], gaps[0]), (leader_speeds, paths), segments.time_step))
+    follow = leader_replay.add_residual(base, recorded_network, limits)(speeds[0], gaps[0])
+    states = list(leader_replay.follow_leader(follow, (speeds[0], gaps[0]), (leader_speeds, paths), segments.time_step))
     speed, gap = (torch.stack(each) for each in zip(*states, strict=True))
     squares = (gap - gaps[1:]).square() + (settings.speed_weight * (speed - speeds[1:])).square()
     gap_part = ((squares * is_present).sum(0) / is_present.sum(0) + MEAN_SQUARE_OFFSET).sqrt().mean()

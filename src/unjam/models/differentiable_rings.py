@@ -13,7 +13,6 @@ from unjam.drivers.driver import Driver, Memory
 from unjam.errors import InputError, invalid_value
 from unjam.models.rollouts import check_device
 from unjam.models.settings import Device
-from unjam.physics.arrays import Array
 from unjam.physics.kinematics import gap_on_loop
 from unjam.scenarios import ScenarioLike, make_scenario
 from unjam.scenarios.ring import Ring
@@ -74,7 +73,7 @@ class DifferentiableRings(RingBatch):
             raise InputError(f"scenario: {reason}")
         if not road.sensors.is_exact:
             raise InputError("sensors: errors have no gradient; allowed: exact sensors")
-        draw = generator and partial(_draw_normal, generator, dtype, device)
+        draw = generator and partial(torch.randn, generator=generator, dtype=dtype, device=device)
         to_tensor = partial(torch.as_tensor, dtype=dtype, device=device)
         super().__init__([road] * len(numbers), numbers, to_tensor, keep_record=False, draw=draw)
         self._reward = make_reward(reward or road.reward)
@@ -151,7 +150,3 @@ class DifferentiableRings(RingBatch):
         """Let no gradients flow to earlier steps from here on; return the driver's `memory` without them, too."""
         self.detach_state()
         return map_leaves(lambda values: values.detach(), memory or {})
-
-
-def _draw_normal(generator: torch.Generator, dtype: torch.dtype, device: Device, shape: tuple[int, ...]) -> Array:
-    return torch.randn(shape, generator=generator, dtype=dtype, device=device)

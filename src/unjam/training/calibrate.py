@@ -250,18 +250,9 @@ def calibrate(
     """Search factors on vehicle types and flows, and write the best as a network and `calibration.json`.
 
     The trials are stored in the folder: an interrupted calibration resumes with the same result, also with more trials.
-
-    Args:
-        corridor: the network and its measurements.
-        folder: new, empty, or that of this calibration.
-        simulator: the result does not depend on its number of processes.
-        space: factors to vary, by the names of `FACTOR_RANGES`.
-        trials: total number; the first one has factors of one, or the nearest values in the space.
-        seeds_per_trial: number of seeds.
-        seed: of the proposals.
-        on_message: called with a line for each trial.
-
-    Raise `UnjamError` if SUMO cannot simulate the original network, or if its process was lost repeatedly.
+    The first trial has factors of one, or the nearest values in the space; `seed` is that of the proposals. The result
+    does not depend on the number of processes. Raise `UnjamError` if SUMO cannot simulate the original network, or if
+    its process was lost repeatedly.
     """
     original = dict.fromkeys(space, 1.0)
     log = TrialLog(folder, corridor.metadata() | {"space": repr(space), "seeds": seeds_per_trial, "seed": seed})

@@ -12,8 +12,8 @@ from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, invalid_value
 from unjam.models.ensemble import torch_generator
 from unjam.models.environment_data import StartIndices
+from unjam.models.registry import RowWorldModel
 from unjam.models.rollouts import ModelDynamics, ModelTransition, draw_starts, tensor_driver, tensor_memory, to_device
-from unjam.models.row_world_model import RowWorldModel
 from unjam.parameters import check_integer
 from unjam.training.model_facts import TrainedModel, read_trained_model, trained_model_facts
 from unjam.training.run_folder import read_config

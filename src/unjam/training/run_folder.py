@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tomli_w
 
+from unjam import files
 from unjam.controller import make_driver
 from unjam.drivers.check import PROBE_ROWS, check_row_independence, probe_state
 from unjam.drivers.driver import Driver
@@ -23,17 +24,6 @@ from unjam.drivers.registry import driver_recipe
 from unjam.drivers.requirements import merge_requirements
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import DiskError, InputError, invalid_value
-from unjam.files import (
-    INVALID_DATA_ERRORS,
-    atomic_write,
-    is_leftover,
-    make_folder,
-    remove,
-    remove_if_empty,
-    remove_leftovers,
-    sha256_of,
-    to_json,
-)
 from unjam.folders import reject_unsafe_files
 from unjam.manifest import manifest, package_versions
 from unjam.parameters import build_dataclass, check_integer, read_toml
@@ -132,10 +122,10 @@ def make_new_folder(folder: Path, alternative: str = "") -> None:
     """Make a folder, or raise `InputError` if it has more than leftovers; the message names an `alternative`."""
     try:
         if folder.exists() and not (
-            folder.is_dir() and all(is_leftover(path) or path.name == LOCK_FILE for path in folder.iterdir())
+            folder.is_dir() and all(files.is_leftover(path) or path.name == LOCK_FILE for path in folder.iterdir())
         ):
             raise InputError(f"out: {str(folder)!r} is not empty; allowed: a new folder{alternative}")
-        make_folder(folder)
+        files.make_folder(folder)
     except OSError as error:  # for example under /proc, or with too long a name
         reason = f"cannot be made ({error.strerror})"
         raise InputError(f"out: {str(folder)!r} {reason}; allowed: a new folder") from None
@@ -161,7 +151,7 @@ def removing_if_empty(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        remove_if_empty(folder)
+        files.remove_if_empty(folder)
 
 
 @contextmanager
@@ -172,20 +162,20 @@ def discarding_refused(folder: Path) -> Iterator[None]:
     except InputError:
         if not read_progress(folder):
             for path in [each for each in folder.iterdir() if each.name != LOCK_FILE]:
-                remove(path)
+                files.remove(path)
         raise
 
 
 def create_run_folder(folder: Path, config: RunConfig) -> None:
     """Make the folder of a new run, with configuration and manifest; raise `InputError` if it is not empty."""
     make_new_folder(folder, f", or --resume {folder}")
-    atomic_write(folder / CONFIG_FILE, to_toml(config))
+    files.atomic_write(folder / CONFIG_FILE, to_toml(config))
     _write_manifest(folder)
 
 
 def _write_manifest(folder: Path) -> None:
     facts = {"format": CHECKPOINT_FORMAT, "start_folder": os.path.relpath(Path.cwd(), folder.resolve()), **manifest()}
-    atomic_write(folder / MANIFEST_FILE, to_json(facts, indent=1))
+    files.atomic_write(folder / MANIFEST_FILE, files.to_json(facts, indent=1))
 
 
 def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
@@ -232,7 +222,7 @@ def resume_run_folder(folder: Path, config: RunConfig) -> None:
         raise invalid_value("steps", config.steps, f">= {done}, which are done")
     if config != before:  # names of files remain as they are
         changed = {**read_toml(folder / CONFIG_FILE), "steps": config.steps, "workers": config.workers}
-        atomic_write(folder / CONFIG_FILE, tomli_w.dumps(changed))
+        files.atomic_write(folder / CONFIG_FILE, tomli_w.dumps(changed))
     if not (folder / MANIFEST_FILE).is_file():  # the run was stopped before it wrote the manifest
         _write_manifest(folder)
 
@@ -253,7 +243,7 @@ def append_lineage(folder: Path, iteration: int) -> None:
         lineage = [*made.get("lineage", []), {"iteration": iteration, **manifest()}]
     except (ValueError, AttributeError, TypeError) as error:
         raise InputError(f"run: {path} cannot be read: {error}") from None
-    atomic_write(path, to_json({**made, "lineage": lineage}, indent=1))
+    files.atomic_write(path, files.to_json({**made, "lineage": lineage}, indent=1))
 
 
 def controller_origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
@@ -272,11 +262,11 @@ def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> 
     from safetensors.torch import save
 
     data = save(tensors, {"state": json.dumps({**state, "format": CHECKPOINT_FORMAT})})
-    name = f"{state['iteration']:06d}-{sha256_of(data)}.safetensors"
-    make_folder(folder)
-    atomic_write(folder / name, data)
+    name = f"{state['iteration']:06d}-{files.sha256_of(data)}.safetensors"
+    files.make_folder(folder)
+    files.atomic_write(folder / name, data)
     for damaged in [path for path in _checkpoint_files(folder) if path.name[:7] == name[:7] and path.name != name]:
-        remove(damaged)
+        files.remove(damaged)
     _remove_old_checkpoints(folder)
 
 
@@ -293,10 +283,10 @@ def restore_newest_checkpoint(
     _remove_old_checkpoints(folder / "checkpoint")
     iteration = checkpoint[0]["iteration"] if checkpoint else 0
     for place in progress_folders:
-        remove_leftovers(place)
+        files.remove_leftovers(place)
         if (place / PROGRESS_FILE).is_file():
-            rows = [to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= iteration]
-            atomic_write(place / PROGRESS_FILE, "".join(rows))
+            rows = [files.to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= iteration]
+            files.atomic_write(place / PROGRESS_FILE, "".join(rows))
     return checkpoint
 
 
@@ -307,7 +297,7 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
     for path, state, data in _valid_checkpoints(folder):
         try:
             found, tensors = state.pop("format", 1), load(data)
-        except INVALID_DATA_ERRORS:
+        except files.INVALID_DATA_ERRORS:
             continue
         if found != CHECKPOINT_FORMAT:
             raise InputError(
@@ -323,10 +313,10 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
 def _valid_checkpoints(folder: Path) -> Iterator[tuple[Path, dict[str, Any], bytes]]:
     """Yield file, state and content of the checkpoints with a correct hash, the newest first."""
     for path in reversed(_checkpoint_files(folder)):
-        with suppress(*INVALID_DATA_ERRORS):
+        with suppress(*files.INVALID_DATA_ERRORS):
             data = path.read_bytes()
             header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-            if f"-{sha256_of(data)}." in path.name:
+            if f"-{files.sha256_of(data)}." in path.name:
                 yield path, dict(json.loads(header["__metadata__"]["state"])), data
 
 
@@ -338,10 +328,10 @@ def check_run_files(folder: Path, config: RunConfig, command: str) -> None:
 
 
 def _remove_old_checkpoints(folder: Path) -> None:
-    remove_leftovers(folder)
+    files.remove_leftovers(folder)
     for old in _checkpoint_files(folder)[:-MAX_CHECKPOINTS]:
         with suppress(DiskError):
-            remove(old)
+            files.remove(old)
 
 
 def _checkpoint_files(folder: Path) -> list[Path]:

@@ -45,13 +45,13 @@ def call_backend(label: str, function: Callable[..., Any], *arguments: Any) -> A
     except UnjamError:
         raise
     except (Exception, SystemExit) as error:
-        frames = [(frame, line) for frame, line in walk_tb(error.__traceback__) if _is_user_code(frame.f_globals)]
-        where = f" ({Path(frames[-1][0].f_code.co_filename).name}, line {frames[-1][1]})" if frames else ""
+        frames = [
+            (Path(frame.f_code.co_filename).name, line)
+            for frame, line in walk_tb(error.__traceback__)
+            if str(frame.f_globals.get("__name__")).startswith(USER_MODULE_PREFIX)
+        ]
+        where = " ({}, line {})".format(*frames[-1]) if frames else ""
         raise InputError(f"backend: {label}: {type(error).__name__}: {error}{where}") from error
-
-
-def _is_user_code(module: dict[str, Any]) -> bool:
-    return str(module.get("__name__")).startswith(USER_MODULE_PREFIX)
 
 
 class CheckedWorld:

@@ -231,7 +231,10 @@ def make_reward(text: RewardLike) -> Reward:
             raise invalid_value(f"reward {name}: {term}", weight, "a number")
     if not is_file_reference(name) and name not in REWARDS:
         raise unknown_name("reward", name, [*REWARDS, "path.py:name"])
-    reward = REWARDS.get(name) or _file_reward(FileReference.parse(name))
+    reward = REWARDS.get(name)
+    if reward is None:
+        reference = FileReference.parse(name)
+        reward = _user_reward(UserFunction.from_object(reference.load_object(), "an Outcome", reference))
 
     def weighted_reward(outcome: Outcome) -> dict[str, Array]:
         terms = dict(reward(outcome))
@@ -248,10 +251,6 @@ def make_reward(text: RewardLike) -> Reward:
 def is_packaged_reward(reward: RewardLike) -> bool:
     """Return whether a reward is one of the package, with or without weights, instead of a user's function."""
     return isinstance(reward, str) and not is_file_reference(split_parameters(reward)[0])
-
-
-def _file_reward(reference: FileReference) -> Reward:
-    return _user_reward(UserFunction.from_object(reference.load_object(), "an Outcome", reference))
 
 
 def _user_reward(function: UserFunction) -> Reward:

@@ -92,13 +92,6 @@ def look_ahead_distance(max_speed: Array, time_headway: Array, braking: Array, s
     return max_speed * (step + time_headway) + stopping_distance(max_speed, braking, step)
 
 
-def lane_end_leader(speed: Array, distance: Array, parameters: HumanParameters) -> Leader:
-    """Return the leader of drivers above their desired speed: the end of their lane, as a standing vehicle."""
-    desired = parameters.desired_speed
-    secure_gap = desired * (parameters.time_headway + desired / parameters.interaction_scale)
-    return Leader(0.0 * speed, clamp_min(distance, secure_gap))
-
-
 def ring_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
     """Return which vehicles, (vehicles, ...), touch the one ahead: SUMO requires both fronts on the same lane."""
     xp = namespace(position)
@@ -129,10 +122,12 @@ def slow_to_desired_speed(
     new_speed: Array, speed: Array, distance_to_end: Array, parameters: HumanParameters, step: float
 ) -> Array:
     """Return the speeds after a step where drivers above their desired speed brake for the end of their lane [m/s]."""
-    xp, is_too_fast = namespace(speed), speed > parameters.desired_speed  # because of noise
-    if bool(is_too_fast.any()):
-        end = lane_end_leader(speed, distance_to_end, parameters)
-        slower = human_idm_speed(speed, *end, without_minimum_gap(parameters), step)
+    xp, desired = namespace(speed), parameters.desired_speed
+    is_too_fast = speed > desired  # because of noise
+    if bool(is_too_fast.any()):  # the end of the lane is a standing leader, at least SUMO's `getSecureGap` ahead
+        secure_gap = desired * (parameters.time_headway + desired / parameters.interaction_scale)
+        gap = clamp_min(distance_to_end, secure_gap)
+        slower = human_idm_speed(speed, 0.0 * speed, gap, without_minimum_gap(parameters), step)
         braking = clamp_min(parameters.comfortable_deceleration, MIN_OVERSPEED_BRAKING)
         min_speed = speed - braking * step - OVERSPEED_BRAKING_TOLERANCE
         new_speed = xp.where(is_too_fast, xp.minimum(new_speed, xp.maximum(slower, min_speed)), new_speed)

@@ -94,7 +94,13 @@ def _run_at_once(
         return [episode for task in tasks for episode in _run_at_once([task], to_array, (), allow_statistical)]
     world = kind.world.from_tasks(tasks, to_array)
     if first.scenario.warmup > 0:
-        keys, upcoming_keys = (list(map(_warm_up_key, each)) for each in (tasks, upcoming))
+        keys, upcoming_keys = (
+            [
+                (cast(LoopScenario, task.scenario), task.seed, task.driver.requirements().measured_fields)
+                for task in each
+            ]
+            for each in (tasks, upcoming)
+        )
         cast(RingBatch, world).warm_up_states = warm_up_states(keys, upcoming_keys)
     driver = _combined_driver(tasks, world.values_of_cavs)
     explore = float(any(task.explore for task in tasks)) if kind.has_own_drivers else first.explore
@@ -135,10 +141,6 @@ def _combined_driver(tasks: Sequence[EpisodeTask], to_cavs: Callable[[Array], Ar
         return drivers[0]
     indices = np.array([drivers.index(task.driver) for task in tasks])
     return DriverPerRoad(tuple(drivers), lambda: to_cavs(indices))
-
-
-def _warm_up_key(task: EpisodeTask) -> _WarmUpKey:
-    return cast(LoopScenario, task.scenario), task.seed, task.driver.requirements().measured_fields
 
 
 def warm_up_states(keys: Sequence[_WarmUpKey], upcoming: Sequence[_WarmUpKey]) -> list[WarmUpState]:

@@ -18,8 +18,8 @@ from unjam.worlds.record import Episode, Floats
 from unjam.worlds.road_world import RoadScene
 from unjam.worlds.sumo.inputs import lane_change_parameters
 from unjam.worlds.sumo.networks import network_file, network_geometry
+from unjam.worlds.sumo.road_control import SpeedCaps
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.speed_caps import SpeedCaps
 from unjam.worlds.sumo.traffic import OpenRoadT, Traffic
 from unjam.worlds.world import DriverLog, ProgressCallback
 

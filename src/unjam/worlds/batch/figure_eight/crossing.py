@@ -149,7 +149,9 @@ class FigureEightMovement:
     def move(self, speed: Array, position: Array, leader: Leader, noise: Array, cav_speeds: Array) -> Array:
         """Return the speeds after a step, (vehicles, W), with `noise` [m/s], and commands (CAVs, W) or None."""
         commanded = clamp_min(self._human_model(speed, *leader) + noise, 0.0)
-        is_commanded = ~self._is_on_crossing(position)
+        place = position % self._loop_length
+        (major_start, major_end), (minor_start, minor_end) = self._crossings  # where SUMO drives humans itself
+        is_commanded = ((place < major_start) | (major_end <= place)) & ((place < minor_start) | (minor_end <= place))
         if cav_speeds is not None:
             commanded[self._cav_indices], is_commanded[self._cav_indices] = cav_speeds, True
         return self._next_speeds(speed, position, leader, commanded, is_commanded)
@@ -158,12 +160,6 @@ class FigureEightMovement:
         """Return the distance of each vehicle past the start of the crossing, on both sides, wrapped to one lap [m]."""
         sumo_position = position + self._position_offset
         return [(sumo_position - side.start) % self._sumo_loop_length for side in self._sides]
-
-    def _is_on_crossing(self, position: Array) -> Array:
-        """Return which vehicles are on the crossing, where SUMO itself drives human-driven vehicles."""
-        place = position % self._loop_length
-        (major_start, major_end), (minor_start, minor_end) = self._crossings
-        return ((major_start <= place) & (place < major_end)) | ((minor_start <= place) & (place < minor_end))
 
     def _next_speeds(
         self, speed: Array, position: Array, leader: Leader, commanded_speed: Array, is_commanded: Array

@@ -37,7 +37,7 @@ class RecordedBatch(RingBatch):
         self._ends = to_array(np.minimum(counts, scenarios[0].horizon).astype(np.float64))
         self._road_ends = to_array(np.array([road.network.edges[0].length for road in self.roads]))
         self._noise_scale[-1] = 0.0
-        self._find_contacts = platoon_contacts
+        self._find_contacts = lambda position, gap, loop_length: gap < CONTACT_GAP
 
     @property
     def is_running(self) -> Array:
@@ -75,8 +75,3 @@ class RecordedBatch(RingBatch):
         replayed = self._replayed_speeds[as_indices(self._next_samples), self._columns][None]
         self._next_samples = clamp_max(self._next_samples + 1.0, len(self._replayed_speeds) - 1.0)
         return xp.concatenate([moved[:-1], replayed]), xp.concatenate([speeds[:-1], replayed])
-
-
-def platoon_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
-    """Return which vehicles touch the vehicle ahead; shapes as of `ring_contacts`."""
-    return gap < CONTACT_GAP

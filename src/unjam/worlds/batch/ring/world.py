@@ -87,11 +87,8 @@ class RingBatch:
     ) -> None:
         """Put the vehicles on the roads, at rest; the scenarios differ only in their lengths.
 
-        Args:
-            to_array: makes the arrays of the simulation, for instance NumPy's or torch's, in any precision.
-            keep_record: whether to keep whole episodes, some 16 bytes for each vehicle and step in float64.
-            draw: draws all noise; None: each road draws the same noise as SUMO's episode.
-            human_model: of human drivers away from junctions, instead of SUMO's IDM.
+        Arrays are those of `to_array`. Whole episodes take 16 bytes for each vehicle and step (`keep_record`). `draw`
+        draws all noise, or each road that of SUMO's episode. `human_model` replaces SUMO's IDM away from junctions.
         """
         scenario = self.scenario = scenarios[0]
         drawn = [each.draw_from_seed(seed) for each, seed in zip(scenarios, seeds, strict=True)]
