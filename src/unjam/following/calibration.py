@@ -286,6 +286,5 @@ def calibrate_human_drivers(recordings: Iterable[LocalState], scenario: Scenario
     if not trajectories:
         return known
     fixed = {name: (getattr(known, name),) * 2 for name in ("desired_speed", "minimum_gap")}
-    return replace(
-        calibrate_idm(trajectories, replace(CAV_FOLLOWER_SETTINGS, **fixed)).parameters, exponent=known.exponent
-    )
+    calibrated = calibrate_idm(trajectories, replace(CAV_FOLLOWER_SETTINGS, **fixed))
+    return replace(calibrated.parameters, exponent=known.exponent)

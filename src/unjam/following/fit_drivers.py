@@ -223,15 +223,13 @@ def _fit_residual(
     """Return the residual, or None if it does not reduce the gap errors; and facts about the fit."""
     from unjam.following.networks import CalibratedTrajectories, fit_multi_step  # imports torch, which IDMs do not need
 
-    split = split_by_driver(
-        trajectories, (1.0 - RESIDUAL_VALIDATION_SHARE, RESIDUAL_VALIDATION_SHARE, 0.0), settings.seed
-    )
+    shares = 1.0 - RESIDUAL_VALIDATION_SHARE, RESIDUAL_VALIDATION_SHARE, 0.0
+    split = split_by_driver(trajectories, shares, settings.seed)
     parts = [select_splits(split, name) for name in ("train", "validation")]
     drivers = [[calibrated[each.driver].parameters for each in part] for part in parts]
     training, validation = map(CalibratedTrajectories, parts, drivers)
-    network, errors = fit_multi_step(
-        training, validation, settings.calibration.limits, settings.multi_step, settings.seed
-    )
+    limits = settings.calibration.limits
+    network, errors = fit_multi_step(training, validation, limits, settings.multi_step, settings.seed)
     is_better = min(errors) < errors[0]
     facts = {"residual_gap_errors": errors, "residual_is_better": is_better}
     return network.to_numpy_network() if is_better else None, facts

@@ -195,10 +195,8 @@ def fit_multi_step(
     """
     torch.set_num_threads(1)
     network = FollowingNetwork(settings, following_samples(training.trajectories), seed, zero_init=True)
-    segments, whole = (
-        make_segments(training.trajectories, settings.segment_seconds),
-        make_segments(validation.trajectories),
-    )
+    segments = make_segments(training.trajectories, settings.segment_seconds)
+    whole = make_segments(validation.trajectories)
     base = validation.model(whole.trajectory_index, limits)
 
     def gap_error() -> float:
@@ -211,9 +209,8 @@ def fit_multi_step(
     errors, best_state = [gap_error()], deepcopy(network.state_dict())
     for step in range(1, settings.gradient_steps + 1):
         batch = segments.select(generator.choice(segments.gap.shape[1], settings.batch_size))
-        loss = _gap_loss(
-            network, training.model(batch.trajectory_index, limits, as_tensors=True), limits, batch, settings
-        )
+        base_model = training.model(batch.trajectory_index, limits, as_tensors=True)
+        loss = _gap_loss(network, base_model, limits, batch, settings)
         if not torch.isfinite(loss):
             raise UnjamError(f"following network: the loss of step {step} is not finite")
         optimizer.zero_grad()

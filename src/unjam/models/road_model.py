@@ -250,6 +250,5 @@ def fit_human_model(
         "training_loss": fit.loss,
     }
     learned = ("speed",) if model.output_mask.any() else ()
-    return ensemble.ModelFit(
-        estimates, {"speed": one_step}, learned, fit.training_rows, len(fit.holdout_indices), fit.epochs
-    )
+    holdout_rows = len(fit.holdout_indices)
+    return ensemble.ModelFit(estimates, {"speed": one_step}, learned, fit.training_rows, holdout_rows, fit.epochs)

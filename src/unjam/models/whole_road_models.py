@@ -105,9 +105,8 @@ class ClosedRoadModel(WholeRoadModel[road_model.RoadSamples]):
         """Yield the episodes of a plan with `StartIndices` as starts, in one batch."""
         rows = self.cavs_per_start * len(plan.starts)
         memory = plan.driver.initial_memory(rows) | {EXPERT_KEY: self._expert_memory(plan.starts)}
-        human_model = road_model.learned_human_model(
-            self.ensemble, self.scenario, torch_generator(plan.noise_seed, "cpu")
-        )
+        generator = torch_generator(plan.noise_seed, "cpu")
+        human_model = road_model.learned_human_model(self.ensemble, self.scenario, generator)
         yield self.simulate(plan.driver, memory, plan.starts, plan.control_steps, human_model, plan.exploration_seed)
 
     def simulate(

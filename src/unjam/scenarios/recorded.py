@@ -166,9 +166,8 @@ class Recorded(Scenario):
         """What was read of the recordings, so that a wrong unit or a gap in time is seen."""
         path, files, found = Path(self.recordings), recording_files(Path(self.recordings)), self._leaders
         seconds, speeds = [each.seconds for each in found], np.concatenate([each.speed for each in found])
-        source = (
-            path.name if path.is_file() else f"{len(files)} {'file' if len(files) == 1 else 'files'} of {path.name}"
-        )
+        count = f"{len(files)} {'file' if len(files) == 1 else 'files'}"
+        source = path.name if path.is_file() else f"{count} of {path.name}"
         parts = f"{len(found)} parts of {min(seconds):.0f} to" if len(found) > 1 else ""
         text = f"{parts} {max(seconds):.0f} s with speeds of {speeds.min():.1f} to {speeds.max():.1f} m/s"
         drawn = {"random": ", drawn at random", "name": ", in the order of their names"}[self.order]

@@ -225,9 +225,8 @@ class CalibrationResult:
         """Return the mean of each measure with its CI: original, calibrated, and the paired difference."""
         estimates = {}
         for name in asdict(self.original[0]):
-            before, after = (
-                np.array([getattr(each, name) for each in rows]) for rows in (self.original, self.calibrated)
-            )
+            both = self.original, self.calibrated
+            before, after = (np.array([getattr(each, name) for each in rows]) for rows in both)
             columns = {"original": before, "calibrated": after, "difference": after - before}
             bounds = (0.0, 1.0 if name == "geh_below_5" else inf)
             estimates[name] = {
@@ -292,9 +291,8 @@ def calibrate(
         text = trial.failure if trial.score is None else f"{trial.score:.4g}"
         on_message(f"{number + 1} of {trials}: {_factor_text(trial.factors)}: {text}")
     ranked = sorted((each for each in results if each.score is not None), key=_ranking_score)[:CALIBRATION_FINALISTS]
-    finalists = [
-        score_factors(each.factors, seeds_per_trial, 2 * seeds_per_trial) for each in (*ranked, original_trial)
-    ]
+    again = [*ranked, original_trial]
+    finalists = [score_factors(each.factors, seeds_per_trial, 2 * seeds_per_trial) for each in again]
     best = min(finalists, key=_ranking_score).factors
     on_message(f"evaluating on {CALIBRATION_TEST_SEEDS} test seeds: {_factor_text(best)}")
     before, after = (simulate(factors, held_out_seeds(CALIBRATION_TEST_SEEDS)) for factors in (original, best))

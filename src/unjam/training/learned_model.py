@@ -137,8 +137,7 @@ class LearnedModel:
     def error_report(self) -> dict[str, Any]:
         """Return how well the model agrees with episodes of which no network learned: the facts of `unjam model`.
 
-        RMSE of a step (`one_step`, `by_state`) and of replays by time (`replay`); the paper's `bound` by length, or
-        None.
+        RMSE of a step (`one_step`, `by_state`) and of replays by time (`replay`); the `bound` by length, or None.
         """
         return trained_model_facts(self._trained)
 

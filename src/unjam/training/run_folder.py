@@ -181,8 +181,7 @@ def _write_manifest(folder: Path) -> None:
 def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
     """Return the configuration of a run folder; raise `InputError` if it is none, or of another format.
 
-    Also if it names untrusted Python code: without `check_trust` only if its roads do, and no other code may be run
-    then.
+    Also if it names untrusted Python code: without `check_trust` only if its roads do; no other may be run then.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():

@@ -84,9 +84,8 @@ class TrainResult:
         table = metric_frame(self.rows)
         lines = [f"training run {self.folder}", table.to_string(index=False)]
         if self.gain:
-            lines.append(
-                f"return compared with the expert: {self.gain.mean:+.1f} {format_ci(self.gain, '.1f')}".strip()
-            )
+            gain = f"{self.gain.mean:+.1f} {format_ci(self.gain, '.1f')}".strip()
+            lines.append(f"return compared with the expert: {gain}")
         return "\n".join([*lines, f"controller: {self.controller}"])
 
     @property
@@ -254,10 +253,9 @@ class Trainer:
             self._save_controllers(self.network(), is_best=True)
             self._best_validation = self._sampler.weighted_mean(self._expert_returns)
         if not self.config.evaluation.should_stop_early(read_progress(self.folder)):
-            with reporting_user_errors(self.config.agent):
-                run_iterations(
-                    self.algorithm, self.collector, self.config.steps, self.config.seed, self.finish_iteration
-                )
+            config = self.config
+            with reporting_user_errors(config.agent):
+                run_iterations(self.algorithm, self.collector, config.steps, config.seed, self.finish_iteration)
 
     def network(self) -> Network:
         """Return the present policy."""

@@ -130,10 +130,8 @@ class OrderedRoadLog:
         return self.speeds.T, np.column_stack([start, positions])
 
     def _local_states(self, speeds: Floats, positions: Floats) -> LocalState:
-        neighbors = loop_neighbors(self.cav_indices, len(self.start_positions))
-        return loop_state(
-            speeds, positions, neighbors, self.road.loop_length, self.road.crossings, self.penetration_rate
-        )
+        road, neighbors = self.road, loop_neighbors(self.cav_indices, len(self.start_positions))
+        return loop_state(speeds, positions, neighbors, road.loop_length, road.crossings, self.penetration_rate)
 
     def episode(
         self,

@@ -4,7 +4,6 @@ SUMO's rings have four lanes in a row. Drivers brake for the vehicle ahead on th
 on each visible lane further ahead: the next one, and others as far as they need to stop, but at least 25 m of lanes.
 Sources: SUMO's MSCFModel_IDM (`_v`), MSCFModel (`finalizeSpeed`, `brakeGap`) and MSVehicle (`executeMove`,
 `planMoveInternal`).
-
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -56,7 +55,6 @@ def leaders(
     """Yield the leader of each vehicle on its own lane, on the next one, and so on as far as any driver sees.
 
     Shapes: (vehicles, W); `loop_length` (W,). Positions are those of front bumpers; `leader` is the vehicle ahead.
-
     """
     xp, lane_length, place = namespace(speed), loop_length / RING_EDGES, position % loop_length
     lane = xp.floor(place / lane_length)

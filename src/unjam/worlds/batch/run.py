@@ -72,7 +72,6 @@ def run_batch(
     Tasks differ at most in road length, seed and driver, and on motorways in exploration; else, or if they are not
     supported, raise `InputError`. Warm-ups of `upcoming` tasks are simulated with theirs. `allow_statistical` allows
     scenarios with episodes that equal SUMO's only in distribution.
-
     """
     first = tasks[0]
     if any(_shared_settings(task) != _shared_settings(first) for task in tasks):
@@ -94,14 +93,11 @@ def _run_at_once(
         return [episode for task in tasks for episode in _run_at_once([task], to_array, (), allow_statistical)]
     world = kind.world.from_tasks(tasks, to_array)
     if first.scenario.warmup > 0:
-        keys, upcoming_keys = (
-            [
-                (cast(LoopScenario, task.scenario), task.seed, task.driver.requirements().measured_fields)
-                for task in each
-            ]
-            for each in (tasks, upcoming)
-        )
-        cast(RingBatch, world).warm_up_states = warm_up_states(keys, upcoming_keys)
+
+        def key(task: EpisodeTask) -> _WarmUpKey:
+            return cast(LoopScenario, task.scenario), task.seed, task.driver.requirements().measured_fields
+
+        cast(RingBatch, world).warm_up_states = warm_up_states([*map(key, tasks)], [*map(key, upcoming)])
     driver = _combined_driver(tasks, world.values_of_cavs)
     explore = float(any(task.explore for task in tasks)) if kind.has_own_drivers else first.explore
     episodes = finish_drive(start_batch_drive(world, driver, to_array, explore))

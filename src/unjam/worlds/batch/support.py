@@ -54,7 +54,6 @@ def statistically_unsupported_reason(scenario: Scenario) -> str:
 
     On figure eights nearly all steps equal SUMO's, but one other decision about the right of way changes the queue. On
     on-ramps, all vehicles change lanes at once, and drivers' errors are other draws.
-
     """
     if kind := batch_kind(scenario):
         return kind.reason(scenario)

@@ -138,9 +138,8 @@ def _type_variant_xml(
     if attributes.get("carFollowModel") == "W99":  # which accelerates by its own parameter
         others["accel"] = attributes.get("cc8", W99_ACCELERATION)
     element = xml_element("vType", **{**others, "speedFactor": 1.0, "speedDev": 0.0, **car_following, "id": name})
-    nested = "".join(
-        xml_element("param", key=key, value=parameters[key]) for key in parameters if is_harmless_parameter(key)
-    )
+    harmless = filter(is_harmless_parameter, parameters)
+    nested = "".join(xml_element("param", key=key, value=parameters[key]) for key in harmless)
     return f"{element.removesuffix('/>')}>{nested}</vType>"
 
 

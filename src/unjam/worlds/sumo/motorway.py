@@ -40,10 +40,8 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         self._measurement = SpeedMeasurement(road.roadside, self._road_sections, limit, step)
         self._messages = RoadsideMessages(road.roadside, step, self.noise_generator)
         self._entered_is_cav: list[bool] = []
-        scenario, ramps = (
-            cast(Motorway, self.scenario),
-            zip(self._geometry.ramps, self._geometry.route_names[1:], strict=True),
-        )
+        scenario = cast(Motorway, self.scenario)
+        ramps = zip(self._geometry.ramps, self._geometry.route_names[1:], strict=True)
         is_controlled = scenario.speed_limit_control.active or scenario.ramp_meter.active
         self._ramp_controls = [
             RampControl(self._simulation, self._speed_caps, scenario, *ramp) for ramp in ramps if is_controlled

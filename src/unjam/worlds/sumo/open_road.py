@@ -181,9 +181,8 @@ class OpenTraffic(Traffic[OpenRoadT]):
         shield = dict.fromkeys(names, 0.0)
         reductions: dict[str, list[float]] = {name: [] for name in names}
         for _ in range(scenario.steps_per_control_step):
-            active = {
-                name: value for name, value in zip(names, requested, strict=False) if name in self._vehicles.is_cav
-            }
+            values = zip(names, requested, strict=False)
+            active = {name: value for name, value in values if name in self._vehicles.is_cav}
             commanded, safe = self._safe_speeds(active)
             for name, value in safe.items():
                 reductions[name].append(active[name] - value)

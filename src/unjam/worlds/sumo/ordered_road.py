@@ -67,8 +67,7 @@ class OrderedTraffic(Traffic[OrderedRoad]):
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
         """Run the warm-up, then hand the CAVs to the driver unless they stay human (`is_controlled` false).
 
-        Return the CAVs' states in the last minute of the warm-up, (CAVs, moments), oldest first; None if not
-        remembered.
+        Return the CAVs' states in the last minute of the warm-up, (CAVs, moments), oldest first, or None.
         """
         scenario, road, history = self.scenario, self.road, None
         self._penetration_rate = road.provided_penetration_rate(self.options.measured_fields)

@@ -3,7 +3,6 @@
 It is the improved IDM of Treiber and Kesting, with coolness towards vehicles that cut in, a bounded jerk, slow starts,
 and errors in the estimation of gaps and speeds. All drivers act in each of the `EIDM_SUBSTEPS` of a simulation step.
 Sources: SUMO's MSCFModel_EIDM (`_v`, `finalizeSpeed`, `slowToStartTerm`); Salles, Kaufmann and Reuss 2020.
-
 """
 
 from math import exp, sqrt
@@ -194,7 +193,6 @@ def finalize_eidm_speed(
     """Return the speeds after a step with bounded jerk and slow starts, and the time of the last start [s].
 
     `acceleration` is that of the previous step; speeds are those of `eidm_speed_bounds`.
-
     """
     is_rolling = speed > 2.0 * CLUTCH_ENGAGE_SPEED
     change, previous_change = desired - speed, acceleration * step

@@ -5,7 +5,6 @@ all that gain by a change, which agrees in distribution. From each lane, only on
 ramp's lane and the right lane, right from the left lane. Vehicles that must change ask others to make room.
 Sources: SUMO's MSLaneChanger (`getRealLeader`, `getRealFollower`, `checkChange`) and MSLCM_LC2013 (`_wantsChange`,
 `anticipateFollowSpeed`, `informLeader`, `informFollower`, `slowDownForBlocked`).
-
 """
 
 from typing import NamedTuple
@@ -141,11 +140,8 @@ def mandatory_lane_changes(
     rows = np.arange(len(position))[is_urgent]
     if len(rows) == 0:
         return vehicles, is_urgent, is_asked
-    own, cooperative, bias = (
-        vehicles.own_advice.copy(),
-        vehicles.cooperative_advice.copy(),
-        vehicles.speed_bias.copy(),
-    )
+    own, cooperative = vehicles.own_advice.copy(), vehicles.cooperative_advice.copy()
+    bias = vehicles.speed_bias.copy()
     merging = _MergingVehicles(vehicles, context, geometry, rows)
     leader, follower = merging.leader, merging.follower
     planned, own_advice, overtakes = merging.plan_with_leader()

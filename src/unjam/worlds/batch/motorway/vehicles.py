@@ -1,7 +1,6 @@
 """The vehicles of W motorways in one table, those of each road from front to back, with their drivers.
 
 Arrays have shape (n,) for the n vehicles on a road now; m/s, m and s. Functions return new records and columns.
-
 """
 
 from collections.abc import Callable
@@ -142,7 +141,6 @@ class MotorwayDrivers(NamedTuple):
         """Return the maximum speed from which drivers that brake a headway later stop behind leaders that brake.
 
         Source: SUMO's MSCFModel (`maximumSafeFollowSpeed`); gaps are beyond the minimum gap.
-
         """
         braking = self.parameters.comfortable_deceleration
         change, delay = braking * step, self.parameters.time_headway / step

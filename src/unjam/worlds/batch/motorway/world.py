@@ -148,8 +148,7 @@ class MotorwayBatch:
     def replace_roads(self, roads: Sequence[int], source: Self, source_roads: Sequence[int]) -> None:
         """Continue on some roads with those of another batch that has just been started, which are empty.
 
-        Both batches keep no record and have the same scenario, without detectors, whose intervals are those of the
-        batch.
+        Both keep no record and have the same scenario, without detectors, whose intervals are those of the batch.
         """
         rows = np.flatnonzero(~np.isin(self.cav_roads, roads))
         self._cav_numbers, self.cav_count = self._cav_numbers[rows], len(rows)
