@@ -19,8 +19,8 @@ from unjam.learners.algorithm_1 import Algorithm1, make_algorithm
 from unjam.learners.learner import Update
 from unjam.learners.model_rollouts import ModelRollouts, rollout_experience
 from unjam.learners.settings import AGENT_NAMES, PolicySettings, PPOSettings, SACSettings, TD3Settings, TRPOSettings
+from unjam.models.registry import RowWorldModel
 from unjam.models.rollouts import RolloutBatch
-from unjam.models.row_world_model import RowWorldModel
 from unjam.models.settings import ModelSettings
 from unjam.models.world_model import RolloutPlan
 from unjam.physics.idm import IDMParameters

@@ -7,9 +7,9 @@ from unjam.drivers import IDM, ResidualDriver
 from unjam.models.comparison import one_step_errors, open_loop_errors, recorded_states, replay_accelerations
 from unjam.models.ensemble import torch_generator
 from unjam.models.environment_data import EnvironmentData
+from unjam.models.registry import RowWorldModel
 from unjam.models.rollouts import prepare_starts, roll_out
 from unjam.models.row_model import STATE_FIELDS, RowModel, fit_row_model
-from unjam.models.row_world_model import RowWorldModel
 from unjam.models.settings import ModelSettings
 from unjam.models.world_model import RolloutPlan
 from unjam.worlds.episode import Task

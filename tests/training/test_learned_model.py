@@ -15,7 +15,7 @@ from unjam.controller import make_driver
 from unjam.drivers.network import Network
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError
-from unjam.models.row_world_model import RowWorldModel
+from unjam.models.registry import RowWorldModel
 from unjam.models.world_model import RolloutPlan
 from unjam.training.config import to_toml
 from unjam.training.learned_model import LearnedModel

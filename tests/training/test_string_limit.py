@@ -16,7 +16,6 @@ from unjam.errors import InputError, UnjamError
 from unjam.reports.results import read_progress
 from unjam.scenarios import Ring
 from unjam.scenarios.motorway import ON_RAMP
-from unjam.training import setting_sampler
 from unjam.training.search_space import SearchSpace
 from unjam.training.string_limit import MAX_STRING_GAIN, OperatingPoint, find_operating_points
 from unjam.training.train import train
@@ -58,7 +57,7 @@ def test_settings_that_amplify_are_never_tried_and_a_resumed_tuning_knows_them(t
 def test_an_expert_that_always_amplifies_ends_the_tuning_with_its_smallest_gain(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(setting_sampler, "MAX_REFUSED_SETTINGS", 3)
+    monkeypatch.setattr("unjam.training.tune.MAX_REFUSED_SETTINGS", 3)
     space: SearchSpace = {"catch_up_speed": FloatDistribution(1.0, 3.0)}
     message = r"3 settings of pi in a row have a string gain of at least 1\.\d+; allowed: at most 1.02, or another"
     with WorkerPool(1) as workers, pytest.raises(UnjamError, match=message):

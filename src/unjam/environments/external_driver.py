@@ -25,9 +25,8 @@ class ExternalDriver(Driver):
 
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
         """Return those of the expert and of the features."""
-        return merge_requirements(
-            self.expert.requirements(road), *(feature(each).requirements for each in self.features)
-        )
+        of_features = (feature(each).requirements for each in self.features)
+        return merge_requirements(self.expert.requirements(road), *of_features)
 
     def replace_rows(self, rows: Any, source: "ExternalDriver", source_rows: Any) -> None:
         """Let some CAVs go on with the last observation of CAVs of another driver of this kind."""

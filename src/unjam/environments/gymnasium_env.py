@@ -82,7 +82,6 @@ class RoadStepResult(NamedTuple):
     reward: float
     reward_terms: dict[str, float]
     terminated: bool
-    """whether there was a collision"""
     truncated: bool
     """whether the horizon is reached, or no CAV will be on the road again"""
 
@@ -100,10 +99,7 @@ class RoadStepper:
         backend: BackendLike = "sumo",
         has_single_cav: bool = False,
     ) -> None:
-        """Prepare a scenario, with arguments as `RoadEnv`; the first `reset` opens the backend.
-
-        `has_single_cav`: one CAV replaces a penetration rate.
-        """
+        """Prepare a scenario, with arguments as `RoadEnv`; one CAV may replace a penetration rate."""
         made = make_scenario(scenario, changes)
         if has_single_cav and getattr(made, "cavs", 1) is None:
             changes = {**changes, "cavs": 1}
@@ -113,7 +109,6 @@ class RoadStepper:
         """that of the constructor; `episode_scenario` is that of the last reset, with its options"""
         reward = reward or self.scenario.reward
         self._reward, self.has_user_reward = make_reward(reward), not is_packaged_reward(reward)
-        """whether the reward is a user's function"""
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
         inputs = as_features(features)
         if not expert and (useless := [name for name in ("expert_acceleration", "expert_memory") if name in inputs]):
@@ -130,7 +125,6 @@ class RoadStepper:
         self._backend_context, self._world_context = ExitStack(), ExitStack()
         bound = np.full(observation_size(self._driver.features, driver), MAX_OBSERVATION, np.float32)
         self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
-        """observation space of one CAV"""
         low, high = (np.full(1, limit, np.float32) for limit in self.scenario.acceleration_limits)
         self.action_space = spaces.Box(low, high, dtype=np.float32)
         """action space of one CAV: an acceleration [m/s2]"""
@@ -161,9 +155,8 @@ class RoadStepper:
     ) -> Observations:
         """Start an episode, run its warm-up, and return the first observations.
 
-        It is that of `seed`; without one, the next after that of the last seed, or one with a seed from `generator`.
-        `options` are changes to the parameters of the scenario, in addition to those of the constructor, for this
-        episode alone.
+        It is that of `seed`, or the next after the last seed, at first one from `generator`. `options` change
+        parameters of the scenario in this episode alone.
         """
         seed = None if seed is None else check_integer("seed", seed, 0)
         warn_of_reserved_seed(seed)
@@ -193,10 +186,7 @@ class RoadStepper:
         return self._observe()
 
     def step(self, actions: Any) -> RoadStepResult:
-        """Advance one control step with `actions`, shape (CAVs,), added to the expert's accelerations [m/s2].
-
-        Without CAVs on the road, the simulation continues until the next one enters.
-        """
+        """Advance one control step with `actions` [m/s2], (CAVs,), and on without CAVs until the next one enters."""
         world, before, last_observations = self.world, list(self.world.cav_ids), self._observations
         self._driver.actions = float(actions[0]) if world.is_scalar else np.asarray(actions, np.float64)
         if next(self._control_steps, None) is None:
@@ -223,10 +213,7 @@ class RoadStepper:
         return RoadStepResult(list(world.cav_ids), self._observe(), departed, reward, terms, terminated, truncated)
 
     def step_info(self, result: RoadStepResult, has_ended: bool) -> dict[str, Any]:
-        """Return `reward_terms` and, at the end of an episode, `episode_metrics`, as `RoadVectorEnv`.
-
-        Where vehicles enter and leave, these are only `return` and `steps`: means over control steps are no metrics.
-        """
+        """Return `reward_terms` and, at the end, `episode_metrics`; on open roads only `return` and `steps`."""
         if not has_ended:
             return {"reward_terms": result.reward_terms}
         means = {} if self._metric_means is None else self._metric_means.means()

@@ -7,9 +7,8 @@ import numpy as np
 
 from unjam.drivers.observation import FeatureLike
 from unjam.drivers.user_driver import DriverLike
-from unjam.environments.agents import RoadAgents
 from unjam.environments.gymnasium_env import RoadStepper, as_action
-from unjam.environments.slots import SlottedRoadEnv
+from unjam.environments.slots import RoadAgents, SlottedRoadEnv
 from unjam.environments.threads import synchronized
 from unjam.errors import InputError, format_count
 from unjam.worlds.backend import BackendLike
@@ -50,10 +49,7 @@ class ParallelRoadEnv(RoadAgents):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start the episode of `seed`; without a seed, the next episode of the last seed.
-
-        `options` are as in `RoadEnv.reset`. Raise `InputError` if the road can then have other CAVs.
-        """
+        """Start an episode as `RoadEnv.reset`; raise `InputError` if the road can then have other CAVs."""
         options = None if options == API_TEST_OPTIONS else options
         observations = self._road.reset(seed, np.random.default_rng(), options)
         if options and (others := {*self._road.episode_scenario.possible_cav_ids()}.difference(self.possible_agents)):

@@ -32,7 +32,6 @@ class SlottedEpisodes(Episodes):
     """Episodes on W motorways, the driver of their CAVs, and the slots of these, S on each road."""
 
     def __init__(self, world: MotorwayBatch, driver: ExternalDriver, slots: int) -> None:
-        """Start the episodes with empty roads, each of which will have a CAV."""
         self._shape = len(world.roads), slots
         self._slots = np.zeros(0, np.intp)
         """slot of each CAV on a road, or `NO_SLOT`"""
@@ -116,11 +115,7 @@ class SlottedRoadVectorEnv(RoadVectorEnv):
         features: Sequence[FeatureLike] = ("local",),
         **changes: Any,
     ) -> None:
-        """Prepare the environments; `slots` are those of each road, other arguments as of `RoadVectorEnv`.
-
-        Raises:
-            InputError: an argument is wrong, or a batch cannot simulate the scenario.
-        """
+        """Prepare the environments with `slots` on each road; other arguments as of `RoadVectorEnv`."""
         slots = check_integer("slots", slots, 1)
         for name in ("exact", "device"):
             if name in changes:

@@ -14,7 +14,6 @@ class CopyableLock:
     """A reentrant lock; copies of its owner get their own."""
 
     def __init__(self) -> None:
-        """Create it unlocked."""
         self.held = RLock()
 
     def __reduce__(self) -> tuple[type[Self], tuple[()]]:

@@ -76,7 +76,6 @@ class Episodes:
     """Episodes on the roads of a batch, and the driver of their CAVs."""
 
     def __init__(self, world: Any, driver: ExternalDriver, to_array: ArrayFactory) -> None:
-        """Start the episodes, with their warm-up."""
         self.world, self._driver, self._memory = world, driver, start_batch_drive(world, driver, to_array).memory
         self.observe()
 
@@ -246,7 +245,6 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         return np.flatnonzero(mask).tolist()
 
     def _seeds_of_environments(self, seed: Any) -> list[int | None]:
-        """Return a seed or None for each environment."""
         if isinstance(seed, int | np.integer):
             super().reset(seed=as_seed(seed)[0])
             return list(range(int(seed), int(seed) + self.num_envs))
@@ -278,10 +276,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         return Episodes(self.make_batch(rows), self._road.copy_driver(), self._kind.to_array)
 
     def _restart(self, rows: list[int]) -> None:
-        """Go on in some environments with their next episodes.
-
-        If one of these is not prepared, those of all environments are, because many warm-ups together are fast.
-        """
+        """Go on in some environments with their next episodes, prepared for all at once as warm-ups are."""
         if not self._prepared.keys() >= set(rows):
             missing = [row for row in range(self.num_envs) if row not in self._prepared]
             started = self._start_episodes(missing)

@@ -1,8 +1,7 @@
 """Calibration of the IDM to recorded drivers: the parameters whose simulated gaps are closest to the recorded ones.
 
-All drivers get the same parameters, or some parameters are individual. The error is that of the gap in a simulation
-behind the recorded leader. A least-squares fit of single accelerations would give a model that hardly reacts to its
-leader. Source of the method: Treiber and Kesting, Traffic Flow Dynamics (2013), chapter 16.
+A least-squares fit of single accelerations would give a model that hardly reacts to its leader. Source of the method:
+Treiber and Kesting, Traffic Flow Dynamics (2013), chapter 16.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -96,7 +95,6 @@ CALIBRATION_GRID_SIZE = 32
 CALIBRATION_TOLERANCE = 1e-3
 """absolute tolerance of the search for a single parameter, in the unit of the parameter"""
 CAV_FOLLOWER_SETTINGS = CalibrationSettings(candidates=4, generations=40)
-"""settings of `calibrate_human_drivers`"""
 
 
 @dataclass(frozen=True)
@@ -123,11 +121,8 @@ def calibrate_idm(
 ) -> CalibratedIDM:
     """Return the IDM parameters with the smallest error of the simulated gaps of all `trajectories`.
 
-    The search is differential evolution; all candidates and segments are simulated at once. `headway_factors` has a
-    known factor of the time headway for each trajectory.
-
-    Raises:
-        InputError: the trajectories have different time steps.
+    The search is differential evolution. `headway_factors` are known factors of the time headway of each trajectory.
+    Raise `InputError` if the trajectories have different time steps.
     """
     from scipy.optimize import differential_evolution  # takes half a second, which --help need not wait for
 
@@ -207,10 +202,8 @@ def calibrate_groups(
 ) -> list[CalibratedIDM]:
     """Calibrate parameters for each group of trajectories, for instance for each driver.
 
-    Only the parameters named in `individual` are searched; the others are those of `typical`. A minute of driving
-    determines the distance that a driver keeps, but not the desired speed on a free road. A single parameter is
-    searched for all groups at once. Several parameters are searched for one group after the other, which takes a second
-    for each group. `on_progress` is called with the number of finished groups.
+    Only parameters in `individual` are searched, a single one for all groups at once; others are those of `typical`. A
+    minute of driving determines a driver's distance, but not the desired speed. `on_progress` gets the finished groups.
     """
     settings = settings or CalibrationSettings()
     calibrated: list[CalibratedIDM] = []
@@ -278,10 +271,6 @@ def _minimize_on_grid(errors: Callable[[Floats], Floats], grid: Floats, group_co
 
 
 def _group_errors(mean_squares: Floats, segments: Segments, group: NDArray[np.int64], weighting: str) -> Floats:
-    """Return the error of each group from the mean squared errors of its segments.
-
-    `weighting` is one of `CalibrationSettings.weighting`.
-    """
     if weighting == "trajectory":
         first, weights = _trajectory_weights(segments)
         errors, group = np.sqrt(np.add.reduceat(mean_squares * weights, first)), group[first]
@@ -291,16 +280,11 @@ def _group_errors(mean_squares: Floats, segments: Segments, group: NDArray[np.in
 
 
 def calibrate_human_drivers(recordings: Iterable[LocalState], scenario: Scenario) -> IDMParameters:
-    """Calibrate the IDM to the followers of CAVs, see `trajectories_behind_cavs`.
-
-    Desired speed and minimum gap are those of the scenario, because slow traffic does not determine them. Without a
-    follower all parameters are those of the scenario.
-    """
+    """Calibrate the IDM to the followers of CAVs, if any; desired speed and minimum gap stay: slow traffic has none."""
     trajectories = trajectories_behind_cavs(recordings, scenario.control_step, scenario.steps_per_control_step)
     known = scenario.humans
     if not trajectories:
         return known
     fixed = {name: (getattr(known, name),) * 2 for name in ("desired_speed", "minimum_gap")}
-    return replace(
-        calibrate_idm(trajectories, replace(CAV_FOLLOWER_SETTINGS, **fixed)).parameters, exponent=known.exponent
-    )
+    calibrated = calibrate_idm(trajectories, replace(CAV_FOLLOWER_SETTINGS, **fixed))
+    return replace(calibrated.parameters, exponent=known.exponent)

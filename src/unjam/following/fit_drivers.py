@@ -37,7 +37,6 @@ MIN_RESIDUAL_DRIVERS = 5
 MIN_SUSPICIOUS_PARAMETERS = 3
 """number of parameters at a bound from which on a warning suspects wrong units or data"""
 FILTER_FIELDS = ("kind", "split", "driver")
-"""fields by which trajectories can be selected"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -45,7 +44,6 @@ class FitDriversSettings:
     """Settings for the calibration of a population."""
 
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
-    """settings of each calibration of the IDM"""
     individual: Annotated[tuple[str, ...], Field(min_length=1)] = ("time_headway",)
     """names of the IDM parameters that are individual; the others are the same for all drivers. On NGSIM, calibrated to
     half a minute of each driver, individual time headways predict the other half better than one IDM for all drivers;
@@ -55,7 +53,6 @@ class FitDriversSettings:
     residual: bool = False
     """whether a network learns an acceleration that is added to the IDM of every driver"""
     multi_step: MultiStepSettings = field(default_factory=MultiStepSettings)
-    """settings of this network"""
     seed: NonNegativeInt = 0
     """seed of the residual, and of its validation drivers"""
 
@@ -106,20 +103,11 @@ def fit_drivers_from_files(
     out: Path | None = None,
     on_progress: DriverProgress = lambda *done: None,
 ) -> FittedDrivers:
-    """Calibrate a population to the trajectories in files.
+    """Calibrate a population to the trajectories in files, with `overrides` of `FitDriversSettings`.
 
-    Args:
-        overrides: values of `FitDriversSettings` by name; names of nested settings contain dots.
-        format: format of the files, see `read_trajectories`.
-        drop_bad_rows: see `ReadOptions`.
-        driver_columns: see `ReadOptions`.
-        filters: values of `kind`, `split` or `driver`; only trajectories with all these values are used.
-        out: file to which the caller will write the population; its name and folder are checked first.
-        on_progress: called after each driver.
-
-    Raises:
-        InputError: a file, a row or a setting is wrong, or no trajectory is selected.
-        DiskError: the folder of `out` does not exist.
+    `format`, `drop_bad_rows` and `driver_columns` are those of `read_trajectories`; `filters` values of `kind`, `split`
+    or `driver`. Name and folder of `out` are checked first. Raise `InputError` if a file, a row or a setting is wrong,
+    or no trajectory is selected, `DiskError` if the folder of `out` does not exist.
     """
     if out is not None:
         if out.suffix != ".json":
@@ -173,11 +161,8 @@ def fit_drivers(
 ) -> Population:
     """Calibrate a population with a driver for each driver of `trajectories`.
 
-    The parameters minimize the error of the gap that is simulated behind the recorded leader. A residual is used only
-    if it reduces this error for validation drivers.
-
-    Raises:
-        InputError: there are too few drivers for a residual, the time steps differ, or a simulated gap is not finite.
+    A residual is used only if it reduces the error of simulated gaps for validation drivers. Raise `InputError` if
+    there are too few drivers for it, the time steps differ, or a simulated gap is not finite.
     """
     settings = settings or FitDriversSettings()
     for name in settings.individual:
@@ -213,11 +198,7 @@ def _calibrate_in_rounds(
     settings: FitDriversSettings,
     on_progress: DriverProgress,
 ) -> tuple[IDMParameters, dict[str, CalibratedIDM]]:
-    """Return the common IDM and the IDM of each driver, by name; both are calibrated in turn.
-
-    One IDM that is calibrated to drivers with different time headways reacts too weakly. Therefore the common
-    parameters are calibrated with individual time headways, and the common time headway is calibrated at the end.
-    """
+    """Return the common IDM and that of each driver, calibrated in turn: one IDM for all reacts too weakly."""
     groups = [[each for each in trajectories if each.driver == name] for name in names]
     has_own_headways = "time_headway" in settings.individual
     weights = (0.0, 1.0 if has_own_headways else 0.0)
@@ -242,15 +223,13 @@ def _fit_residual(
     """Return the residual, or None if it does not reduce the gap errors; and facts about the fit."""
     from unjam.following.networks import CalibratedTrajectories, fit_multi_step  # imports torch, which IDMs do not need
 
-    split = split_by_driver(
-        trajectories, (1.0 - RESIDUAL_VALIDATION_SHARE, RESIDUAL_VALIDATION_SHARE, 0.0), settings.seed
-    )
+    shares = 1.0 - RESIDUAL_VALIDATION_SHARE, RESIDUAL_VALIDATION_SHARE, 0.0
+    split = split_by_driver(trajectories, shares, settings.seed)
     parts = [select_splits(split, name) for name in ("train", "validation")]
     drivers = [[calibrated[each.driver].parameters for each in part] for part in parts]
     training, validation = map(CalibratedTrajectories, parts, drivers)
-    network, errors = fit_multi_step(
-        training, validation, settings.calibration.limits, settings.multi_step, settings.seed
-    )
+    limits = settings.calibration.limits
+    network, errors = fit_multi_step(training, validation, limits, settings.multi_step, settings.seed)
     is_better = min(errors) < errors[0]
     facts = {"residual_gap_errors": errors, "residual_is_better": is_better}
     return network.to_numpy_network() if is_better else None, facts

@@ -22,7 +22,6 @@ MIN_REGIME_GAP = 0.1
 """smallest gap with which the acceleration is computed [m]; noise can make the gap itself smaller"""
 
 UniformRange = tuple[float, float]
-"""smallest and largest value of a uniform distribution"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -72,8 +71,7 @@ class FourRegimesSettings:
 def make_four_regimes(settings: FourRegimesSettings) -> list[FollowingTrajectory]:
     """Return trajectories with `settings.samples` accelerations in total; their `kind` is the name of their regime.
 
-    Successive trajectories have the regimes in the order of `REGIMES`. The speed of the leader is constant. The initial
-    gap is that with which the driver has the initial acceleration of the regime.
+    Regimes are in the order of `REGIMES`. Leaders have constant speeds; initial gaps give the regime's acceleration.
     """
     generator = np.random.default_rng(settings.seed)
     length = max(1, round(settings.seconds / settings.time_step))

@@ -1,7 +1,6 @@
-"""Simulation of driver models behind recorded leaders.
+"""Simulation of driver models behind leaders that repeat their recorded speeds.
 
-The leader repeats its recorded speeds, and the model drives the follower, whose speeds and gaps are simulated. Errors
-one step ahead of recorded states are not sufficient: a model with smaller ones can collide more often when it drives.
+Errors one step ahead are not sufficient: a model with smaller ones can collide more often when it drives.
 """
 
 from collections.abc import Callable, Iterator
@@ -57,11 +56,9 @@ def idm_function(parameters: AnyIDM, limits: AccelerationBounds | None = None) -
 def individual_idm(
     parameters: AnyIDM, initial_headway_weight: Array, limits: AccelerationBounds | None = None
 ) -> DriverModel:
-    """Return an IDM whose time headway depends on its initial gap and speed.
+    """Return an IDM whose time headway depends on its initial gap and speed: drivers differ most in their distance.
 
-    Human drivers differ most in the distance that they keep. A model can estimate it from its first state, as the
-    headway T0 = (gap - s0) / v. The headway of the driver is T^(1 - w) T0^w with the initial headway weight w: with
-    w = 0 all drivers have the headway T of `parameters`, with w = 1 each driver keeps its initial headway.
+    The headway is T^(1 - w) T0^w with T of `parameters`, T0 = (gap - s0) / v of the first state, and the weight w.
     """
     p = parameters
 
@@ -76,10 +73,7 @@ def individual_idm(
 def add_residual(
     base: DriverModel | None, network: ResidualFunction, limits: AccelerationBounds | None = None
 ) -> DriverModel:
-    """Return a driver model that adds the output of a network to the acceleration of a base; None: the network alone.
-
-    With `limits`, the sum is clipped to them [m/s2].
-    """
+    """Return a driver that adds a network to a base (None: the network alone), within `limits` [m/s2]."""
 
     def start(speed: Array, gap: Array) -> AccelerationFunction:
         base_function = base(speed, gap) if base is not None else None
@@ -100,14 +94,8 @@ def follow_leader(
 ) -> Iterator[Any]:
     """Yield the speed [m/s] and the gap [m] of a follower after each step behind a recorded leader.
 
-    The gap never becomes negative: a follower that uses it up stays in contact with the leader, and is not faster than
-    the leader, until it brakes. A network could not act on negative gaps, which recorded data do not contain.
-
-    Args:
-        follow: acceleration function of the follower.
-        start: its initial speed [m/s] and gap [m], shape (..., n).
-        leader: speeds [m/s] and paths [m] of the leaders as in `FollowingTrajectory`, shape (T, n).
-        time_step: time between two samples [s].
+    A follower that uses up its gap stays in contact with the leader, and is not faster, until it brakes. `start` is its
+    speed and gap, (..., n); `leader` speeds [m/s] and paths [m] as in `FollowingTrajectory`, (T, n).
     """
     (speed, gap), (leader_speeds, paths) = start, leader
     position = gap * 0.0

@@ -1,8 +1,7 @@
 """Networks as driver models: alone (`vanilla`), or as a residual added to a base (`knowledge`, Eq. 4 of the paper).
 
-The loss of `fit_one_step` is the error of single accelerations; small errors can accumulate when such a network drives.
-The loss of `fit_multi_step` is the error of the gap in a simulation behind the recorded leader; the gradient passes
-through all steps.
+`fit_one_step` fits single accelerations, small errors of which can accumulate; `fit_multi_step` fits the gap in a
+simulation behind the recorded leader, with the gradient through all steps.
 """
 
 import itertools
@@ -19,18 +18,8 @@ from torch import Tensor, nn
 from unjam.adam import Adam
 from unjam.drivers.network import Network
 from unjam.errors import UnjamError
+from unjam.following import leader_replay
 from unjam.following.calibration import HiddenSizes, MultiStepSettings
-from unjam.following.leader_replay import (
-    AccelerationBounds,
-    AccelerationFunction,
-    DriverModel,
-    ResidualFunction,
-    add_residual,
-    as_driver_model,
-    follow_leader,
-    idm_function,
-    simulate_followers,
-)
 from unjam.parameters import STRICT, Positive, PositiveInt, parameter_dataclass
 from unjam.physics.arrays import Floats
 from unjam.physics.idm import IDMArrays, IDMParameters, stack_idm_parameters
@@ -55,13 +44,10 @@ class NetworkSettings:
     """Settings of a network that learns single accelerations (`fit_one_step`); the defaults are those of the paper."""
 
     hidden: HiddenSizes = (128, 128)
-    """sizes of the hidden layers"""
     learning_rate: Positive = 1e-4
-    """learning rate of Adam"""
     batch_size: PositiveInt = 1024
     """number of samples in a gradient step"""
     epochs: PositiveInt = 200
-    """maximum number of epochs"""
     patience: PositiveInt = 200
     """number of epochs without a smaller validation error after which the fit ends"""
     authority: Positive = 8.0
@@ -118,7 +104,7 @@ def _to_tensor(values: Floats) -> Tensor:
     return torch.as_tensor(np.ascontiguousarray(values), dtype=torch.float32)
 
 
-def batched_network(network: Network) -> ResidualFunction:
+def batched_network(network: Network) -> leader_replay.ResidualFunction:
     """Return a NumPy network as a function of inputs of the shape (..., 3)."""
     return lambda inputs: network(inputs.reshape(-1, len(RESIDUAL_INPUTS))).reshape(inputs.shape[:-1])
 
@@ -135,17 +121,14 @@ class LossHistory(NamedTuple):
 def fit_one_step(
     samples: FollowingSamples,
     validation: FollowingSamples,
-    base: AccelerationFunction | None,
+    base: leader_replay.AccelerationFunction | None,
     settings: NetworkSettings,
     seed: int,
 ) -> tuple[FollowingNetwork, LossHistory]:
     """Fit a network to the accelerations of single samples, minus those of the base if there is one.
 
-    The network has the weights of the epoch with the smallest error on `validation`. `seed` determines the initial
-    weights and the order of the samples.
-
-    Raises:
-        UnjamError: a loss is not finite.
+    It has the weights of the epoch with the smallest error on `validation`. Raises `UnjamError` if a loss is not
+    finite.
     """
     torch.set_num_threads(1)
     network = FollowingNetwork(settings, samples, seed)
@@ -188,45 +171,37 @@ class CalibratedTrajectories:
     """IDM parameters of the driver of each trajectory"""
 
     def model(
-        self, trajectory_index: NDArray[np.int64], limits: AccelerationBounds, as_tensors: bool = False
-    ) -> DriverModel:
+        self, trajectory_index: NDArray[np.int64], limits: leader_replay.AccelerationBounds, as_tensors: bool = False
+    ) -> leader_replay.DriverModel:
         """Return the base for segments of the trajectories with these indices, for NumPy arrays or torch tensors."""
         parameters = stack_idm_parameters([self.drivers[number] for number in trajectory_index])
         if as_tensors:
             parameters = IDMArrays(*map(_to_tensor, parameters))
-        return as_driver_model(idm_function(parameters, limits))
+        return leader_replay.as_driver_model(leader_replay.idm_function(parameters, limits))
 
 
 def fit_multi_step(
     training: CalibratedTrajectories,
     validation: CalibratedTrajectories,
-    limits: AccelerationBounds,
+    limits: leader_replay.AccelerationBounds,
     settings: MultiStepSettings,
     seed: int,
 ) -> tuple[FollowingNetwork, list[float]]:
     """Return a residual for calibrated drivers that reduces the difference between simulated and recorded gaps.
 
-    With it come the RMS gap errors at each validation, averaged over the validation trajectories [m]; the first is that
-    of the base.
-
-    The initial residual is zero. The network has the weights with the smallest error on uncut `validation`
-    trajectories, possibly the initial ones. `limits` are those of the acceleration [m/s2]; `seed` determines the
-    initial weights and the order of the segments.
-
-    Raises:
-        UnjamError: a loss is not finite.
+    It starts at zero, and has the weights with the smallest error on uncut `validation` trajectories. With it come the
+    mean RMS gap errors at each validation [m], first of the base. `limits` are those of the acceleration [m/s2]. Raises
+    `UnjamError` if a loss is not finite.
     """
     torch.set_num_threads(1)
     network = FollowingNetwork(settings, following_samples(training.trajectories), seed, zero_init=True)
-    segments, whole = (
-        make_segments(training.trajectories, settings.segment_seconds),
-        make_segments(validation.trajectories),
-    )
+    segments = make_segments(training.trajectories, settings.segment_seconds)
+    whole = make_segments(validation.trajectories)
     base = validation.model(whole.trajectory_index, limits)
 
     def gap_error() -> float:
-        model = add_residual(base, batched_network(network.to_numpy_network()), limits)
-        return float(np.sqrt(simulate_followers(model, whole).gap_mse).mean())
+        model = leader_replay.add_residual(base, batched_network(network.to_numpy_network()), limits)
+        return float(np.sqrt(leader_replay.simulate_followers(model, whole).gap_mse).mean())
 
     optimizer = Adam(network.parameters(), lr=settings.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.gradient_steps)
@@ -234,9 +209,8 @@ def fit_multi_step(
     errors, best_state = [gap_error()], deepcopy(network.state_dict())
     for step in range(1, settings.gradient_steps + 1):
         batch = segments.select(generator.choice(segments.gap.shape[1], settings.batch_size))
-        loss = _gap_loss(
-            network, training.model(batch.trajectory_index, limits, as_tensors=True), limits, batch, settings
-        )
+        base_model = training.model(batch.trajectory_index, limits, as_tensors=True)
+        loss = _gap_loss(network, base_model, limits, batch, settings)
         if not torch.isfinite(loss):
             raise UnjamError(f"following network: the loss of step {step} is not finite")
         optimizer.zero_grad()
@@ -253,7 +227,11 @@ def fit_multi_step(
 
 
 def _gap_loss(
-    network: nn.Module, base: DriverModel, limits: AccelerationBounds, segments: Segments, settings: MultiStepSettings
+    network: nn.Module,
+    base: leader_replay.DriverModel,
+    limits: leader_replay.AccelerationBounds,
+    segments: Segments,
+    settings: MultiStepSettings,
 ) -> Tensor:
     speeds, leader_speeds, gaps, paths = (_to_tensor(getattr(segments, name)) for name in SEGMENT_FIELDS)
     is_present = torch.as_tensor(segments.is_present)[1:]
@@ -263,8 +241,8 @@ def _gap_loss(
         residuals.append(network(inputs))
         return residuals[-1]
 
-    follow = add_residual(base, recorded_network, limits)(speeds[0], gaps[0])
-    states = list(follow_leader(follow, (speeds[0], gaps[0]), (leader_speeds, paths), segments.time_step))
+    follow = leader_replay.add_residual(base, recorded_network, limits)(speeds[0], gaps[0])
+    states = list(leader_replay.follow_leader(follow, (speeds[0], gaps[0]), (leader_speeds, paths), segments.time_step))
     speed, gap = (torch.stack(each) for each in zip(*states, strict=True))
     squares = (gap - gaps[1:]).square() + (settings.speed_weight * (speed - speeds[1:])).square()
     gap_part = ((squares * is_present).sum(0) / is_present.sum(0) + MEAN_SQUARE_OFFSET).sqrt().mean()

@@ -109,10 +109,8 @@ def check_agent(name: str) -> None:
     required = ("network", "state", "restore", "iterate" if protocol is Algorithm else "learn")
     # What a class inherits from the protocol does nothing.
     if missing := [f"{each}()" for each in required if getattr(found, each, None) in (None, getattr(protocol, each))]:
-        allowed = (
-            "allowed: a class with network(), state(), restore() and iterate(), an algorithm, or learn(), a learner"
-        )
-        raise InputError(f"agent: {FileReference.parse(name)} has no {', '.join(missing)}; {allowed}")
+        allowed = "a class with network(), state(), restore() and iterate(), an algorithm, or learn(), a learner"
+        raise InputError(f"agent: {FileReference.parse(name)} has no {', '.join(missing)}; allowed: {allowed}")
     if protocol is Learner and Learner not in found.__mro__:
         allowed = "allowed: a class that inherits from unjam.learners.learner.Learner"
         raise InputError(f"agent: {FileReference.parse(name)} has no exploring_network() and others; {allowed}")

@@ -16,7 +16,6 @@ from unjam.worlds.record import Episode
 
 Tensors = dict[str, Tensor]
 TaskEpisodes = Sequence[Sequence[Episode]]
-"""the episodes of each task"""
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,6 @@ class Collector:
     """Runs the episodes of an iteration, in the workers of a training, and counts their control steps."""
 
     def __init__(self, run: Callable[[Network, int], TaskEpisodes]) -> None:
-        """Prepare the first iteration; `run` returns the episodes of a network in an iteration."""
         self._run = run
         self.iteration = 0
         """number of the present iteration, from 1"""
@@ -56,7 +54,7 @@ class Collector:
     def __call__(self, network: Network) -> TaskEpisodes:
         """Return episodes of each task, driven by its expert plus the residual of `network`, with exploration.
 
-        Further calls in an iteration run the same roads and vehicles again: networks are compared on equal seeds.
+        Further calls in an iteration run the same roads and vehicles again.
         """
         start = time.perf_counter()
         found = self._run(network, self.iteration)
@@ -101,7 +99,7 @@ def run_iterations(
 ) -> None:
     """Continue up to `max_environment_steps`, those of earlier iterations included, or until `on_iteration` is true.
 
-    An abort loses at most one iteration. Raise `UnjamError` if an iteration runs no episodes.
+    Raise `UnjamError` if an iteration runs no episodes.
     """
     while collect.environment_steps < max_environment_steps:
         collect.start_iteration()

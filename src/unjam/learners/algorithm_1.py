@@ -41,10 +41,7 @@ class Algorithm1:
         return self.learner.network()
 
     def iterate(self, collect: Collector) -> IterationLog:
-        """Make an iteration: lines 4 to 8 of the paper.
-
-        Raise `UnjamError` if an observation, a reward or a parameter is not finite; it names the first.
-        """
+        """Make an iteration, lines 4 to 8 of the paper; raise `UnjamError` if a number is not finite."""
         learner, model_rollouts = self.learner, self.model_rollouts
         timed_parts = ("fit", "roll_out", "update") if model_rollouts else ("update",)
         timed_parts += ("string_gain",) if self.spec.string_gain is not None else ()
@@ -110,11 +107,7 @@ class Algorithm1:
         return string_gain is None or string_gain(network) <= self.spec.policy.max_string_gain
 
     def _plan_updates(self, environment_steps: int) -> list[tuple[bool, int, int]]:
-        """Return the updates of this iteration: (with environment rows, part of the model rows, number of parts).
-
-        All rows at once; or the environment rows, then parts of the model rows, each by the policy of the previous
-        update. Without parts there are no model rows.
-        """
+        """Return the updates of this iteration: (with environment rows, part of the model rows, number of parts)."""
         without_model = (True, 0, 0)
         if not self.model_rollouts or not self.learner.is_learning(environment_steps):
             return [without_model]

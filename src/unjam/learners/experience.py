@@ -50,10 +50,7 @@ def make_experience(
     critic_inputs: Sequence[Sequence[float]] | Float64,
     returns_after_exit: Sequence[float | None] | None = None,
 ) -> Experience:
-    """Return the experience of trajectories, each with the `critic_inputs` of the critic alone.
-
-    One with a return after its exit, discounted to its last action, counts as terminated; others are bootstrapped.
-    """
+    """Return trajectories, with `critic_inputs`, as experience; those with a return after their exit are terminated."""
     residuals, rewards = zip(*(trajectory.actions_and_rewards for trajectory in trajectories), strict=True)
     terminated = [trajectory.terminated for trajectory in trajectories]
     for number, later in enumerate(returns_after_exit or ()):

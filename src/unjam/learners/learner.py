@@ -93,11 +93,7 @@ class Learner(Protocol):
 
 
 def limit_update(learner: Learner, before: Sequence[Tensor], is_allowed: Callable[[Network], bool]) -> float:
-    """Take back so much of an update of the policy that its network is allowed; return the remaining share.
-
-    `before` are copies of the parameters before the update, which are allowed. Each try halves the update; after
-    `MAX_HALVINGS` nothing of it remains.
-    """
+    """Halve an update of the policy until it is allowed, or `MAX_HALVINGS` times, then drop it; return its share."""
     parameters = learner.policy_parameters()
     changes = [parameter.detach() - old for parameter, old in zip(parameters, before, strict=True)]
     share = 1.0
@@ -110,10 +106,7 @@ def limit_update(learner: Learner, before: Sequence[Tensor], is_allowed: Callabl
 
 
 def policy_distance(p: Normal, q: Normal) -> Tensor:
-    """Return the total variation between Gaussians, eps_pi of the paper's bound, row by row, shape (n,), in [0, 1].
-
-    It is the difference of the probabilities between the crossings of the densities, and invariant under squashing.
-    """
+    """Return the total variation between Gaussians, eps_pi of the paper's bound, row by row, shape (n,), in [0, 1]."""
     p, q = (Normal(each.mean.double(), each.stddev.double()) for each in (p, q))
     m, s, n, t = p.mean, p.stddev, q.mean, q.stddev
     # p = q where (x-m)^2/s^2 - (x-n)^2/t^2 + 2 log(s/t) = 0

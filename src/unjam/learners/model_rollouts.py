@@ -36,15 +36,12 @@ class ModelRollouts:
         """Start with the base alone and without data; `InputError` if scenario or settings are not supported."""
         self.spec, self.task, self._index = spec, spec.tasks[task_index], task_index
         self.name = f"model-{task_index}" if task_index else "model"
-        """name in checkpoints"""
         kind = world_model_class(self.task.scenario, spec.model)
         self.world_model = kind(spec.model, self.task, spec.policy.exploration_signs, self._seed(FIT_SEED))
         self.model_steps = 0
-        """number of model steps of all iterations"""
         self.k_star = 0
         """rollout length [control steps]; 0: the model must not be used"""
         self.facts: dict[str, Any] = {}
-        """about the model in this iteration"""
 
     def _seed(self, *key: int) -> Seed:
         return (self.spec.seed, *key, *([self._index] if self._index else []))
@@ -65,10 +62,7 @@ class ModelRollouts:
         }
 
     def roll_out(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Experience | None:
-        """Return experience of the policy `network` in the model; None if k* is too short, or there is none.
-
-        All `parts` of an iteration together have `model_ratio` times as many control steps as its environment episodes.
-        """
+        """Return one of `parts` of the experience of `network` in the model; None if k* is too short."""
         model, driver = self.world_model, full_policy(self.task, self.spec.policy, network)
         control_steps = int(min(self.k_star, model.max_control_steps)) // driver.action_repeat * driver.action_repeat
         seed, *seeds = (self._seed(iteration, purpose, part) for purpose in (STARTS_SEED, NOISE_SEED, EXPLORATION_SEED))

@@ -16,19 +16,11 @@ from torch.distributions import Normal
 
 from unjam.adam import Adam
 from unjam.drivers.network import Network
+from unjam.learners import sb3_learner
 from unjam.learners.agent import AgentSpec
 from unjam.learners.algorithm import Tensors
 from unjam.learners.experience import Experience
 from unjam.learners.learner import Update
-from unjam.learners.sb3_learner import (
-    MixedReplayBuffer,
-    SB3Learner,
-    add_to_replay_buffer,
-    check_shape,
-    network_layers,
-    shift_rewards,
-    zero_layer,
-)
 from unjam.learners.settings import OffPolicySettings, PolicySettings, SACSettings, TD3Settings
 
 UNIFORM_STD = 0.85
@@ -64,7 +56,6 @@ class OffPolicyResidualMixin(BasePolicy):
 
     critic_kwargs: dict[str, Any]
     reward_offset: Tensor
-    """subtracted from rewards"""
 
     def __init__(self, *args: Any, settings: PolicySettings, inputs: int, action_limit: float, **kwargs: Any) -> None:
         self.settings, self.inputs, self.authority = settings, inputs, settings.authority * action_limit
@@ -77,7 +68,7 @@ class OffPolicyResidualMixin(BasePolicy):
         """Return the actor, which takes the first `inputs` inputs."""
         actor = super().make_actor(ActorInputExtractor(self.observation_space, self.inputs))  # pyright: ignore[reportAttributeAccessIssue]
         if self.settings.zero_init:
-            zero_layer([layer for layer in actor.mu.modules() if isinstance(layer, nn.Linear)][-1])
+            sb3_learner.zero_layer([layer for layer in actor.mu.modules() if isinstance(layer, nn.Linear)][-1])
         return actor
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
@@ -98,7 +89,7 @@ class SquashedResidualPolicy(OffPolicyResidualMixin, SACPolicy):
 
     def network(self) -> Network:
         """Return the policy as a NumPy network: the same residual to 1e-6, the same exploration noise."""
-        layers = network_layers(nn.Sequential(self.actor.latent_pi, self.actor.mu, self.actor.log_std))  # pyright: ignore[reportArgumentType]
+        layers = sb3_learner.network_layers(nn.Sequential(self.actor.latent_pi, self.actor.mu, self.actor.log_std))  # pyright: ignore[reportArgumentType]
         *hidden, (mean, mean_bias), (log_std, log_std_bias) = layers
         output = np.hstack([mean, log_std]), np.hstack([mean_bias, log_std_bias])
         return Network((*hidden, output), self.authority)
@@ -114,22 +105,21 @@ class DeterministicResidualPolicy(OffPolicyResidualMixin, TD3Policy):
 
     def network(self) -> Network:
         """Return the policy as a NumPy network: the same residual to 1e-6, and the exploration noise."""
-        return Network(network_layers(self.actor.mu), self.authority, self.exploration_std)
+        return Network(sb3_learner.network_layers(self.actor.mu), self.authority, self.exploration_std)
 
 
-class OffPolicyLearner(SB3Learner):
+class OffPolicyLearner(sb3_learner.SB3Learner):
     """A learner that also learns from earlier iterations, which are in a replay buffer."""
 
     def __init__(
         self, spec: AgentSpec, settings: OffPolicySettings, algorithm: type, policy: type[BasePolicy], **kwargs: Any
     ) -> None:
-        """Make SB3's algorithm; `kwargs` are its own beyond those that `settings` share."""
         super().__init__(
             spec,
             algorithm,
             policy,
             learning_rate=settings.learning_rate,
-            replay_buffer_class=MixedReplayBuffer,
+            replay_buffer_class=sb3_learner.MixedReplayBuffer,
             buffer_size=settings.buffer_size,
             learning_starts=0,  # see learn
             batch_size=settings.batch_size,
@@ -139,7 +129,7 @@ class OffPolicyLearner(SB3Learner):
             **kwargs,
         )
         self.settings = settings
-        self.buffer: MixedReplayBuffer = self.sb3.replay_buffer
+        self.buffer: sb3_learner.MixedReplayBuffer = self.sb3.replay_buffer
         self._due_gradient_steps = 0
 
     def policy_parameters(self) -> list[Tensor]:
@@ -179,8 +169,8 @@ class OffPolicyLearner(SB3Learner):
     def add_rows(self, buffer: ReplayBuffer, rows: Experience) -> None:
         """Add rows to a replay buffer, with shifted and scaled rewards."""
         policy = self.sb3.policy
-        rewards = shift_rewards(rows, policy.reward_offset.item(), self.gamma)
-        add_to_replay_buffer(buffer, rows, policy.authority, rewards * self.settings.reward_scale)
+        rewards = sb3_learner.shift_rewards(rows, policy.reward_offset.item(), self.gamma)
+        sb3_learner.add_to_replay_buffer(buffer, rows, policy.authority, rewards * self.settings.reward_scale)
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return all that it needs to resume, including the replay buffer."""
@@ -193,7 +183,7 @@ class OffPolicyLearner(SB3Learner):
         super().restore(values, tensors)
         self.buffer.pos, self.buffer.full = range(self.buffer.buffer_size)[values["pos"]], bool(values["full"])
         for name, tensor in self._shared_tensors().items():
-            check_shape(name, tensors[name], tensor.shape)
+            sb3_learner.check_shape(name, tensors[name], tensor.shape)
             tensor.detach().copy_(tensors[name])
 
     def _shared_tensors(self) -> Tensors:
@@ -217,7 +207,6 @@ class SAC(OffPolicyLearner):
         return Normal(mean.squeeze(1), log_std.squeeze(1).exp())
 
     def _shared_tensors(self) -> Tensors:
-        """Return the filled part of the replay buffer and, if it is learned, the temperature."""
         learned = {} if self.sb3.log_ent_coef is None else {"log_ent_coef": self.sb3.log_ent_coef}
         return super()._shared_tensors() | learned
 

@@ -29,14 +29,12 @@ class SB3Learner(Learner):
     """An algorithm of SB3 for residuals; subclasses make it and fill its buffer."""
 
     gamma: float
-    """discount from one action of the network to the next"""
     sb3: Any
     """SB3's algorithm: its `train()` needs a filled buffer, a logger, and the spaces of an environment"""
 
     def __init__(
         self, spec: AgentSpec, algorithm: type[BaseAlgorithm], policy: type[BasePolicy], **kwargs: Any
     ) -> None:
-        """Make SB3's algorithm; `kwargs` are its own."""
         env = gymnasium.Env[np.ndarray, np.ndarray]()  # SB3 reads its spaces; it is never stepped
         env.observation_space, env.action_space = policy_spaces(spec.inputs, spec.critic_inputs, spec.authority)
         self.spec, self.gamma = spec, kwargs["gamma"]
@@ -122,10 +120,7 @@ def zero_layer(layer: nn.Linear) -> None:
 
 @torch.no_grad()
 def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: Experience) -> None:
-    """Fill `buffer` with rows and compute their advantages; to truncated trajectories gamma V of their end is added.
-
-    Values and log-probabilities are computed in one batch, so that the ratio before the first update is exactly 1.
-    """
+    """Fill `buffer` with rows and their advantages, in one batch; truncated trajectories get gamma V of their end."""
     actions, observations = rows.actions[:, None], torch.as_tensor(rows.observations)
     values, log_probs, _ = policy.evaluate_actions(observations, torch.as_tensor(actions))
     last_values = policy.predict_values(torch.as_tensor(rows.last_observations)).numpy().ravel()
@@ -145,10 +140,7 @@ def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: 
 
 
 def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: float, rewards: Float64) -> None:
-    """Add rows to the buffer, in place of the oldest ones if it is full; only collisions set `dones`.
-
-    SB3 stores actions as shares of their bounds, here of the `authority` [m/s2].
-    """
+    """Add rows to the buffer, actions as shares of the `authority` [m/s2]; only collisions set `dones`."""
     done = np.zeros(len(rewards), np.float32)
     done[rows.last_rows] = rows.terminated
     indices = (buffer.pos + np.arange(len(rewards))) % buffer.buffer_size

@@ -101,11 +101,7 @@ class ResidualPolicy(ActorCriticPolicy):
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # pyright: ignore[reportCallIssue]
 
     def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
-        """Return SB3's distribution; per-episode noise also perturbs the bias.
-
-        Without it there would be hardly any exploration where all hidden units are zero, and actions there would be so
-        improbable that no step of TRPO's line search passes.
-        """
+        """Return SB3's distribution; per-episode noise perturbs the bias, too, or dead units would not explore."""
         if not self.settings.episode_noise:
             return super()._get_action_dist_from_latent(latent_pi)
         mean = self.action_net(latent_pi)

@@ -53,7 +53,6 @@ class ReplayDriver(Driver):
     """Applies recorded accelerations, step by step."""
 
     accelerations: Array
-    """recorded accelerations [m/s2], shape (H, rows)"""
 
     def initial_memory(self, n: int) -> Memory:
         """Return the index of the first step."""

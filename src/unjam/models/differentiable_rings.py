@@ -13,7 +13,6 @@ from unjam.drivers.driver import Driver, Memory
 from unjam.errors import InputError, invalid_value
 from unjam.models.rollouts import check_device
 from unjam.models.settings import Device
-from unjam.physics.arrays import Array
 from unjam.physics.kinematics import gap_on_loop
 from unjam.scenarios import ScenarioLike, make_scenario
 from unjam.scenarios.ring import Ring
@@ -74,7 +73,7 @@ class DifferentiableRings(RingBatch):
             raise InputError(f"scenario: {reason}")
         if not road.sensors.is_exact:
             raise InputError("sensors: errors have no gradient; allowed: exact sensors")
-        draw = generator and partial(_draw_normal, generator, dtype, device)
+        draw = generator and partial(torch.randn, generator=generator, dtype=dtype, device=device)
         to_tensor = partial(torch.as_tensor, dtype=dtype, device=device)
         super().__init__([road] * len(numbers), numbers, to_tensor, keep_record=False, draw=draw)
         self._reward = make_reward(reward or road.reward)
@@ -101,8 +100,8 @@ class DifferentiableRings(RingBatch):
     def set_state(self, speeds: Tensor, positions: Tensor) -> None:
         """Move all vehicles [m/s, m], shapes as of `speeds` and `positions`; gradients flow back to both.
 
-        Raise `InputError` if they have another shape, a number is not finite, a speed is negative, or a vehicle is not
-        behind its leader, the next row, within one lap.
+        Raise `InputError` for another shape, a number that is not finite, a negative speed, or a vehicle not behind its
+        leader.
         """
         shape = self._position.shape
         speeds, positions = self._as_tensor("speeds", speeds, shape), self._as_tensor("positions", positions, shape)
@@ -128,10 +127,7 @@ class DifferentiableRings(RingBatch):
         return found
 
     def initial_memory(self, driver: Driver) -> Memory:
-        """Return the memory, as tensors, with which a driver begins to drive all CAVs after the warm-up.
-
-        Raise `InputError` if the driver takes only NumPy arrays, which have no gradients.
-        """
+        """Return a driver's memory after the warm-up as tensors; `InputError` if it takes only NumPy arrays."""
         if driver.requirements().needs_numpy:
             raise invalid_value("driver", driver.describe(), "one that takes tensors, like 'pi' or a torch.nn.Module")
         memory = initial_batch_memory(driver, len(self.roads), self.cav_count)
@@ -141,9 +137,8 @@ class DifferentiableRings(RingBatch):
     def step(self, acceleration: Tensor) -> Tensor:
         """Simulate one control step, and return the reward of each ring, shape (W,); `reward_terms` are its terms.
 
-        `acceleration` [m/s2], shape (CAVs * W,), is limited to the scenario's limits, and then by the safety filter.
-        After a collision, `crashed_roads`, and after the horizon, the rewards of a ring are zero. Raise `InputError` if
-        the accelerations have another shape, or one is not finite.
+        `acceleration` [m/s2], shape (CAVs * W,), is limited by the scenario and its filter; else raise `InputError`.
+        After a collision (`crashed_roads`) or the horizon, the rewards of a ring are zero.
         """
         was_running = self._is_running
         self.advance(Command(self._as_tensor("step: acceleration", acceleration, (self.cav_count,))))
@@ -155,7 +150,3 @@ class DifferentiableRings(RingBatch):
         """Let no gradients flow to earlier steps from here on; return the driver's `memory` without them, too."""
         self.detach_state()
         return map_leaves(lambda values: values.detach(), memory or {})
-
-
-def _draw_normal(generator: torch.Generator, dtype: torch.dtype, device: Device, shape: tuple[int, ...]) -> Array:
-    return torch.randn(shape, generator=generator, dtype=dtype, device=device)

@@ -34,10 +34,7 @@ def torch_generator(seed: Seed, device: torch.device | str) -> torch.Generator:
 
 
 def predict(layers: Layers, inputs: Tensor, members: Tensor) -> Tensor:
-    """Return the residual of the base, (n, outputs), for `inputs`, (n, inputs), both in SI units.
-
-    Each of `members` predicts one block of rows; all blocks but the last have the same length.
-    """
+    """Return the residual, (n, outputs), for `inputs`, (n, inputs), in SI units; each member has a block of rows."""
     n, blocks = len(inputs), len(members)
     size = -(-n // blocks)
     blocked = pad(inputs, (0, 0, 0, blocks * size - n)).view(blocks, size, -1)
@@ -98,8 +95,7 @@ class Ensemble(nn.Module):
     def set_normalization(self, inputs: Tensor, targets: Tensor) -> None:
         """Normalize by mean and standard deviation of `inputs` and `targets`, (rows, ...); predictions stay the same.
 
-        An input that varies by less than `MIN_CHANGE`, as the length of the ring in a single episode, counts as zero:
-        else Adam would make long steps of rounding errors, and another value on the holdout would be far away.
+        Inputs that vary by less than `MIN_CHANGE` count as zero: Adam would make long steps of rounding errors.
         """
         varies = inputs.std(0) >= MIN_CHANGE
         mean = torch.where(varies, inputs.mean(0), inputs[0]).float()
@@ -159,7 +155,7 @@ def fit_ensemble(
 ) -> EnsembleFit:
     """Train `ensemble` further on `inputs`, (rows, inputs), and residuals of the base `targets`, (rows, outputs).
 
-    Units are SI. Each network is trained on a bootstrap sample of the rows that are not `is_holdout`, and ends with the
+    Units are SI. Each network is trained on a bootstrap sample of the rows that are not `is_holdout`, and keeps the
     weights that were best on the holdout. With `fallback_to_base`, outputs that are predicted no better there than by
     zero are masked. Raises `UnjamError` if a loss is not finite.
     """
@@ -220,7 +216,6 @@ def _train(
 
 @torch.no_grad()
 def _member_losses(ensemble: Ensemble, inputs: Tensor, targets: Tensor) -> Tensor:
-    """Return each member's mean squared error, shape (members,)."""
     return (ensemble(inputs) - targets).square().mean((1, 2))
 
 
@@ -228,7 +223,6 @@ class OneStepRMSE(NamedTuple):
     """One-step root mean squared errors on the holdout [m/s, m, reward]."""
 
     base: float
-    """error of the base alone"""
     model: float
     """error of a member of the ensemble; that of the base where it is better"""
     change: float
@@ -271,8 +265,8 @@ def transition_variation(errors: Floats, noise: float) -> float:
 def total_variation(predictions: Floats, noise: Floats) -> float:
     """Return the mean total variation, in [0, 1], between Gaussians around a member's prediction and around the mean.
 
-    `predictions` has shape (members, rows, quantities), `noise`, the standard deviation of both, (quantities,). It is
-    NaN for a single member, since its error is unknown.
+    `predictions`: (members, rows, quantities); `noise`, the standard deviation of both: (quantities,). NaN for one
+    member.
     """
     if len(predictions) == 1:
         return float("nan")

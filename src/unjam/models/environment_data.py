@@ -38,15 +38,12 @@ class Transitions(NamedTuple):
 
     states: LocalState
     acceleration: Floats
-    """applied acceleration [m/s2]"""
     drawn_values: Floats
     """scaled values that the episode drew, shape (R, m)"""
     next_states: LocalState
     reward: Floats
     crashed: NDArray[np.bool_]
-    """whether the step ended in a collision"""
     is_holdout: NDArray[np.bool_]
-    """rows that no network is trained on"""
 
     def select(self, rows: NDArray[np.int64]) -> "Transitions":
         """Return the transitions with these indices."""
@@ -64,7 +61,6 @@ class EnvironmentData:
     """number of episodes that were added, including dropped ones"""
 
     def __len__(self) -> int:
-        """Return the number of stored control steps."""
         return sum(len(recording.reward) for recording in self.recordings)
 
     def add(self, episodes: Sequence[Episode], scenario: Scenario) -> None:
@@ -103,8 +99,7 @@ class EnvironmentData:
     def holdout_masks(self, holdout: float) -> list[NDArray[np.bool_]]:
         """Return which steps of each recording are held out, an array of booleans for each.
 
-        Whole episodes are held out, always the same ones. If these would be all episodes or none, the last part of each
-        recording is held out instead.
+        These are whole episodes, always the same ones; if they were all or none, the last part of each recording.
         """
         masks = [np.full(len(r.reward), is_holdout_episode(r.episode, holdout)) for r in self.recordings]
         if np.concatenate(masks).all() or not np.concatenate(masks).any():
@@ -112,10 +107,7 @@ class EnvironmentData:
         return masks
 
     def start_indices(self, min_control_steps: int = 1, first_episode: int = 0) -> StartIndices:
-        """Return the steps in which a new residual was computed and after which `min_control_steps` are recorded.
-
-        Only episodes with the number `first_episode` or a larger one are used.
-        """
+        """Return the steps with a new residual and enough steps after them, of episodes from the first on."""
         due = {
             index: np.arange(0, len(recording.reward) - min_control_steps + 1, recording.action_repeat)
             for index, recording in enumerate(self.recordings)
@@ -143,9 +135,7 @@ def _concatenate_states(parts: Sequence[LocalState]) -> LocalState:
 def reconstruct_memory(expert: Driver, recordings: Sequence[Recording], start_indices: StartIndices) -> Memory:
     """Return the expert's memory before each of `start_indices`, NumPy arrays with one row per start.
 
-    The expert is driven over the recorded states once more, from its recorded initial memory. That is exact, since the
-    memory of a driver depends on nothing else. With noisy sensors it is the memory that exact sensors would have left:
-    sensor errors are not recorded.
+    The expert is driven over the recorded states once more, which is exact unless sensors have errors.
     """
     indices, rows = np.unique(start_indices[:, 0], return_inverse=True)
     used = [recordings[index] for index in indices]

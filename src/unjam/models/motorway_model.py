@@ -1,8 +1,7 @@
 """The road model of motorways: the batch's human drivers with known entry times, plus what networks learn.
 
-The base is the batch: each vehicle's own driver model and lane changes. Perception errors are noise. One ensemble
-learns the rest, where vehicles keep their lane, from samples of environment episodes: vehicles are stepped
-once as the base does, and the remaining difference in speed is the target.
+Perception errors are noise. One ensemble learns the rest where vehicles keep their lane: in samples of environment
+episodes, vehicles are stepped once as the base does, and the remaining difference in speed is the target.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,18 +27,12 @@ from unjam.worlds.batch.motorway.traffic import (
     enable_acc,
     make_vehicles,
 )
-from unjam.worlds.batch.motorway.vehicles import (
-    MotorwayVehicles,
-    find_road_neighbors,
-    find_rows,
-    neighbors_on_lane,
-    vehicle_numbers,
-)
+from unjam.worlds.batch.motorway.vehicles import MotorwayVehicles, find_rows, vehicle_numbers
+from unjam.worlds.lane_neighbors import find_road_neighbors, neighbors_on_lane
 from unjam.worlds.record import Episode
 
 Index = NDArray[np.intp]
 MAX_SAMPLE_INTERVAL = 60
-"""maximum number of control steps between samples"""
 MIN_ERROR_REDUCTION = 0.3
 """share by which networks must reduce the base's mean squared error: a record has no lane-change memory of human
 drivers, which rollouts have, and its mean effect would be added twice. Networks that reduced it by a fifth made model
@@ -53,7 +46,6 @@ class MotorwaySamples:
     """Human drivers on a motorway at some steps of an environment episode."""
 
     episode: int
-    """number of the episode"""
     seed: tuple[int, ...]
     """seed of the episode: it determines the vehicles and their entry times"""
     episode_return: float
@@ -79,7 +71,8 @@ def motorway_samples(episode: Episode, number: int, scenario: Motorway, base: st
     noisy = before._replace(**perception, driving_error=errors[2])
     base_speed = _speeds_after_step(before, road, scenario, len(steps), np.zeros)
     noisy_speed = _speeds_after_step(noisy, road, scenario, len(steps), generator.standard_normal)
-    leader = neighbors_on_lane(find_road_neighbors(before, road.geometry).leaders, before.lane)
+    neighbors = find_road_neighbors(before.road, before.lane, before.position, road.geometry)
+    leader = neighbors_on_lane(neighbors.leaders, before.lane)
     next_speed = episode.speeds[later]
     keeps_lane = episode.lane_indices[later] == episode.lane_indices[now]
     is_used = (leader >= 0) & before.is_eidm & keeps_lane & ~np.isnan(base_speed + noisy_speed + next_speed)
@@ -147,10 +140,7 @@ def _speeds_after_step(
 def learned_correction(
     model: RoadModel, generator: torch.Generator, steps: int, has_noise: bool = True
 ) -> LearnedCorrection | None:
-    """Return what the model adds to the speeds of the batch's human drivers in a control step of `steps` steps.
-
-    With the base `none` it replaces the batch's car following, and perception errors by noise of the same strength.
-    """
+    """Return what the model adds to human drivers' speeds in a control step; base `none` replaces all but noise."""
     residual = residual_function(model, generator)
     if model.base != "none":
         return residual
@@ -167,10 +157,7 @@ def learned_correction(
 def fit_motorway_model(
     model: RoadModel, samples: Sequence[MotorwaySamples], settings: ModelSettings, seed: Seed, group_size: int = 1
 ) -> ModelFit:
-    """Fit `model` to what the base leaves, see `fit_human_model`; perception errors do not count as model error.
-
-    `group_size` consecutive episodes have the same vehicles, and are held out together.
-    """
+    """Fit `model` as `fit_human_model`; `group_size` consecutive episodes with equal vehicles are held out together."""
     rows = HumanRows(*(np.concatenate(parts) for parts in zip(*(each.human_rows for each in samples), strict=True)))
     rows = rows._replace(episode=rows.episode // group_size)
     sigma = float(np.sqrt(np.mean([each.noise_variance for each in samples])))

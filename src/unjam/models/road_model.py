@@ -1,8 +1,7 @@
 """The road model: samples of whole closed roads, and the human drivers on them as a base plus one learned ensemble.
 
-All human drivers differ from the base in the same way: one ensemble learns it from all of them. SUMO's drivers add
-noise after they have moved, so that their distance gives the intended speed. Noise moves commanded drivers too: only
-its strength is known. Steps in which the known right of way constrains a driver are not used for training.
+SUMO's drivers add noise after they have moved, so that their distance gives the intended speed. Noise moves commanded
+drivers too: only its strength is known. Steps in which the right of way constrains a driver are not used.
 """
 
 from collections.abc import Sequence
@@ -17,19 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
-from unjam.models.ensemble import (
-    MIN_CHANGE,
-    Ensemble,
-    ModelFit,
-    OneStepRMSE,
-    Seed,
-    fit_ensemble,
-    predict,
-    random_members,
-    root_mean_square,
-    total_variation,
-    transition_variation,
-)
+from unjam.models import ensemble
 from unjam.models.environment_data import is_holdout_episode
 from unjam.models.row_model import BASE_DRIVERS
 from unjam.models.settings import ModelSettings
@@ -61,13 +48,11 @@ class RoadSamples:
     """N vehicles of a closed road, in its order, at M steps at which a residual was due; arrays (M, N), SI units."""
 
     episode: int
-    """number of the environment episode"""
     interval: int
     """control steps between samples"""
     size: int
     """drawn by the episode: length of the ring, radius of the figure eight [m]"""
     length: float
-    """length of the road [m]"""
     is_human: Floats
     """1 for human drivers, 0 for CAVs, shape (N,)"""
     speeds: Floats
@@ -76,7 +61,6 @@ class RoadSamples:
     intended_speeds: Floats
     """distance divided by time in the next control step: the speed before noise"""
     next_speeds: Floats
-    """speeds after that step"""
     crossing_memory: CrossingMemory | None
     """waiting times and entry steps on a road that crosses itself"""
 
@@ -122,18 +106,16 @@ class HumanRows(NamedTuple):
     intended_speed: Floats
     """speed of the movement, before noise except for commanded drivers"""
     next_speed: Floats
-    """speed after the step"""
     episode: Floats
-    """number of the episode"""
 
 
-class RoadModel(Ensemble):
+class RoadModel(ensemble.Ensemble):
     """An ensemble for the residual of a base of human drivers, and the strength of their noise."""
 
     noise: Tensor
     """standard deviation of the noise of a speed [m/s]"""
 
-    def __init__(self, settings: ModelSettings, seed: Seed) -> None:
+    def __init__(self, settings: ModelSettings, seed: ensemble.Seed) -> None:
         super().__init__(settings, ROAD_MODEL_INPUTS, 1, seed)
         self.base = settings.base
         self.register_buffer("noise", torch.zeros((), dtype=torch.float64))
@@ -157,7 +139,6 @@ def base_human_model(base: str, scenario: Scenario) -> HumanSpeedModel:
 
 
 def _inputs(*columns: Array) -> Tensor:
-    """Return the inputs of the networks, shape (R, 4), for vehicles of any shape."""
     flat = [values.ravel() for values in columns]
     return torch.from_numpy(np.stack(flat, 1)) if isinstance(flat[0], np.ndarray) else torch.stack(flat, 1)
 
@@ -170,7 +151,7 @@ def residual_function(model: RoadModel, generator: torch.Generator) -> LearnedCo
 
     def residual(speed: Array, leader_speed: Array, gap: Array, base_speed: Array) -> Array:
         inputs = _inputs(speed, leader_speed, gap, base_speed).float()
-        predicted = predict(layers, inputs, random_members(model.members, len(inputs), generator))
+        predicted = ensemble.predict(layers, inputs, ensemble.random_members(model.members, len(inputs), generator))
         return (predicted.numpy() if isinstance(speed, np.ndarray) else predicted).reshape(speed.shape)
 
     return residual
@@ -215,8 +196,8 @@ def human_rows(samples: Sequence[RoadSamples], base: str, scenario: Scenario) ->
 
 
 def fit_road_model(
-    model: RoadModel, samples: Sequence[RoadSamples], settings: ModelSettings, scenario: Scenario, seed: Seed
-) -> ModelFit:
+    model: RoadModel, samples: Sequence[RoadSamples], settings: ModelSettings, scenario: Scenario, seed: ensemble.Seed
+) -> ensemble.ModelFit:
     """Measure the noise of human drivers' speeds, unless they are commanded, and fit `model`, see `fit_human_model`."""
     rows = human_rows(samples, model.base, scenario)
     if scenario.human_control == "commanded":
@@ -232,15 +213,15 @@ def fit_human_model(
     rows: HumanRows,
     sigma: float,
     settings: ModelSettings,
-    seed: Seed,
+    seed: ensemble.Seed,
     is_noise_known: bool,
     min_error_reduction: float = 0.0,
-) -> ModelFit:
+) -> ensemble.ModelFit:
     """Fit `model` further, in place, to the residual of the base of the rows' intended speeds, see `fit_ensemble`.
 
-    The errors are those of `ModelFit` for the speed alone. `sigma` is the standard deviation of the rows' noise [m/s];
-    unless the intended speeds are without noise (`is_noise_known`), its variance is subtracted from the mean squared
-    errors. Networks are used if they reduce the base's mean squared error by the share `min_error_reduction`.
+    `sigma` is the standard deviation of the rows' noise [m/s]; unless the intended speeds are without noise, its
+    variance is subtracted from squared errors. Networks must reduce the base's squared error by the share
+    `min_error_reduction`.
     """
     generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
     is_holdout = is_holdout_episode(rows.episode, settings.holdout)
@@ -248,22 +229,26 @@ def fit_human_model(
         is_holdout = np.arange(len(is_holdout)) >= (1.0 - settings.holdout) * len(is_holdout)
     model.noise.fill_(sigma)
     targets = torch.from_numpy((rows.intended_speed - rows.base_speed)[:, None])
-    fit = fit_ensemble(model, _inputs(*rows[:ROAD_MODEL_INPUTS]), targets, is_holdout, settings, generator)
-    base_error, model_error = root_mean_square(fit.targets), root_mean_square(fit.targets - fit.predictions)
-    is_base_enough = base_error < MIN_CHANGE or model_error**2 > (1.0 - min_error_reduction) * base_error**2
+    fit = ensemble.fit_ensemble(model, _inputs(*rows[:ROAD_MODEL_INPUTS]), targets, is_holdout, settings, generator)
+    base_error, model_error = (
+        ensemble.root_mean_square(fit.targets),
+        ensemble.root_mean_square(fit.targets - fit.predictions),
+    )
+    is_base_enough = base_error < ensemble.MIN_CHANGE or model_error**2 > (1.0 - min_error_reduction) * base_error**2
     if settings.fallback_to_base and is_base_enough:
         model.output_mask.zero_()
     predictions = fit.predictions * model.output_mask.numpy()
     errors = fit.targets - predictions
     change = float((rows.intended_speed - rows.speed)[fit.holdout_indices].std())
-    one_step = OneStepRMSE(base_error, root_mean_square(errors), change)
+    one_step = ensemble.OneStepRMSE(base_error, ensemble.root_mean_square(errors), change)
     if not is_noise_known:
         errors = np.sqrt((np.square(errors).mean((0, 1)) - sigma**2).clip(0.0))
     estimates = {
-        "unexplained_variance": (root_mean_square(errors) / max(change, MIN_CHANGE)) ** 2,
-        "transitions": transition_variation(errors, sigma),
-        "total_variation": total_variation(predictions, np.array([sigma])),
+        "unexplained_variance": (ensemble.root_mean_square(errors) / max(change, ensemble.MIN_CHANGE)) ** 2,
+        "transitions": ensemble.transition_variation(errors, sigma),
+        "total_variation": ensemble.total_variation(predictions, np.array([sigma])),
         "training_loss": fit.loss,
     }
     learned = ("speed",) if model.output_mask.any() else ()
-    return ModelFit(estimates, {"speed": one_step}, learned, fit.training_rows, len(fit.holdout_indices), fit.epochs)
+    holdout_rows = len(fit.holdout_indices)
+    return ensemble.ModelFit(estimates, {"speed": one_step}, learned, fit.training_rows, holdout_rows, fit.epochs)

@@ -18,18 +18,9 @@ from unjam.drivers.residual import EXPERT_KEY, RESIDUAL_AGE_KEY, RESIDUAL_KEY, R
 from unjam.drivers.safety import FollowingState
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import MissingPartError, UnjamError
+from unjam.models import row_model
 from unjam.models.ensemble import Seed, predict, random_members
 from unjam.models.environment_data import EnvironmentData, StartIndices, reconstruct_memory
-from unjam.models.row_model import (
-    NOISE_SAMPLES,
-    SPEED_FIELDS,
-    STATE_FIELDS,
-    RowModel,
-    base_reward,
-    base_step,
-    max_gap,
-    model_inputs,
-)
 from unjam.models.settings import Device, ModelSettings
 from unjam.physics.kinematics import distance_driven
 from unjam.scenarios.scenario import Scenario
@@ -38,10 +29,8 @@ from unjam.worlds.drive import drive_world
 from unjam.worlds.reward import Outcome, Reward, make_reward
 from unjam.worlds.world import DriverLog, ProgressCallback
 
-GAP_SLICE = slice(len(SPEED_FIELDS), len(STATE_FIELDS))
-"""the gaps in `STATE_FIELDS`"""
+GAP_SLICE = slice(len(row_model.SPEED_FIELDS), len(row_model.STATE_FIELDS))
 CLIPPED_QUANTITIES = ("speed", "gap", "reward")
-"""quantities that are clipped to physical bounds"""
 
 
 def check_device(device: Device, name: str = "device") -> None:
@@ -116,13 +105,12 @@ class ModelTransition(NamedTuple):
 class ModelDynamics:
     """Base plus residual of a random member of the ensemble in each step, Eq. 4, for state and reward.
 
-    Noise is a random holdout error of the model, drawn independently for each row and step: it has their standard
-    deviations, correlations and tails. Noise alone never causes a collision.
+    Noise is a random holdout error of the model for each row and step; it alone never causes a collision.
     """
 
     def __init__(
         self,
-        model: RowModel,
+        model: row_model.RowModel,
         scenario: Scenario,
         reward: str,
         generator: torch.Generator,
@@ -135,19 +123,16 @@ class ModelDynamics:
         self._reward = tensor_reward(reward or scenario.reward)
 
     def step(self, state: LocalState, acceleration: Tensor, drawn_values: Tensor) -> ModelTransition:
-        """Return the transitions under `acceleration` [m/s2], (n,), which the safety filter limits.
-
-        `drawn_values`, (n, m), are those that the rows' episodes drew.
-        """
+        """Return the transitions under `acceleration` [m/s2], (n,), with `drawn_values`, (n, m), of the episodes."""
         scenario = self._scenario
         acceleration = scenario.safety.limit(acceleration, FollowingState(*state[:3]), scenario.control_step)
-        base_state = base_step(self._model.base, scenario, state, acceleration)
-        expected = torch.stack([getattr(base_state, name) for name in STATE_FIELDS])
+        base_state = row_model.base_step(self._model.base, scenario, state, acceleration)
+        expected = torch.stack([getattr(base_state, name) for name in row_model.STATE_FIELDS])
         residual = self._residual(state, acceleration, drawn_values, expected[GAP_SLICE]).T
-        predicted = expected + residual[: len(STATE_FIELDS)]
-        predicted_speeds, predicted_gaps = predicted[: len(SPEED_FIELDS)], predicted[GAP_SLICE]
+        predicted = expected + residual[: len(row_model.STATE_FIELDS)]
+        predicted_speeds, predicted_gaps = predicted[: len(row_model.SPEED_FIELDS)], predicted[GAP_SLICE]
         crashed = (predicted_gaps <= 0.0).any(0)
-        largest_gap = max_gap(state)
+        largest_gap = row_model.max_gap(state)
         speeds = predicted_speeds.clip(0.0, scenario.top_speed)
         gaps = predicted_gaps.clip(0.0).minimum(largest_gap)
         residual_reward = residual[-1].clip(*self._model.reward_range)
@@ -167,7 +152,7 @@ class ModelDynamics:
             distance_to_crossing=None if to_crossing is None else (to_crossing - distance) % state.loop_length,
             penetration_rate=state.penetration_rate,
         )
-        reward = base_reward(self._model.base, self._reward, next_state, acceleration, crashed)
+        reward = row_model.base_reward(self._model.base, self._reward, next_state, acceleration, crashed)
         clipped = torch.stack(
             [(speeds != predicted_speeds).any(0), (gaps != predicted_gaps).any(0), residual_reward != residual[-1]]
         )
@@ -178,10 +163,10 @@ class ModelDynamics:
         rows, members, generator = len(acceleration), self._fixed_members, self._generator
         if members is None:
             members = random_members(self._model.members, rows, generator)
-        residual = predict(self._layers, model_inputs(state, acceleration, drawn_values), members)
+        residual = predict(self._layers, row_model.model_inputs(state, acceleration, drawn_values), members)
         if not self._add_noise:
             return residual
-        samples = torch.randint(NOISE_SAMPLES, (rows,), generator=generator, device=generator.device)
+        samples = torch.randint(row_model.NOISE_SAMPLES, (rows,), generator=generator, device=generator.device)
         noisy = residual + self._model.noise.index_select(0, samples)
         # Vehicles that change lanes or merge make gaps jump; they do so only where they fit.
         is_collision = (expected_gaps + noisy.T[GAP_SLICE] <= 0.0).any(0)
@@ -198,9 +183,8 @@ def rollout_length(eps_m: float, settings: ModelSettings) -> int:
 def return_bound(eps_pi: float, eps_m: float, k: int, gamma: float, max_reward: float) -> float:
     """Return C, the bound on model return minus environment return (paper, below Eq. 13).
 
-    `eps_pi` is the total variation between the policy and the one that collected the data, `eps_m` that between next
-    states of model and environment; `k` the rollout length, `gamma` the discount and R_max the largest |reward| of
-    control steps.
+    `eps_pi` is the total variation of the policy since the data, `eps_m` that of next states in the model; `k` the
+    rollout length, `gamma` the discount of control steps.
     """
     horizon = 1.0 / (1.0 - gamma)
     policy_term = gamma ** (k + 1) * eps_pi * horizon**2 + gamma**k * eps_pi * horizon
@@ -235,7 +219,6 @@ class RolloutBatch:
     drawn_values: Tensor
     """scaled values that the episodes drew, shape (n, m)"""
     control_steps: int
-    """total number of valid control steps"""
     clipped_share: dict[str, float]
     """share of the control steps in which each of `CLIPPED_QUANTITIES` was clipped"""
 
@@ -365,8 +348,7 @@ def roll_out(
 ) -> RolloutBatch:
     """Drive the full policy in the model for `control_steps`, rounded down to whole actions of the network.
 
-    `generator` draws the exploration noise; None: no exploration. Raises `UnjamError` if the model, or `InputError`
-    if a driver of the user, returns a value that is not finite.
+    `generator` draws the exploration noise, if any. Raises `UnjamError` or `InputError` for values that are not finite.
     """
     speed, repeat = starts.state.speed, driver.action_repeat
     driver = replace(driver, expert=tensor_driver(driver.expert, speed.device))

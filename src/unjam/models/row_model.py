@@ -38,7 +38,6 @@ from unjam.worlds.reward import Outcome, Reward, make_reward, time_gap
 SPEED_FIELDS = ("speed", "leader_speed", "follower_speed")
 GAP_FIELDS = ("leader_gap", "follower_gap")
 STATE_FIELDS = (*SPEED_FIELDS, *GAP_FIELDS)
-"""the five predicted quantities of the state"""
 TARGET_NAMES = (*STATE_FIELDS, "reward")
 """outputs of the networks: the difference of each quantity to the base's prediction [m/s, m, reward]"""
 NOISE_SAMPLES = 4096
@@ -75,9 +74,8 @@ def missing_neighbors(state: LocalState) -> tuple[Array, Array]:
 def base_step(base: str, scenario: Scenario, state: LocalState, acceleration: Array) -> LocalState:
     """Return the state after one control step under `acceleration` [m/s2] according to the base; Eq. 2 of the paper.
 
-    The follower moves by the base's car-following model. The leader keeps its speed, since its own leader is not
-    observed. All take `scenario.steps_per_control_step` Euler steps, as in SUMO. Missing neighbors stay missing. The
-    base `none` predicts no change.
+    The follower moves by the base's car-following model, and the leader keeps its speed. Missing neighbors stay
+    missing. The base `none` predicts no change.
     """
     make_driver = BASE_DRIVERS[base]
     if make_driver is None:
@@ -137,7 +135,6 @@ class RowModel(Ensemble):
     noise: Tensor
     """errors on the holdout, shape (NOISE_SAMPLES, 6)"""
     reward_range: Tensor
-    """smallest and largest residual of the reward"""
 
     def __init__(
         self, settings: ModelSettings, drawn_count: int, seed: Seed, device: torch.device | str = "cpu"
@@ -220,8 +217,7 @@ def unexplained_variance(one_step: Sequence[OneStepRMSE]) -> float:
 def recorded_noise(transitions: Transitions, scenario: Scenario) -> Floats | None:
     """Return what noise added to the speeds of leader and follower in each control step, shape (rows, 2).
 
-    SUMO's drivers add it after they have moved, so that their distance gives the intended speed. Noise moves commanded
-    drivers too: then it is unknown, None.
+    SUMO's drivers add it after they have moved; None for commanded drivers, whom it moves.
     """
     if scenario.human_control != "native" or scenario.steps_per_control_step > 1:
         return None

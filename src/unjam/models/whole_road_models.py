@@ -10,19 +10,11 @@ import numpy as np
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.residual import EXPERT_KEY
 from unjam.errors import InputError
+from unjam.models import road_model
 from unjam.models.comparison import ReplayDriver
 from unjam.models.ensemble import ModelFit, Seed, torch_generator
 from unjam.models.environment_data import StartIndices, is_holdout_episode, reconstruct_memory
 from unjam.models.motorway_model import MotorwaySamples, fit_motorway_model, learned_correction, motorway_samples
-from unjam.models.road_model import (
-    RoadModel,
-    RoadSamples,
-    base_human_model,
-    fit_road_model,
-    learned_human_model,
-    road_samples,
-    with_size,
-)
 from unjam.models.settings import ModelSettings
 from unjam.models.world_model import RolloutPlan, Rollouts, WorldModel
 from unjam.scenarios.motorway import Motorway
@@ -45,10 +37,10 @@ from unjam.worlds.worker_pool import EpisodeTask
 WAVE_INTERVAL = 10.0
 """time between the stored states of waves on an on-ramp [s]"""
 Facts = dict[str, Any]
-SamplesT = TypeVar("SamplesT", RoadSamples, MotorwaySamples)
+SamplesT = TypeVar("SamplesT", road_model.RoadSamples, MotorwaySamples)
 
 
-class WholeRoadModel(WorldModel[RoadModel, SamplesT]):
+class WholeRoadModel(WorldModel[road_model.RoadModel, SamplesT]):
     """A world model of whole roads, which is fitted to samples of all vehicles in the episodes of D_a."""
 
     @classmethod
@@ -62,19 +54,16 @@ class WholeRoadModel(WorldModel[RoadModel, SamplesT]):
         if reason:
             raise InputError(f"model.kind: road is not allowed; allowed: row, for {reason}")
 
-    def new_ensemble(self) -> RoadModel:
+    def new_ensemble(self) -> road_model.RoadModel:
         """Return the ensemble before any fit."""
-        return RoadModel(self.settings, self.seed)
+        return road_model.RoadModel(self.settings, self.seed)
 
     def simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
         """Yield the episodes of a plan without rewards, batch by batch."""
         raise NotImplementedError
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:
-        """Return a holdout episode as recorded, in the model, and in its base alone, as facts for `model.json`.
-
-        `run_episode` runs an episode where environment episodes run.
-        """
+        """Return a holdout episode as recorded, in the model, and in its base alone, as facts for `model.json`."""
         raise NotImplementedError
 
     def roll_out(self, plan: RolloutPlan) -> Iterator[Rollouts]:
@@ -94,29 +83,30 @@ class WholeRoadModel(WorldModel[RoadModel, SamplesT]):
         return (held_out or self.samples)[-1]
 
 
-class ClosedRoadModel(WholeRoadModel[RoadSamples]):
+class ClosedRoadModel(WholeRoadModel[road_model.RoadSamples]):
     """The world model of closed roads."""
 
-    samples_type: ClassVar = RoadSamples
+    samples_type: ClassVar = road_model.RoadSamples
 
     @property
     def cavs_per_start(self) -> int:
         """Number of CAVs of a rollout: all of its road."""
         return len(self.scenario.possible_cav_ids())
 
-    def sample_episode(self, episode: Episode, number: int) -> RoadSamples:
+    def sample_episode(self, episode: Episode, number: int) -> road_model.RoadSamples:
         """Return the samples of an episode with this number."""
-        return road_samples(episode, number, cast(LoopScenario, self.scenario))
+        return road_model.road_samples(episode, number, cast(LoopScenario, self.scenario))
 
     def fit(self, seed: Seed) -> ModelFit:
         """Fit the ensemble further to all samples."""
-        return fit_road_model(self.ensemble, self.samples, self.settings, self.scenario, seed)
+        return road_model.fit_road_model(self.ensemble, self.samples, self.settings, self.scenario, seed)
 
     def simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
         """Yield the episodes of a plan with `StartIndices` as starts, in one batch."""
         rows = self.cavs_per_start * len(plan.starts)
         memory = plan.driver.initial_memory(rows) | {EXPERT_KEY: self._expert_memory(plan.starts)}
-        human_model = learned_human_model(self.ensemble, self.scenario, torch_generator(plan.noise_seed, "cpu"))
+        generator = torch_generator(plan.noise_seed, "cpu")
+        human_model = road_model.learned_human_model(self.ensemble, self.scenario, generator)
         yield self.simulate(plan.driver, memory, plan.starts, plan.control_steps, human_model, plan.exploration_seed)
 
     def simulate(
@@ -128,10 +118,7 @@ class ClosedRoadModel(WholeRoadModel[RoadSamples]):
         human_model: HumanSpeedModel,
         seed: Seed,
     ) -> list[Episode]:
-        """Return the episodes that follow recorded states; `seed` is that of all noise, and of sensor errors.
-
-        `driver` controls all CAVs and explores; its `memory` has all rows of the first CAV, then of the second.
-        """
+        """Return the episodes that follow recorded states; `memory` has all rows of the first CAV, then the next."""
         road = cast(LoopScenario, self.scenario)
         by_episode = {each.episode: each for each in self.samples}
         samples = [by_episode[self.data.recordings[index].episode] for index, _ in start_indices]
@@ -139,7 +126,7 @@ class ClosedRoadModel(WholeRoadModel[RoadSamples]):
         noise = float(self.ensemble.noise) / road.simulation_step / replace(road, noise=1.0).noise_per_step
         common = replace(road, horizon=control_steps, noise=noise if self.settings.add_noise else 0.0, population="")
         world = RingBatch(
-            [with_size(common, each.size) for each in samples],
+            [road_model.with_size(common, each.size) for each in samples],
             [(*seed, number) for number in range(len(samples))],  # of sensors alone: everything else is given
             draw=np.random.default_rng(list(seed)).standard_normal,
             human_model=human_model,
@@ -160,8 +147,8 @@ class ClosedRoadModel(WholeRoadModel[RoadSamples]):
         rows = [index for index, each in enumerate(recordings) if each.episode == samples.episode]
         driver = ReplayDriver(np.stack([recordings[row].applied_acceleration for row in rows], 1))
         human_models = {
-            "model": learned_human_model(self.ensemble, self.scenario, torch_generator((0,), "cpu")),
-            "base": base_human_model(self.settings.base, self.scenario),
+            "model": road_model.learned_human_model(self.ensemble, self.scenario, torch_generator((0,), "cpu")),
+            "base": road_model.base_human_model(self.settings.base, self.scenario),
         }
         lanes, cav_columns = np.zeros((0, 0)), np.flatnonzero(samples.is_human == 0.0).tolist()
         roads = {"recorded": _road_facts(samples.speeds, samples.positions, lanes, cav_columns)}
@@ -270,7 +257,7 @@ class MotorwayModel(WholeRoadModel[MotorwaySamples]):
         world.measured_fields = driver.requirements().measured_fields
         return finish_drive(DriveLoop(world, driver, 0.0 if exploration_scales is None else 1.0))
 
-    def _correction(self, model: RoadModel, seed: Sequence[int]) -> LearnedCorrection | None:
+    def _correction(self, model: road_model.RoadModel, seed: Sequence[int]) -> LearnedCorrection | None:
         generator, steps = torch_generator(seed, "cpu"), self.scenario.steps_per_control_step
         return learned_correction(model, generator, steps, self.settings.add_noise)
 

@@ -40,15 +40,11 @@ class Rollouts(NamedTuple):
     """Model rollouts, either rows or whole episodes."""
 
     control_steps: int
-    """total number"""
     returns: Floats
-    """of each rollout"""
     crashed: Sequence[bool]
-    """whether it ended in a collision"""
     rows: RolloutBatch | None = None
     episodes: Sequence[Episode] = ()
     facts: Mapping[str, Any] = MappingProxyType({})
-    """other facts about them"""
 
 
 class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
@@ -58,10 +54,7 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
     """type of the samples of each episode to which the ensemble is fitted; None: it is fitted to D_a itself"""
 
     def __init__(self, settings: ModelSettings, task: Task, exploration_signs: Sequence[float], seed: Seed) -> None:
-        """Start with the base alone and without data; `InputError` if scenario or settings are not supported.
-
-        Consecutive episodes with the same vehicles explore with `exploration_signs`.
-        """
+        """Start with the base alone and without data; `InputError` if scenario or settings are not supported."""
         check_device(settings.device, "model.device")
         self.check(task.scenario, settings)
         self.settings, self.task, self.exploration_signs, self.seed = settings, task, exploration_signs, seed
@@ -117,10 +110,7 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
             self.scenario = replace(self.scenario, humans=calibrate_human_drivers(states, self.scenario))
 
     def draw_starts(self, control_steps: int, parts: int, seed: Seed) -> Any:
-        """Return random recorded states for one of several parts of the rollouts, each of so many control steps.
-
-        All rollouts together have `model_ratio` times as many steps as the newest episodes.
-        """
+        """Return random recorded states for one of several parts of the rollouts, by `model_ratio` in all."""
         kind = self.settings.rollout_starts
         count = ceil(self.settings.model_ratio * self.new_steps / (parts * self.cavs_per_start) / control_steps)
         first_episode = self.first_new_episode if kind == "newest" else 0
@@ -129,8 +119,7 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
     def recorded_returns(self, plan: RolloutPlan) -> Floats:
         """Return the returns of D_a from the starts on, NaN for older than the newest episodes or with too few steps.
 
-        Compared with the rollouts they are fair if the same policy drove both, with exploration. They are undiscounted
-        sums of rewards up to the last step or a crash.
+        They are undiscounted, up to the last step or a crash; rollouts must have the same policy and exploration.
         """
         rewards = [self.data.recordings[index].reward[at : at + plan.control_steps] for index, at in plan.starts]
         is_new = [self.data.recordings[index].episode >= self.first_new_episode for index in plan.starts[:, 0]]

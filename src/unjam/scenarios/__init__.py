@@ -115,10 +115,7 @@ def default_scenario(name: str) -> Scenario | type[Scenario]:
 
 
 def without_toml_file(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a configuration of a run or task that has the content of a scenario's TOML file instead of its name.
-
-    A run holds its road: the file may change later, and another folder may have another one of this name.
-    """
+    """Return a configuration with the content of a scenario's TOML file, which may change, instead of its name."""
     name = values.get("scenario")
     if not isinstance(name, str) or not name.endswith(".toml"):
         return values
@@ -134,10 +131,7 @@ def example_scenario(name: str) -> Scenario:
 
 
 def scenario_recipe(scenario: Scenario) -> dict[str, Any]:
-    """Return a scenario as JSON; the inverse of `scenario_from_recipe`.
-
-    Raise `InputError` for a class that another process cannot import: neither built in nor from a `path.py:name`.
-    """
+    """Return a scenario as JSON; raise `InputError` for a class that another process cannot import."""
     kind = type(scenario)
     code = {} if SCENARIO_KINDS.get(kind.title) is kind else {CODE_ENTRY: class_recipe(kind)}
     return {"kind": kind.title, **code, **asdict(scenario)}

@@ -118,8 +118,7 @@ class FigureEight(LoopScenario):
     def limit_speed(self, size: float) -> float:
         """Return the speed at which a queue at equilibrium just clears the crossing before its head is back [m/s].
 
-        The queue of all vehicles at the IDM's equilibrium gaps and the crossing fill half a lap. Vehicles that must
-        yield need a margin of some seconds, so the real limit is lower.
+        The queue and the crossing fill half a lap; vehicles that must yield need more, so the real limit is lower.
         """
         queue = _edge_length(size) / 2 - CROSSING_LINK
         return equilibrium_speed(queue / self.vehicles - VEHICLE_LENGTH, self.humans)

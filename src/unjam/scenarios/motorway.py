@@ -1,6 +1,6 @@
 """Motorways with any number of lanes and on-ramps, a peak of demand, and different human drivers that overtake."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import field, replace
 from typing import Annotated, ClassVar, Literal, Self
 
@@ -10,16 +10,8 @@ from pydantic import Field, model_validator
 from unjam.drivers.roadside import RoadsideSettings
 from unjam.drivers.safety import SafetyFilter
 from unjam.parameters import STRICT, NonNegative, Positive, PositiveInt, Subclassable, parameter_dataclass
+from unjam.scenarios import motorway_vehicles
 from unjam.scenarios.motorway_road import MAIN_ROUTE, MotorwayGeometry, MotorwayRoad, RampGeometry
-from unjam.scenarios.motorway_vehicles import (
-    TRUCK_TYPE_COUNT,
-    Interval,
-    LaneChanging,
-    OrdinaryACC,
-    Trucks,
-    check_intervals,
-    draw_uniform,
-)
 from unjam.scenarios.road import Entry, VehicleType
 from unjam.scenarios.road_control import RampMeter, SpeedLimitControl
 from unjam.scenarios.scenario import Actuation, Horizon, Scenario, SimulationStep
@@ -92,7 +84,7 @@ class Motorway(Scenario):
     """demand at the entrance of the motorway in the peak [veh/h]"""
     off_peak_inflow: NonNegative = 1800.0
     """demand at the entrance before and after the peak [veh/h]"""
-    peak: Interval = (300.0, 1500.0)
+    peak: motorway_vehicles.Interval = (300.0, 1500.0)
     """its begin and end [s]"""
     peak_rise: Annotated[float, Field(ge=0, le=86_400)] = 0.0
     """time in which demand rises before the peak, and falls after it, in steps of a minute [s]"""
@@ -104,22 +96,22 @@ class Motorway(Scenario):
     """exact number of CAVs instead of a share, among the vehicles of the first half"""
     car_following: Literal["EIDM", "IDM"] = "EIDM"
     """SUMO's car-following model of human drivers"""
-    time_headways: Interval = (1.0, 1.8)
+    time_headways: motorway_vehicles.Interval = (1.0, 1.8)
     """range among human drivers [s]"""
-    accelerations: Interval = (1.0, 1.5)
+    accelerations: motorway_vehicles.Interval = (1.0, 1.5)
     """range among human drivers [m/s2]"""
-    decelerations: Interval = (1.5, 2.0)
+    decelerations: motorway_vehicles.Interval = (1.5, 2.0)
     """range of comfortable decelerations among human drivers [m/s2]"""
-    minimum_gaps: Interval = (2.0, 2.5)
+    minimum_gaps: motorway_vehicles.Interval = (2.0, 2.5)
     """range among human drivers, in a standing queue [m]"""
     speed_factor_std: NonNegative = 0.1
     """standard deviation of desired speed / speed limit, with mean 1; at most 0.2 from the mean"""
     vehicle_length: Positive = 4.8
     """of cars [m]"""
-    lane_changing: LaneChanging = field(default_factory=LaneChanging)
+    lane_changing: motorway_vehicles.LaneChanging = field(default_factory=motorway_vehicles.LaneChanging)
     """how human drivers change lanes"""
-    trucks: Trucks = field(default_factory=Trucks)
-    ordinary_acc: OrdinaryACC = field(default_factory=OrdinaryACC)
+    trucks: motorway_vehicles.Trucks = field(default_factory=motorway_vehicles.Trucks)
+    ordinary_acc: motorway_vehicles.OrdinaryACC = field(default_factory=motorway_vehicles.OrdinaryACC)
     """cars with an ACC that are not CAVs"""
     speed_limit_control: SpeedLimitControl = field(default_factory=SpeedLimitControl)
     """variable speed limits for all vehicles upstream of each ramp"""
@@ -141,7 +133,7 @@ class Motorway(Scenario):
 
     @model_validator(mode="after")
     def _check_settings(self) -> Self:
-        check_intervals(self, "time_headways", "accelerations", "decelerations", "minimum_gaps")
+        motorway_vehicles.check_intervals(self, "time_headways", "accelerations", "decelerations", "minimum_gaps")
         begin, end = self.peak
         if not 0 <= begin <= end:
             raise ValueError(f"peak: ({begin:g}, {end:g}) is not allowed; allowed: 0 <= begin <= end")
@@ -206,7 +198,9 @@ class Motorway(Scenario):
             limit_speed=self.speed_limit,
             merge_positions=tuple(ramp.merge_start - geometry.origin for ramp in geometry.ramps),
             vehicle_types=types,
-            cav_ids=self._select_cavs({each.name: draws[each.name] for each in entries if _is_car(types, each)}),
+            cav_ids=self._select_cavs(
+                {each.name: draws[each.name] for each in entries if types[each.vehicle_type].vehicle_class is None}
+            ),
             peak=self.peak,
             free_flow_time=self.free_flow_time,
             roadside=self.roadside,
@@ -220,10 +214,7 @@ class Motorway(Scenario):
 
     @property
     def free_flow_time(self) -> float:
-        """Mean travel time of human drivers in free flow [s]: as measured, or at the speed limits.
-
-        At the speed limits, it is the mean of all routes, weighted with their demand before and after the peak.
-        """
+        """Mean travel time of human drivers in free flow [s]: as measured, or at speed limits, by off-peak demand."""
         geometry = self.geometry
         if measured := FREE_FLOW_TIMES.get(geometry._replace(vehicle_length=0.0)):
             return measured
@@ -241,22 +232,20 @@ class Motorway(Scenario):
         return ("allowed_speed", *to_merge, *ahead, "adjacent_gaps", "adjacent_speeds", "penetration_rate")
 
     def _select_cavs(self, draws: dict[str, float]) -> frozenset[str]:
-        """Return the CAVs: the vehicles with the lowest draws."""
         if self.cavs is None:
             return frozenset(name for name, draw in draws.items() if draw < self.penetration_rate)
         early = sorted(list(draws)[: len(draws) // 2], key=draws.__getitem__)
         return frozenset(early[: self.cavs])
 
     def _draw_types(self, generator: np.random.Generator) -> tuple[dict[str, VehicleType], Callable[[str], str]]:
-        """Return all vehicle types, and a function that replaces a human driver's type by that of a truck or an ACC.
-
-        What other settings draw, on a generator of their own, does not change the cars with human drivers.
-        """
+        """Return all vehicle types, and a function that replaces types by trucks or ACCs by draws of its own."""
         (others,) = generator.spawn(1)
         humans = {f"human_type_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
         lane_changing, trucks, acc = self.lane_changing, self.trucks, self.ordinary_acc
         types = {name: one._replace(parameters=lane_changing.draw(others)) for name, one in humans.items()}
-        truck_types = [f"truck_type_{number}" for number in range(TRUCK_TYPE_COUNT if trucks.share else 0)]
+        truck_types = [
+            f"truck_type_{number}" for number in range(motorway_vehicles.TRUCK_TYPE_COUNT if trucks.share else 0)
+        ]
         if acc.share:
             types |= {_with_acc(name): acc.replace_driver(types[name]) for name in humans}
         types |= {name: trucks.draw(others, self.car_following, lane_changing) for name in truck_types}
@@ -264,7 +253,7 @@ class Motorway(Scenario):
         def select_type(human: str) -> str:
             draw = others.random()
             if draw < trucks.share:
-                return truck_types[others.integers(TRUCK_TYPE_COUNT)]
+                return truck_types[others.integers(motorway_vehicles.TRUCK_TYPE_COUNT)]
             return _with_acc(human) if draw < trucks.share + acc.share else human
 
         return types, select_type
@@ -272,10 +261,10 @@ class Motorway(Scenario):
     def _draw_human_type(self, generator: np.random.Generator) -> VehicleType:
         human = VehicleType(
             model=self.car_following,
-            time_headway=draw_uniform(generator, self.time_headways),
-            acceleration=draw_uniform(generator, self.accelerations),
-            deceleration=draw_uniform(generator, self.decelerations),
-            minimum_gap=draw_uniform(generator, self.minimum_gaps),
+            time_headway=motorway_vehicles.draw_uniform(generator, self.time_headways),
+            acceleration=motorway_vehicles.draw_uniform(generator, self.accelerations),
+            deceleration=motorway_vehicles.draw_uniform(generator, self.decelerations),
+            minimum_gap=motorway_vehicles.draw_uniform(generator, self.minimum_gaps),
             speed_factor=round(float(np.clip(generator.normal(1.0, self.speed_factor_std), *SPEED_FACTOR_RANGE)), 4),
             length=self.vehicle_length,
         )
@@ -354,12 +343,7 @@ class Motorway(Scenario):
 
 
 def _with_acc(human_type: str) -> str:
-    """Return the name of the vehicle type of a human driver's car with an ordinary ACC."""
     return f"acc_{human_type}"
-
-
-def _is_car(types: Mapping[str, VehicleType], entry: Entry) -> bool:
-    return types[entry.vehicle_type].vehicle_class is None
 
 
 ON_RAMP = Motorway(ramps=(Ramp(position=2000.0),))

@@ -41,8 +41,7 @@ class RampGeometry(NamedTuple):
 class MotorwaySections(NamedTuple):
     """The sections where n vehicles are, and their next ramps; arrays of shape (n,).
 
-    The next ramp of a vehicle is the first one with a merging section that ends downstream of the vehicle; downstream
-    of all merging sections, it is the last ramp.
+    The next ramp has the first merging section that ends downstream of the vehicle; downstream of all, it is the last.
     """
 
     ramp: Array
@@ -102,10 +101,7 @@ class MotorwayGeometry(NamedTuple):
         return MotorwaySections(ramp, merge_start, merge_end, limits[ramp], start, is_before, ~is_before & ~is_past)
 
     def distance_to_merge(self, lane: Array, position: Array) -> Array | None:
-        """Return the distance of n vehicles to the merging section of their next ramp [m]; None without ramps.
-
-        It is negative in the section, and downstream of the last one.
-        """
+        """Return the distance to the next merging section [m], in it negative; None without ramps."""
         return self.sections(lane, position).merge_start - position if self.ramps else None
 
     def speed_limits(self, lane: Array, sections: MotorwaySections) -> Array:

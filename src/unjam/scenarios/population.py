@@ -83,10 +83,7 @@ def residual_inputs(speed: Array, leader_speed: Array, gap: Array) -> Array:
 def apply_population(
     population: Population | None, acceleration: Array, speed: Array, leader_speed: Array, gap: Array
 ) -> Array:
-    """Return IDM accelerations with the residual and the limits of a population applied [m/s2].
-
-    Shapes: all arrays (n,). Without a population the accelerations are unchanged.
-    """
+    """Return IDM accelerations (n,) with the residual and the limits of a population, if any, applied [m/s2]."""
     if population is None:
         return acceleration
     if population.residual is not None:
@@ -118,10 +115,7 @@ def write_population(path: Path, population: Population) -> None:
 
 
 def population_file(name: Path | str) -> Path:
-    """Return the file of a population: names such as `unjam:ngsim` are part of the package, others are paths.
-
-    Raise `InputError` if the package has no population of that name.
-    """
+    """Return the file of a population, in the package or by path; raise `InputError` if the package has none."""
     if not str(name).startswith(PACKAGED_PREFIX):
         return Path(name)
     known = {f"{PACKAGED_PREFIX}{path.stem}": path for path in sorted(PACKAGED_POPULATIONS.glob("*.json"))}

@@ -119,14 +119,10 @@ class Recorded(Scenario):
 
     @cached_property
     def _longest_recording(self) -> float:
-        """Duration of the longest recording [s]."""
-        if not self.recordings:
-            return ARTIFICIAL_SECONDS
-        return max(each.seconds for each in self._leaders)
+        return max(each.seconds for each in self._leaders) if self.recordings else ARTIFICIAL_SECONDS
 
     @cached_property
     def _leaders(self) -> list[LeaderRecording]:
-        """All recordings of all files."""
         from unjam.recordings.leader_files import read_leaders
 
         files, found, problems = recording_files(Path(self.recordings)), list[LeaderRecording](), dict[str, str]()
@@ -227,7 +223,9 @@ class Recorded(Scenario):
         """Return the road behind a vehicle with given speeds in all simulation steps [m/s], shape (S + 1,)."""
         ids = (LEADER_ID, *(f"{kind}_{number}" for number, kind in enumerate(self.vehicle_kinds)))[::-1]
         people, speed = self.draw_humans(ids, generator), float(speeds[0])
-        spaces = [VEHICLE_LENGTH + self._start_gap(speed, people.get(name, self.humans)) for name in ids[:-1]]
+        humans = [people.get(name, self.humans) for name in ids[:-1]]
+        start_speeds = [min(speed, MAX_FREE_SPEED_SHARE * human.desired_speed) for human in humans]
+        spaces = [VEHICLE_LENGTH + gap for gap in map(equilibrium_gap, start_speeds, humans)]
         positions = VEHICLE_LENGTH + np.concatenate([[0.0], np.cumsum(spaces)])
         distance = float(positions[-1] + speeds.sum() * self.simulation_step)
         length = ROAD_LENGTH_STEP * ceil(distance / ROAD_LENGTH_STEP + 0.5)
@@ -262,9 +260,6 @@ class Recorded(Scenario):
         found = read_leaders(files[number])
         part = int(generator.integers(len(found)))
         return {"file": float(number), "part": float(part)}, found[part]
-
-    def _start_gap(self, speed: float, human: IDMParameters) -> float:
-        return equilibrium_gap(min(speed, MAX_FREE_SPEED_SHARE * human.desired_speed), human)
 
     def _fact_values(self) -> tuple[str, str, str, str]:
         source = f"recordings of {self.recordings}" if self.recordings else "artificial waves"

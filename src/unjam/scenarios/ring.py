@@ -90,10 +90,7 @@ class LoopScenario(Scenario):
     def _closed_road(
         self, size: float, edges: Sequence[EdgeSpan], positions: NDArray[np.float64], **fields: Any
     ) -> ClosedRoad:
-        """Return a road of edges in driving order with vehicles at these positions, from the last to the first [m].
-
-        `fields` are further ones of the road.
-        """
+        """Return a road of edges in driving order with vehicles at positions from the last to the first [m]."""
         ids, names = self._vehicle_ids(), [edge.name for edge in edges]
         laps = int(self.max_duration * self.top_speed / sum(edge.length for edge in edges)) + 2  # enough for an episode
         routes = [Route(f"from_{name}", (*names[first:], *names[:first]), laps) for first, name in enumerate(names)]
@@ -145,7 +142,6 @@ class LoopScenario(Scenario):
 
     @property
     def _min_length(self) -> float:
-        """Shortest road on which the vehicles fit [m]."""
         return self.vehicles * (VEHICLE_LENGTH + self.humans.minimum_gap)
 
     def _vehicle_ids(self) -> tuple[str, ...]:

@@ -98,7 +98,6 @@ def _check_loop(road: ClosedRoad, vehicle_length: float) -> None:
 
 
 def _check_starts(road: ClosedRoad, lap: list[Edge]) -> None:
-    """Raise `ValueError` unless vehicles enter where they start."""
     offsets = dict(zip([edge.name for edge in lap], np.cumsum([0.0, *(edge.length for edge in lap)]), strict=False))
     starts = dict(zip(road.vehicle_ids, road.start_positions, strict=True))
     routes = {route.name: route for route in road.routes}

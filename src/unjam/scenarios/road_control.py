@@ -1,7 +1,4 @@
-"""What a road operator does at on-ramps: variable speed limits upstream, and ramp meters; both control a density.
-
-They act on all vehicles, not only on CAVs, and know the exact density of the merging section.
-"""
+"""What a road operator does at on-ramps, for all vehicles: variable speed limits and ramp meters control a density."""
 
 from unjam.parameters import STRICT, NonNegative, Positive, Subclassable, parameter_dataclass
 

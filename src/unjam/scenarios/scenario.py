@@ -89,12 +89,11 @@ class CruiseControl(Subclassable):
         step: float,
         vehicle_limits: tuple[Array, Array] | None = None,
     ) -> Array:
-        """Return the set speed with which the ACC accelerates as commanded on a free road [m/s].
+        """Return the set speed with which the ACC accelerates as commanded on a free road [m/s]; arrays (n,).
 
-        It is infinite where the command is the largest possible: the ACC then drives without a set-speed cap.
-        `target_speed` is to be reached after a `step` [s] of the simulation; `max_acceleration` is the largest that can
-        be commanded [m/s2]; `vehicle_limits` are acceleration and comfortable deceleration of each vehicle [m/s2], for
-        an ACC without its own. Arrays have shape (n,).
+        It is infinite where the command is `max_acceleration` [m/s2]: then there is no cap. `target_speed` is that
+        after a `step` [s]; `vehicle_limits` are acceleration and comfortable deceleration for an ACC without its own
+        [m/s2].
         """
         xp, command = namespace(speed), (target_speed - speed) / step
         vehicle_acceleration, vehicle_deceleration = vehicle_limits or (0.0, 0.0)
@@ -357,11 +356,7 @@ class Scenario(Subclassable):
         return {}
 
     def stratum(self, index: int, count: int) -> Self:
-        """Return this scenario with its drawn values narrowed to one of `count` equal parts of their range.
-
-        Episodes of all parts cover the range evenly: with few episodes, whether a ring is long or short would
-        otherwise hide the effect of the driver.
-        """
+        """Return this scenario with one of `count` parts of its drawn ranges: few episodes cover all of them evenly."""
         return self
 
     def draw_from_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:

@@ -162,11 +162,7 @@ class UserNetwork(Scenario):
         )
 
     def check_vehicles(self, has_entered: bool | None = None, warnings: Sequence[str] = ()) -> None:
-        """Raise `InputError` if no vehicle enters, according to the first departure or to an episode.
-
-        `has_entered`: whether a vehicle was on the road in a complete episode, with SUMO's `warnings`; None: no episode
-        was driven yet.
-        """
+        """Raise `InputError` if no vehicle enters, by the first departure or a whole episode (`has_entered`)."""
         files = read_sumo_files(Path(self.file))
         begin, first = self._begin(files), files.first_departure
         end = self._end(begin)
@@ -229,10 +225,7 @@ class UserNetwork(Scenario):
 
 
 def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
-    """Return the scenario of a .sumocfg file, with its step, begin and end unless `changes` has others.
-
-    Raise `InputError` with one line about what is missing or broken, before SUMO starts.
-    """
+    """Return the scenario of a .sumocfg file with `changes`; raise `InputError` about it before SUMO starts."""
     for name in (each for each in OPERATOR_SETTINGS if each in changes):
         raise InputError(
             f"{name}: it is not allowed on your own network, only on motorways such as on-ramp; {ALTERNATIVES}"
@@ -317,5 +310,4 @@ def is_road_vehicle(files: SumoFiles, name: str) -> bool:
 
 
 def _format_types(files: SumoFiles, names: Collection[str]) -> str:
-    """Return types with their classes, as many as fit on a line."""
     return _shorten_list([f"{name} ({vehicle_class(files, name)})" for name in sorted(names)], MAX_LOGGED_NAMES)

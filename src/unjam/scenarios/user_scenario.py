@@ -41,10 +41,7 @@ def _load_object(reference: FileReference) -> Scenario | type[Scenario]:
 
 
 def class_recipe(kind: type[Scenario]) -> dict[str, Any]:
-    """Return path, name and hash of a class that was loaded from a Python file.
-
-    Raise `InputError` for other classes, which other processes cannot import.
-    """
+    """Return path, name and hash of a class of a Python file; raise `InputError` for others, which stay here."""
     if kind in _class_recipes:
         return _class_recipes[kind]
     reference = object_reference(kind)

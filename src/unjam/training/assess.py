@@ -1,7 +1,6 @@
 """Assessment of CAVs on a user's network: controllers at several penetration rates, compared with two baselines.
 
-The baselines are human drivers alone, and ACC vehicles without a controller. A controller is selected for each
-penetration rate on selection seeds and tested on others; a rule decides whether it is recommended.
+These are human drivers alone, and ACC vehicles without a controller.
 """
 
 import json
@@ -62,7 +61,6 @@ from unjam.worlds.worker_pool import WorkerPool
 StageCallback = Callable[[str, int], None]
 """called with the name of a stage that begins, and its maximum number of control steps"""
 DEFAULT_CONTROLLERS = (DEFAULT_DRIVER, "follower-stopper", "pi")
-"""default controllers, which suit open roads"""
 ACC_PROPERTIES = ("acceleration", "deceleration", "keep_right", "speed_gain")
 """settings of the CAVs' ACC that replace a property of the vehicle"""
 SPEEDS_AHEAD = {"lane_speeds", "road_speeds", "congestion"}
@@ -70,7 +68,6 @@ SPEEDS_AHEAD = {"lane_speeds", "road_speeds", "congestion"}
 MIN_BASELINE_EPISODES = 20
 """episodes of the baseline to which early ends are related before the last one: two of them are too many"""
 PLOT_EPISODE_COUNT = 2
-"""episodes of the budget that are kept for figures"""
 ZERO_PENETRATION_RATE = 1e-12
 """penetration rate of human-only traffic: zero is not allowed on user networks"""
 SELECTION_FOLDER = "selection"
@@ -88,10 +85,8 @@ class AssessmentRequest:
     network: UserNetwork
     """user network with human drivers alone"""
     drivers: dict[str, Driver]
-    """the controllers"""
     penetration_rates: tuple[float, ...]
     episodes: int
-    """total budget"""
     minutes: float | None
     """time budget, checked between batches"""
     precision: float
@@ -142,10 +137,7 @@ def make_request(
     drivers: Sequence[str] = DEFAULT_CONTROLLERS,
     options: dict[str, Any] | None = None,
 ) -> AssessmentRequest:
-    """Return a checked request; raise `InputError` if an argument is wrong.
-
-    The human baseline is always included, with or without a penetration rate of 0.
-    """
+    """Return a checked request, with the human baseline; raise `InputError` if an argument is wrong."""
     if not file.endswith(".sumocfg"):
         raise invalid_value("scenario", file, "your own .sumocfg file")
     for name in [name for name in options or {} if name in CAV_SELECTION_OPTIONS]:
@@ -184,7 +176,6 @@ class Assessment:
     controller_results: list[ControllerResult]
     """results of the controller that was selected for each penetration rate; empty if all were rejected"""
     acc_results: list[AccResult]
-    """results of ACC vehicles alone at each penetration rate"""
     document: dict[str, Any]
     """the content of `assessment.json`: everything except the rows"""
     page: Path
@@ -198,12 +189,11 @@ def assess(
     on_message: MessageCallback = lambda line: None,
     on_stage: StageCallback = lambda name, steps: None,
 ) -> Assessment:
-    """Run an assessment, and write rows, `assessment.json` and the page into a new folder.
+    """Run an assessment, and write rows, `assessment.json` and the page into a new folder, at its end.
 
-    Files are written at the end. Without `minutes`, the result does not depend on the number of workers. `progress` is
-    called repeatedly with the control steps of an episode, `on_stage` at the beginning of a batch of episodes, and
-    `on_message` with a line about its result. Raise `InputError` if the folder is not empty, or no driver can drive on
-    this road.
+    Without `minutes`, the result does not depend on the number of workers. `progress` is called with the control steps
+    of an episode, `on_stage` when a batch of episodes begins, and `on_message` with a line about its result. Raise
+    `InputError` if the folder is not empty, or no driver can drive on this road.
     """
     make_new_folder(folder)
     budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()

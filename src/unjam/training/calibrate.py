@@ -1,7 +1,6 @@
 """Calibration of the human drivers and the demand of a user's network, so that detectors measure what they did.
 
-`unjam calibrate`, with Optuna, in SUMO. It varies factors on the values in the network's own files, so that differences
-between vehicle types remain. Tuning seeds select the factors, test seeds evaluate them.
+It varies factors on the values in the network's own files, so that differences between vehicle types remain.
 """
 
 import re
@@ -49,7 +48,6 @@ CALIBRATION_FINALISTS = 3
 CALIBRATION_TEST_SEEDS = 10
 """seeds on which the best and the original factors are evaluated"""
 FLOW_FACTOR = "flow"
-"""factor on the number of vehicles, of all types"""
 FACTOR_RANGES: SearchSpace = {
     "tau": FloatDistribution(0.5, 2.0, log=True),
     "accel": FloatDistribution(0.5, 2.0, log=True),
@@ -60,7 +58,6 @@ FACTOR_RANGES: SearchSpace = {
 }
 """factors on the attributes of passenger vehicle types, and on flows"""
 SUMO_TYPE_DEFAULTS = {"tau": 1.0, "accel": 2.6, "decel": 4.5, "minGap": 2.5, "speedFactor": 1.0}
-"""defaults of passenger types"""
 SPEED_PERCENTILE, MAX_SPEED_LIMIT_RATIO = 95, 1.6
 """percentile of the measured speeds relative to the speed limits, and its maximum: speeds in mph would have 2.2"""
 NORMAL_DISTRIBUTION = re.compile(r"(normc?)\(([^()]*)\)")
@@ -83,10 +80,8 @@ class Corridor:
     measurements: tuple[Measurement, ...]
     """intervals between `begin` and `end`"""
     excluded_count: int
-    """number of other intervals"""
     loops: tuple[InductionLoop, ...]
     loop_numbers: tuple[tuple[int, ...], ...]
-    """numbers of the loops of each measurement"""
 
     def scenario(self, file: Path) -> UserNetwork:
         """Return the human-only traffic of a variant of the network, until the last measurement."""
@@ -107,15 +102,10 @@ class Corridor:
 
 
 def load_corridor(file: str, detectors: Path, begin: float | None = None, end: float | None = None) -> Corridor:
-    """Return a network and its detector measurements, both checked.
+    """Return a network, a .sumocfg file, and its detector measurements, a CSV file, from `begin` to `end` [s].
 
-    Args:
-        file: a .sumocfg file.
-        detectors: a CSV file, as for `measures.detectors.read_detectors`.
-        begin: start time [s]; None: that of the configuration.
-        end: end time [s]; None: that of the configuration, or of the last interval.
-
-    Raise `InputError` if an argument is wrong, a detector is not on the network, or nothing can be varied.
+    None: times of the configuration, or of the last interval. Raise `InputError` if an argument is wrong, a detector is
+    not on the network, or nothing can be varied.
     """
     if not file.endswith(".sumocfg"):
         raise invalid_value("scenario", file, "your own .sumocfg file")
@@ -170,7 +160,7 @@ def _detector_loops(network: Path, kind: str, row: Measurement) -> list[Inductio
 def scale_vehicle_types(files: SumoFiles, factors: CalibrationFactors) -> dict[str, dict[str, str]]:
     """Return the changed attributes of all passenger types multiplied by `factors`, by id.
 
-    A reaction time never falls below the simulation step, because vehicles would collide. Raise `InputError` if an
+    Reaction times stay at least as long as the simulation step, or vehicles would collide. Raise `InputError` if an
     attribute is not a number.
     """
     scaled: dict[str, dict[str, str]] = {}
@@ -198,10 +188,7 @@ def _scale_attribute(field: str, text: str, factor: float, minimum: float) -> st
 
 
 def parse_factor_space(texts: list[str]) -> SearchSpace:
-    """Return a search space from texts `tau=0.5..2` or `tau=0.5..2:log`; without any, `FACTOR_RANGES`.
-
-    Raise `InputError` for unknown names and for values that are not positive ranges.
-    """
+    """Return a search space from `tau=0.5..2` or `tau=0.5..2:log`, without any `FACTOR_RANGES`; or `InputError`."""
     space: SearchSpace = {}
     for name, values in (parse_search_space(texts) if texts else FACTOR_RANGES).items():
         if name not in FACTOR_RANGES:
@@ -230,20 +217,16 @@ class CalibrationResult:
     vehicle_types: dict[str, dict[str, str]]
     """changed attributes of vehicle types, by id"""
     original: list[Agreement]
-    """agreement of the original network on the test seeds"""
     calibrated: list[Agreement]
-    """agreement of the calibrated network on the test seeds"""
     trials: list[CalibrationTrial]
     file: Path
-    """the new configuration"""
 
     def estimates(self) -> dict[str, dict[str, Estimate]]:
         """Return the mean of each measure with its CI: original, calibrated, and the paired difference."""
         estimates = {}
         for name in asdict(self.original[0]):
-            before, after = (
-                np.array([getattr(each, name) for each in rows]) for rows in (self.original, self.calibrated)
-            )
+            both = self.original, self.calibrated
+            before, after = (np.array([getattr(each, name) for each in rows]) for rows in both)
             columns = {"original": before, "calibrated": after, "difference": after - before}
             bounds = (0.0, 1.0 if name == "geh_below_5" else inf)
             estimates[name] = {
@@ -266,18 +249,9 @@ def calibrate(
     """Search factors on vehicle types and flows, and write the best as a network and `calibration.json`.
 
     The trials are stored in the folder: an interrupted calibration resumes with the same result, also with more trials.
-
-    Args:
-        corridor: the network and its measurements.
-        folder: new, empty, or that of this calibration.
-        simulator: the result does not depend on its number of processes.
-        space: factors to vary, by the names of `FACTOR_RANGES`.
-        trials: total number; the first one has factors of one, or the nearest values in the space.
-        seeds_per_trial: number of seeds.
-        seed: of the proposals.
-        on_message: called with a line for each trial.
-
-    Raise `UnjamError` if SUMO cannot simulate the original network, or if its process was lost repeatedly.
+    The first trial has factors of one, or the nearest values in the space; `seed` is that of the proposals. The result
+    does not depend on the number of processes. Raise `UnjamError` if SUMO cannot simulate the original network, or if
+    its process was lost repeatedly.
     """
     original = dict.fromkeys(space, 1.0)
     log = TrialLog(folder, corridor.metadata() | {"space": repr(space), "seeds": seeds_per_trial, "seed": seed})
@@ -317,9 +291,8 @@ def calibrate(
         text = trial.failure if trial.score is None else f"{trial.score:.4g}"
         on_message(f"{number + 1} of {trials}: {_factor_text(trial.factors)}: {text}")
     ranked = sorted((each for each in results if each.score is not None), key=_ranking_score)[:CALIBRATION_FINALISTS]
-    finalists = [
-        score_factors(each.factors, seeds_per_trial, 2 * seeds_per_trial) for each in (*ranked, original_trial)
-    ]
+    again = [*ranked, original_trial]
+    finalists = [score_factors(each.factors, seeds_per_trial, 2 * seeds_per_trial) for each in again]
     best = min(finalists, key=_ranking_score).factors
     on_message(f"evaluating on {CALIBRATION_TEST_SEEDS} test seeds: {_factor_text(best)}")
     before, after = (simulate(factors, held_out_seeds(CALIBRATION_TEST_SEEDS)) for factors in (original, best))

@@ -278,11 +278,7 @@ def load_config(file: Path | None = None, preset: str = "", changes: dict[str, A
 
 
 def read_values(file: Path) -> dict[str, Any]:
-    """Return the values of a configuration file, in which a run names files relative to the folder of its start.
-
-    In another working folder these names become absolute. Files that are not there are those of the working folder, as
-    they are for other configurations.
-    """
+    """Return the values of a configuration file, with names relative to the start of its run as absolute ones."""
     values, start = read_toml(file), _start_folder(file.absolute().parent)
     return values if start == Path.cwd() else absolute_names(values, start)
 

@@ -1,8 +1,7 @@
 """Trainings in subprocesses: many command lines at once, on this machine or on a Ray cluster; or a single training.
 
-The single training is for a program that imported NumPy before unjam: see `unjam.kernels`. Its child, `python -m
-unjam.training.executors`, reads one message and writes several. After each row of progress it reads whether to
-continue.
+The single one, `python -m unjam.training.executors`, is for programs that imported NumPy before unjam: `unjam.kernels`.
+It reads one message and writes several. After each row of progress it reads whether to continue.
 """
 
 import os
@@ -40,7 +39,6 @@ if TYPE_CHECKING:  # the command line imports this module and must start quickly
 
 Executor = Literal["local", "ray"]
 MessageCallback = Callable[[str], None]
-"""called with a line of progress"""
 IterationCallback = Callable[[dict[str, Any]], object]
 """called with each row of progress; it returns False to end the training"""
 MAX_ATTEMPTS = 3
@@ -51,13 +49,10 @@ class CommandLine(NamedTuple):
     """A command line of unjam."""
 
     arguments: Sequence[str]
-    """arguments of the command `unjam`"""
     log: Path
-    """file to which its output is appended"""
     resume_marker: Path | None = None
     """file that exists if the command was started before"""
     resume_arguments: Sequence[str] = ()
-    """arguments that resume it"""
 
     def argv(self) -> list[str]:
         """Return the whole command line, which depends on whether it was started before."""
@@ -123,10 +118,9 @@ class LocalExecutor:
 
 @contextmanager
 def open_executor(executor: Executor, workers: int) -> Iterator[Callable[[CommandLine], Future[int]]]:
-    """Yield a function that starts a command line and returns the future of its exit code.
+    """Yield a function that starts a command line, `workers` at once, and returns the future of its exit code.
 
-    At most `workers` run at once; the machines of a Ray cluster must share the folders. An exception in the block ends
-    all of them. Raise `MissingPartError` if Ray is not installed.
+    The machines of a Ray cluster must share the folders. An exception in the block ends all command lines.
     """
     local = LocalExecutor()
     opened = _open_ray(workers) if executor == "ray" else nullcontext(local.run)

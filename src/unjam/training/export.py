@@ -38,10 +38,7 @@ ControllerKind = Literal["best", "latest"]
 
 
 class ControllerStore:
-    """The contents of the controllers in a run's folders.
-
-    `best` come from validations that a longer run would also make; `latest` also from the last iteration.
-    """
+    """The contents of the controllers in a run's folders: the `best` of scheduled validations, and the `latest`."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         """Prepare one controller for each folder."""
@@ -64,10 +61,7 @@ class ControllerStore:
         }
 
     def restore(self, tensors: "Tensors", is_finished: bool) -> None:
-        """Remove the contents of a checkpoint from `tensors` and write them: `latest` if the training has ended.
-
-        The files in the folders may come from a later iteration, or may have been changed.
-        """
+        """Take the contents from a checkpoint's `tensors` and write them: `latest` if the training has ended."""
         for kind in ("best", "latest") if "best/0" in tensors else ():
             stored = [tensors.pop(f"{kind}/{index}") for index in range(len(self._folders))]
             self._contents[kind] = [each.numpy().tobytes() for each in stored]
@@ -89,7 +83,6 @@ class ExportResult:
     graph: Path | None
     """the ONNX graph with its description as metadata; without it, the graph is also in the controller's file"""
     model: Path | None
-    """the model of Stable-Baselines3"""
     driver: str
     sample_steps: int
     """length of the recorded sample"""

@@ -26,8 +26,7 @@ _LOG = logging.getLogger(__name__)
 def fingerprint(config: RunConfig) -> dict[str, Any]:
     """Return everything that the result of a training depends on, as JSON.
 
-    `settings` has all but steps and workers, by name; `files` the hashes of the experts and of the user's code and
-    networks; `packages` and `kernels` the numerical environment.
+    These are all settings but steps and workers, hashes of experts and user files, packages and kernels.
     """
     files = code_hashes(config)
     for each, task in zip(config.task_configs().values(), config.make_tasks(), strict=True):

@@ -12,8 +12,8 @@ from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, invalid_value
 from unjam.models.ensemble import torch_generator
 from unjam.models.environment_data import StartIndices
+from unjam.models.registry import RowWorldModel
 from unjam.models.rollouts import ModelDynamics, ModelTransition, draw_starts, tensor_driver, tensor_memory, to_device
-from unjam.models.row_world_model import RowWorldModel
 from unjam.parameters import check_integer
 from unjam.training.model_facts import TrainedModel, read_trained_model, trained_model_facts
 from unjam.training.run_folder import read_config
@@ -64,10 +64,7 @@ class LearnedModel:
         self.reset(1)
 
     def reset(self, rows: int, seed: int = 0, episode_starts_only: bool = False) -> LocalState:
-        """Set `rows` random recorded states, and the random numbers by `seed`; return the states.
-
-        With `episode_starts_only`, they are first states of recorded episodes. Raise `InputError` without any rows.
-        """
+        """Set random recorded states, or first ones, and random numbers; raise `InputError` without rows."""
         data, rows = self.world_model.data, check_integer("rows", rows, 1)
         return self.reset_at(draw_starts(data, rows, 1, (seed, 0), episode_starts_only=episode_starts_only), seed)
 
@@ -140,8 +137,7 @@ class LearnedModel:
     def error_report(self) -> dict[str, Any]:
         """Return how well the model agrees with episodes of which no network learned: the facts of `unjam model`.
 
-        `one_step` and `by_state` have root mean squared errors of a step; `replay` has those under recorded
-        accelerations by time; `bound` is the bound C of the paper by rollout length, or None.
+        RMSE of a step (`one_step`, `by_state`) and of replays by time (`replay`); the `bound` by length, or None.
         """
         return trained_model_facts(self._trained)
 
@@ -149,8 +145,7 @@ class LearnedModel:
 def load_world_model(run: Path | str) -> LearnedModel:
     """Return the learned model in the newest checkpoint of a run folder.
 
-    Raise `InputError` if it is no run folder, is damaged, has no checkpoint yet, or has no model of rows: its
-    `model.model_ratio` is 0, `model.kind` is `road`, its agent learns no model, or it has several tasks.
+    Raise `InputError` if it is damaged, or has no checkpoint or no model of rows, as with several tasks.
     """
     if not isinstance(run, Path | str):
         raise invalid_value("run", run, "a run folder")

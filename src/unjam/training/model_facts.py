@@ -1,7 +1,4 @@
-"""Facts about the learned model of a run: how well it agrees with the environment, by state and time.
-
-They are measured on holdout episodes, from which no network learned, and stored in the run folder as `model.json`.
-"""
+"""Facts about the learned model of a run, measured on holdout episodes; the run folder has them as `model.json`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,25 +31,19 @@ MAX_REPLAY_STEPS = 500
 MAX_ERROR_ROWS = 20_000
 """control steps for the one-step errors, at most"""
 MAX_REPLAYS = 200
-"""replays of recorded accelerations, at most"""
 EXAMPLE_COUNT = 3
 """replays that are shown one by one"""
 MAX_REPLAY_TIMES = 100
-"""stored times of a replay, at most"""
 BINS_PER_FIELD = 10
 """bins with equal numbers of control steps, by gap and by speed"""
 BINNED_FIELDS = ("leader_gap", "speed")
 ROLLOUT_LENGTHS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """lengths for which the bound is computed [control steps]"""
 EXAMPLE_FIELDS = ("leader_gap", "leader_speed")
-"""quantities of the examples"""
 
 
 def update_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
-    """Return the facts about the model of a run, measured again if they are missing or out of date.
-
-    Raise `InputError` if the run has no model that is measured, or no checkpoint yet.
-    """
+    """Return facts about the model of a run, measured again if out of date; `InputError` if it has none."""
     _check_has_facts(folder, config)
     facts, progress = read_model_facts(folder), read_progress(folder)
     if facts is None or not progress or facts.get("iteration") != progress[-1]["iteration"]:
@@ -164,10 +155,7 @@ def _errors_by_bin(values: Floats, errors: OneStepErrors) -> dict[str, Any]:
 
 
 def replay_length(trip_lengths: Sequence[int]) -> int:
-    """Return the length of a replay for trips of such lengths [control steps].
-
-    It is half of the median, so that at least half of the trips are long enough.
-    """
+    """Return the length of a replay: half of the median trip, so that at least half of the trips suffice."""
     return min(MAX_REPLAY_STEPS, max(1, int(np.median(trip_lengths)) // 2))
 
 

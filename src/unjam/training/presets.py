@@ -27,10 +27,7 @@ def _packaged_presets() -> dict[str, dict[str, Any]]:
 
 @cache
 def all_presets() -> dict[str, dict[str, Any]]:
-    """Return the packaged presets and those of other packages, which are imported for it, by name.
-
-    The entry `on` of a preset has settings of their own for some scenarios.
-    """
+    """Return packaged presets and those of other packages by name; the entry `on` has values for some scenarios."""
     return reduce(operator.or_, load_plugins("unjam.presets").values(), _packaged_presets())
 
 

@@ -17,9 +17,8 @@ _training_lock = threading.Lock()
 def exclusive_random_state() -> Iterator[None]:
     """Lend the global generators of Python, NumPy and torch to the block, with one thread for torch's operations.
 
-    In the block torch has its own defaults, whatever the program has set: single precision, the CPU, gradients, no
-    automatic precision. Generators, threads and defaults are restored at the end. Raise `UnjamError` if another thread
-    is in such a block.
+    In the block torch has its own defaults: single precision, the CPU, gradients, no automatic precision. All is
+    restored at the end. Raise `UnjamError` if another thread is in such a block.
     """
     if not _training_lock.acquire(blocking=False):
         raise UnjamError("train: another training runs in this process; allowed: one, or a process for each")

@@ -1,7 +1,7 @@
 """The folder of a run: its creation, resumption and checkpoints.
 
-torch is only imported to read or write a checkpoint, so that errors are reported quickly. A checkpoint is a file that
-is written at the end of each iteration, and named by iteration and hash; the newest two are kept.
+A checkpoint is written after each iteration, and named by iteration and hash; the newest two are kept. torch is only
+imported for checkpoints, so that errors are reported quickly.
 """
 
 import json
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tomli_w
 
+from unjam import files
 from unjam.controller import make_driver
 from unjam.drivers.check import PROBE_ROWS, check_row_independence, probe_state
 from unjam.drivers.driver import Driver
@@ -23,17 +24,6 @@ from unjam.drivers.registry import driver_recipe
 from unjam.drivers.requirements import merge_requirements
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import DiskError, InputError, invalid_value
-from unjam.files import (
-    INVALID_DATA_ERRORS,
-    atomic_write,
-    is_leftover,
-    make_folder,
-    remove,
-    remove_if_empty,
-    remove_leftovers,
-    sha256_of,
-    to_json,
-)
 from unjam.folders import reject_unsafe_files
 from unjam.manifest import manifest, package_versions
 from unjam.parameters import build_dataclass, check_integer, read_toml
@@ -129,16 +119,13 @@ def _check_row_model(config: RunConfig, scenario: Scenario, expert: Driver) -> N
 
 
 def make_new_folder(folder: Path, alternative: str = "") -> None:
-    """Make a folder; raise `InputError` if it is not empty. `alternative` is what else is allowed, for the message.
-
-    Leftovers of a process that was killed before it had written anything do not count.
-    """
+    """Make a folder, or raise `InputError` if it has more than leftovers; the message names an `alternative`."""
     try:
         if folder.exists() and not (
-            folder.is_dir() and all(is_leftover(path) or path.name == LOCK_FILE for path in folder.iterdir())
+            folder.is_dir() and all(files.is_leftover(path) or path.name == LOCK_FILE for path in folder.iterdir())
         ):
             raise InputError(f"out: {str(folder)!r} is not empty; allowed: a new folder{alternative}")
-        make_folder(folder)
+        files.make_folder(folder)
     except OSError as error:  # for example under /proc, or with too long a name
         reason = f"cannot be made ({error.strerror})"
         raise InputError(f"out: {str(folder)!r} {reason}; allowed: a new folder") from None
@@ -146,10 +133,7 @@ def make_new_folder(folder: Path, alternative: str = "") -> None:
 
 @contextmanager
 def lock_new_folder(folder: Path, resumable_file: str = "") -> Iterator[None]:
-    """Make a folder and lock it for this process; remove it if it stays empty.
-
-    Raise `InputError` if it is locked, or not empty and without the file `resumable_file`.
-    """
+    """Make and lock a folder, and remove it if it stays empty; `InputError` if locked, or used and not resumable."""
 
     def check() -> None:
         if not (resumable_file and (folder / resumable_file).is_file()):
@@ -167,7 +151,7 @@ def removing_if_empty(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        remove_if_empty(folder)
+        files.remove_if_empty(folder)
 
 
 @contextmanager
@@ -178,27 +162,26 @@ def discarding_refused(folder: Path) -> Iterator[None]:
     except InputError:
         if not read_progress(folder):
             for path in [each for each in folder.iterdir() if each.name != LOCK_FILE]:
-                remove(path)
+                files.remove(path)
         raise
 
 
 def create_run_folder(folder: Path, config: RunConfig) -> None:
     """Make the folder of a new run, with configuration and manifest; raise `InputError` if it is not empty."""
     make_new_folder(folder, f", or --resume {folder}")
-    atomic_write(folder / CONFIG_FILE, to_toml(config))
+    files.atomic_write(folder / CONFIG_FILE, to_toml(config))
     _write_manifest(folder)
 
 
 def _write_manifest(folder: Path) -> None:
     facts = {"format": CHECKPOINT_FORMAT, "start_folder": os.path.relpath(Path.cwd(), folder.resolve()), **manifest()}
-    atomic_write(folder / MANIFEST_FILE, to_json(facts, indent=1))
+    files.atomic_write(folder / MANIFEST_FILE, files.to_json(facts, indent=1))
 
 
 def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
     """Return the configuration of a run folder; raise `InputError` if it is none, or of another format.
 
-    Also if the configuration names untrusted Python code: without `check_trust` only if its roads do, whose code runs
-    here; nothing else of it may be run then.
+    Also if it names untrusted Python code: without `check_trust` only if its roads do; no other may be run then.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
@@ -238,7 +221,7 @@ def resume_run_folder(folder: Path, config: RunConfig) -> None:
         raise invalid_value("steps", config.steps, f">= {done}, which are done")
     if config != before:  # names of files remain as they are
         changed = {**read_toml(folder / CONFIG_FILE), "steps": config.steps, "workers": config.workers}
-        atomic_write(folder / CONFIG_FILE, tomli_w.dumps(changed))
+        files.atomic_write(folder / CONFIG_FILE, tomli_w.dumps(changed))
     if not (folder / MANIFEST_FILE).is_file():  # the run was stopped before it wrote the manifest
         _write_manifest(folder)
 
@@ -259,7 +242,7 @@ def append_lineage(folder: Path, iteration: int) -> None:
         lineage = [*made.get("lineage", []), {"iteration": iteration, **manifest()}]
     except (ValueError, AttributeError, TypeError) as error:
         raise InputError(f"run: {path} cannot be read: {error}") from None
-    atomic_write(path, to_json({**made, "lineage": lineage}, indent=1))
+    files.atomic_write(path, files.to_json({**made, "lineage": lineage}, indent=1))
 
 
 def controller_origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
@@ -278,21 +261,20 @@ def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> 
     from safetensors.torch import save
 
     data = save(tensors, {"state": json.dumps({**state, "format": CHECKPOINT_FORMAT})})
-    name = f"{state['iteration']:06d}-{sha256_of(data)}.safetensors"
-    make_folder(folder)
-    atomic_write(folder / name, data)
+    name = f"{state['iteration']:06d}-{files.sha256_of(data)}.safetensors"
+    files.make_folder(folder)
+    files.atomic_write(folder / name, data)
     for damaged in [path for path in _checkpoint_files(folder) if path.name[:7] == name[:7] and path.name != name]:
-        remove(damaged)
+        files.remove(damaged)
     _remove_old_checkpoints(folder)
 
 
 def restore_newest_checkpoint(
     folder: Path, progress_folders: Iterable[Path], expected: dict[str, Any] | None = None
 ) -> "tuple[dict[str, Any], Tensors] | None":
-    """Return the newest checkpoint of a run; None before the first one.
+    """Return the newest checkpoint of a run, and remove everything later; None before the first one.
 
-    Everything later is removed: rows of progress in `progress_folders`, and incomplete files. Raise `InputError` if no
-    checkpoint is valid, or if its fingerprint differs from the `expected` one.
+    Raise `InputError` if no checkpoint is valid, or if its fingerprint differs from the `expected` one.
     """
     checkpoint = load_checkpoint(folder / "checkpoint")
     if checkpoint and expected and "fingerprint" in checkpoint[0]:
@@ -300,10 +282,10 @@ def restore_newest_checkpoint(
     _remove_old_checkpoints(folder / "checkpoint")
     iteration = checkpoint[0]["iteration"] if checkpoint else 0
     for place in progress_folders:
-        remove_leftovers(place)
+        files.remove_leftovers(place)
         if (place / PROGRESS_FILE).is_file():
-            rows = [to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= iteration]
-            atomic_write(place / PROGRESS_FILE, "".join(rows))
+            rows = [files.to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= iteration]
+            files.atomic_write(place / PROGRESS_FILE, "".join(rows))
     return checkpoint
 
 
@@ -314,7 +296,7 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
     for path, state, data in _valid_checkpoints(folder):
         try:
             found, tensors = state.pop("format", 1), load(data)
-        except INVALID_DATA_ERRORS:
+        except files.INVALID_DATA_ERRORS:
             continue
         if found != CHECKPOINT_FORMAT:
             raise InputError(
@@ -330,10 +312,10 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
 def _valid_checkpoints(folder: Path) -> Iterator[tuple[Path, dict[str, Any], bytes]]:
     """Yield file, state and content of the checkpoints with a correct hash, the newest first."""
     for path in reversed(_checkpoint_files(folder)):
-        with suppress(*INVALID_DATA_ERRORS):
+        with suppress(*files.INVALID_DATA_ERRORS):
             data = path.read_bytes()
             header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-            if f"-{sha256_of(data)}." in path.name:
+            if f"-{files.sha256_of(data)}." in path.name:
                 yield path, dict(json.loads(header["__metadata__"]["state"])), data
 
 
@@ -345,11 +327,10 @@ def check_run_files(folder: Path, config: RunConfig, command: str) -> None:
 
 
 def _remove_old_checkpoints(folder: Path) -> None:
-    """Remove all but the newest two checkpoints, and incomplete ones."""
-    remove_leftovers(folder)
+    files.remove_leftovers(folder)
     for old in _checkpoint_files(folder)[:-MAX_CHECKPOINTS]:
         with suppress(DiskError):
-            remove(old)
+            files.remove(old)
 
 
 def _checkpoint_files(folder: Path) -> list[Path]:

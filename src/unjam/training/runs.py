@@ -115,10 +115,7 @@ def config_differences(runs: Sequence[Run]) -> dict[str, list[Any]]:
 
 
 def remove_run(folder: Path) -> None:
-    """Remove a run folder permanently.
-
-    Raise `InputError` if it is not a run folder, if a process writes it, or if it is a link or has the working folder.
-    """
+    """Remove a run folder permanently; raise `InputError` if it is none, in use, a link or the working folder."""
     read_run(folder)
     if folder.is_symlink() or Path.cwd().is_relative_to(folder.resolve()):
         raise InputError(f"run: {str(folder)!r} is a link or has the working folder; allowed: a run folder elsewhere")

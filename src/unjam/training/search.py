@@ -1,7 +1,6 @@
 """Search for the settings with which a training learns best. `unjam search`, with Optuna.
 
-Each trial is a training in its own folder. Its objective is the validation return, which also selects the controller of
-a training; test seeds are not used.
+The objective is the validation return, which also selects the controller of a training; test seeds are not used.
 """
 
 import math
@@ -59,7 +58,6 @@ class SearchTrial:
     gain: float | None
     """validation return of the best controller minus that of the expert; None if it failed"""
     last_gain: float | None
-    """gain of the last checkpoint"""
 
 
 def search(
@@ -74,12 +72,8 @@ def search(
     """Train with settings that Optuna proposes, `workers` at once, and return all trials, the best first.
 
     The folder gets `search.json`, and `best.toml` for `unjam train --config`. An interrupted search resumes, also with
-    more `trials`, which include those of earlier calls. `base` and `space` must pass `check_search_space`; `on_message`
-    is called with a line when a training has ended.
-
-    Raises:
-        InputError: the folder has another search.
-        UnjamError: all trainings failed.
+    more `trials` in total. `base` and `space` must pass `check_search_space`. Raise `InputError` if the folder has
+    another search, `UnjamError` if all trainings failed.
     """
     log = TrialLog(folder, {"config": asdict(base), "space": repr(space)})
     atomic_write(folder / CONFIG_FILE, to_toml(base))  # below it, files may only name trusted code
@@ -190,7 +184,6 @@ def describe_trial(trial: SearchTrial) -> str:
 
 
 def _running_line(folder: Path, numbers: Iterable[int], steps: int) -> str:
-    """Return how far trainings are."""
     rows = {number: read_progress(_trial_folder(folder, number))[-1:] for number in numbers}
     texts = (f"trial {number} {row[0]['environment_steps'] if row else 0:,}" for number, row in rows.items())
     return f"steps of {steps:,}: {', '.join(texts)}"

@@ -29,10 +29,7 @@ def boundary_values(values: Distribution) -> Sequence[Any]:
 
 
 def parse_search_space(texts: Sequence[str]) -> SearchSpace:
-    """Return a search space from texts `key=low..high`, `key=low..high:log` or `key=a,b,c`.
-
-    Raise `InputError` for other texts and empty ranges.
-    """
+    """Return a search space from texts `key=low..high`, `key=low..high:log` or `key=a,b,c`; else `InputError`."""
     space: SearchSpace = {}
     for text in texts:
         key, equals, values = (part.strip() for part in text.partition("="))
@@ -84,10 +81,7 @@ def default_search_space(expert: str, time_step: float) -> SearchSpace:
 
 
 def expert_search_space(texts: Sequence[str], defaults: SearchSpace) -> SearchSpace:
-    """Return the search space of an expert from texts as in `parse_search_space`.
-
-    A range with integer limits is still one of numbers if that of `defaults` (`default_search_space`) is.
-    """
+    """Return the search space of texts; integer limits are numbers where `defaults`, the expert's, are."""
     space = parse_search_space(texts)
     is_float = {name: isinstance(defaults.get(name), FloatDistribution) for name in space}
     return {name: float_range(values) if is_float[name] else values for name, values in space.items()}

@@ -1,7 +1,6 @@
 """Selection of a controller for each penetration rate, and its comparison with ACC vehicles and human drivers.
 
-Selection seeds select a controller for each penetration rate by successive halving. Test seeds then compare the human
-baseline, ACC vehicles without a controller, and the selected controllers.
+Selection seeds select it by successive halving, test seeds compare it.
 """
 
 import time
@@ -50,7 +49,6 @@ ACC_DRIVER = "cruise"
 UNCHANGED_ACC_DRIVER = "acc with unchanged vehicles"
 """the same, with the properties of the replaced vehicles instead of those that the user has set for CAVs"""
 OptionRunner = Callable[[Sequence[Option], Sequence[EpisodeSeed]], dict[Option, OptionRows]]
-"""runs all options on all seeds, and measures"""
 
 
 class EpisodeBudget:
@@ -59,7 +57,6 @@ class EpisodeBudget:
     def __init__(
         self, episodes: int, minutes: float | None = None, workers: int = 1, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Start the clock; `workers` is the number of parallel episodes."""
         self.episodes, self.minutes, self.used_episodes = episodes, minutes, 0
         self._workers, self._completed_rounds, self._clock, self._start_time = workers, 0, clock, clock()
 
@@ -98,7 +95,6 @@ class Selection:
 
     rows: dict[Option, OptionRows]
     rejection_reasons: dict[Option, str]
-    """reason why an option is not tested, by option"""
     finalists: list[Option]
     """options that are tested, at most one for each penetration rate"""
 
@@ -133,10 +129,9 @@ def verdict_episodes(
 def select_controllers(
     options: Sequence[Option], run_options: OptionRunner, budget: EpisodeBudget, on_message: MessageCallback
 ) -> Selection:
-    """Select a controller for each penetration rate by successive halving.
+    """Select a controller for each penetration rate: the better half continues after each round.
 
-    The better half of each penetration rate continues after each round, and `on_message` is called with a line. Raise
-    `UnjamError` if the human baseline or all options fail.
+    Raise `UnjamError` if the human baseline or all options fail.
     """
     rows: dict[Option, OptionRows] = {option: [] for option in (HUMAN_BASELINE, *options)}
     rejected: dict[Option, str] = {}
@@ -194,9 +189,9 @@ def compare_on_test_seeds(
     """Compare human baseline, ACC vehicles and the selected controllers on test seeds.
 
     An option runs until its CIs are narrower than `precision`, a share of the baseline's travel time, or until more
-    seeds within the budget can hardly lead to a recommendation. No option ends because its result is good, so that CIs
-    are not too narrow by chance. CIs hold together for all penetration rates with 95 % (Bonferroni). With
-    `with_unchanged_acc`, ACC vehicles that keep all properties of the vehicles that they replace run, too.
+    seeds within the budget can hardly lead to a recommendation; a good result ends none, so that CIs are not too
+    narrow. CIs hold together for all penetration rates with 95 % (Bonferroni). ACC vehicles with all properties of the
+    vehicles that they replace run `with_unchanged_acc`, too.
     """
     acc_options = [Option(rate, ACC_DRIVER) for rate in penetration_rates]
     unchanged = [Option(rate, UNCHANGED_ACC_DRIVER) for rate in penetration_rates if with_unchanged_acc]
@@ -293,7 +288,6 @@ def _extend_rows(rows: dict[Option, OptionRows], new_rows: dict[Option, OptionRo
 
 
 def _failure_reasons(rows: dict[Option, OptionRows], options: Iterable[Option]) -> dict[Option, str]:
-    """Return the options with a failed episode, and the reason."""
     reasons = {
         option: next((row["reason"] for row in rows[option] if row["status"] == "failed"), None) for option in options
     }

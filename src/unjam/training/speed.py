@@ -1,7 +1,6 @@
 """Speed of episodes on this machine, relative to plain SUMO and to TraCI, and of batches of rings on a CPU or a GPU.
 
-Speed differs between machines and from minute to minute: ratios within one run count, with their parts measured
-alternately.
+Speed changes from minute to minute: ratios within one run count, with their parts measured alternately.
 """
 
 import itertools
@@ -55,9 +54,7 @@ RING_SIZES = {22: 3000, 220: 800, 2200: 200}
 ROLLOUT_SIZES = ((2000, 50), (1200, 10))
 """rows and control steps of model rollouts: with an accurate model, and as in a training iteration on the ring"""
 BATCH_VEHICLES = 90_112
-"""vehicles of a batch: 4,096 rings of 22"""
 BENCHMARK_SCENARIOS = ("ring", "figure-eight", "merge")
-"""scenarios that are compared with plain SUMO"""
 VECTOR_ENVIRONMENTS = ((1024, False), (4096, False), (1024, True))
 """numbers of rings in vector environments, and whether they equal SUMO exactly"""
 ASYNC_ENVIRONMENTS = 2
@@ -75,11 +72,8 @@ BUSY_ON_RAMP: dict[str, Any] = {
 STEPS_PER_ROUND = 100
 METERS_PER_VEHICLE = 245 / 22
 VEHICLES_PER_RING = 22
-"""number of vehicles on each ring of `benchmark_batches`"""
 BATCH_SIZES = {"cpu": (64, 256, 1024, 4096, 16_384), "cuda": (64, 256, 1024, 4096, 16_384, 65_536, 262_144)}
-"""numbers of rings, by device"""
 BENCHMARK_MODEL = ModelSettings(hidden=(32, 32))
-"""the networks of human drivers"""
 SUMO_PART, EPISODE_PART = "SUMO alone", "run_episode"
 """what other parts are related to, after the name of a scenario"""
 ENVIRONMENT_PART = "ring: env.step"
@@ -101,9 +95,9 @@ class Part(NamedTuple):
 def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: None) -> dict[str, Any]:
     """Return control steps per second, and their ratios, for each `Part`; on one core, medians over the rounds.
 
-    Episodes have the default residual driver of training, which has an action repeat of one second, and are loaded,
-    filtered, audited and recorded. Batches of rings are in single precision, with fast noise; model rollouts use the
-    default ensemble. Environments have no policy: actions are random in SUMO, zeros in batches.
+    Episodes have the default residual driver of training, and are loaded, filtered, audited and recorded. Batches of
+    rings have single precision and fast noise. Environments have no policy: actions are random in SUMO, zeros in
+    batches.
     """
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
     if cores is not None:
@@ -178,7 +172,6 @@ class VectorBenchmark:
     """A vector environment of rings, and the same batch alone with constant commands."""
 
     def __init__(self, rings: int, is_exact: bool) -> None:
-        """Start both; no episode ends."""
         self.rings, self.is_exact = rings, is_exact
         self.name = f"vector environment of {rings:,} rings{', exact' * is_exact}"
         self._environment = RoadVectorEnv(rings, exact=is_exact, horizon=MAX_HORIZON)
@@ -231,7 +224,6 @@ def _episode_rate(scenario: Scenario, seed: int, simulation: Simulation, action_
 
 
 def _loop_rate(scenario: Scenario, driver: ResidualDriver, simulation: Simulation) -> float:
-    """Return control steps per second of the driving loop alone."""
     options = WorldOptions(accepts_floats=not driver.requirements().needs_arrays)
     traffic = make_traffic(scenario, (1,), simulation, options)
     return steps_per_second(lambda: deque(DriveLoop(traffic, driver, explore=True), maxlen=0), scenario.horizon)
@@ -303,10 +295,7 @@ def make_benchmark_ring(vehicles: int, horizon: int) -> Ring:
 def start_batch(
     rings: int, vehicles: int, driver: Driver, device: Device = "cpu", human_drivers: HumanSpeedModel | None = None
 ) -> Iterator[object]:
-    """Start a batch of rings with so many vehicles each, and return an iterator over its control steps.
-
-    It uses single precision and a fast noise generator; by default human drivers follow SUMO's IDM.
-    """
+    """Return an iterator over control steps of new rings, in single precision with fast noise, by default the IDM."""
     generator, to_array = torch_generator((0,), device), partial(to_device, device=device)
     world = RingBatch(
         [make_benchmark_ring(vehicles, MAX_HORIZON)] * rings,
@@ -344,8 +333,7 @@ def steps_per_second(run: Callable[[], object], steps: int) -> float:
 def benchmark_batches(device: Device, on_message: MessageCallback = lambda line: None) -> dict[str, Any]:
     """Return the speed of batches of growing size with a residual driver, by model of the human drivers.
 
-    The networks of human drivers are untrained: they are evaluated but add nothing. On a CPU one core is used. Raise
-    `MissingPartError` if there is no such device.
+    Networks of human drivers add nothing. A CPU uses one core. Raise `MissingPartError` if there is no such device.
     """
     check_device(device)
     torch.set_num_threads(1)

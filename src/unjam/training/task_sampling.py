@@ -20,7 +20,6 @@ class TaskSampler:
     """The current number of episodes of each task; with `regret`, each validation changes it."""
 
     def __init__(self, tasks: Sequence[Task], kind: TaskSampling, best_returns: Sequence[float]) -> None:
-        """Begin with the weights; `best_returns` has the best return of each task so far."""
         self._tasks, self._kind, self.best_returns = tasks, kind, list(best_returns)
         self._shares = self._weight_shares = weight_shares(tasks)
 
@@ -56,14 +55,9 @@ def weight_shares(tasks: Sequence[Task]) -> list[float]:
 def regret_shares(shares: Sequence[float], best_returns: Sequence[float], returns: Sequence[float]) -> list[float]:
     """Return each task's share of the environment steps, `REGRET_FRACTION` of which follows the regret.
 
-    The regret is the difference between the best validation return so far, of the policy or of its expert, and the
-    current one: so much is known to be possible. It is a level-based sampling like prioritized level replay (Jiang et
-    al. 2021, arXiv:2010.03934), with a measured regret instead of one estimated from the critic.
-
-    Args:
-        shares: those by weight; they sum to one.
-        best_returns: best return of each task so far.
-        returns: current return of each task; the returns of all tasks must be of similar size.
+    The regret is the best validation return so far, of the policy or its expert, minus the current one; all tasks have
+    returns of similar size. It is a level-based sampling like prioritized level replay (Jiang et al. 2021,
+    arXiv:2010.03934), with a measured regret.
     """
     regrets = [share * max(best - now, 0.0) for share, best, now in zip(shares, best_returns, returns, strict=True)]
     total = sum(regrets)
@@ -88,10 +82,9 @@ def make_episodes(
     stratified: bool,
     exploration_scales: Sequence[float],
 ) -> list[EpisodeTask]:
-    """Return `counts` episodes of each task; each adds a number to the seed.
+    """Return `counts` episodes of each task, which cover the range of drawn values if `stratified`.
 
-    If `stratified`, those of a task cover the range of its drawn values. Groups of episodes that differ only in the
-    scale of their exploration share a seed, one episode for each of `exploration_scales`.
+    Each has its own seed, except for those that differ only in their scale, one of `exploration_scales`.
     """
     episodes: list[EpisodeTask] = []
     for task, driver, count in zip(tasks, drivers, counts, strict=True):
@@ -109,8 +102,7 @@ def warm_up_iterations(
 ) -> range:
     """Return the iterations with a common warm-up of their rings: `iteration` and some that follow.
 
-    Their number is limited by the `remaining_steps` of the training, those of `iteration` included, and by the cache of
-    warm-up states, which has room for the `counts` of episodes of each task in so many iterations.
+    Their number is limited by the `remaining_steps`, those of `iteration` included, and by the cache of warm-up states.
     """
     pairs = zip((task.scenario for task in tasks), counts, strict=True)
     cavs = sum(count * len(scenario.possible_cav_ids()) for scenario, count in pairs if scenario.is_closed)

@@ -62,7 +62,6 @@ PROGRESS_METRICS = (
 """metrics of progress: means over the episodes of an iteration"""
 PROGRESS_RETURNS = ("return_mean", "return_expert", "return_validation")
 ALGORITHM_PREFIX = "algorithm/"
-"""of the tensors of the algorithm in checkpoints"""
 ValidationReturns = Sequence[float] | None
 """return on the validation seeds of each task; None without a validation"""
 
@@ -80,15 +79,13 @@ class TrainResult:
     """results by task, each in its own folder; empty for a single road"""
 
     def __str__(self) -> str:
-        """Return the metrics of all drivers as a table, by task, and the files."""
         if self.tasks:
             return "\n\n".join(f"{name}: {result}" for name, result in self.tasks.items())
         table = metric_frame(self.rows)
         lines = [f"training run {self.folder}", table.to_string(index=False)]
         if self.gain:
-            lines.append(
-                f"return compared with the expert: {self.gain.mean:+.1f} {format_ci(self.gain, '.1f')}".strip()
-            )
+            gain = f"{self.gain.mean:+.1f} {format_ci(self.gain, '.1f')}".strip()
+            lines.append(f"return compared with the expert: {gain}")
         return "\n".join([*lines, f"controller: {self.controller}"])
 
     @property
@@ -189,14 +186,13 @@ def _report_task_progress(progress: EvaluationProgress, name: str, episode: tupl
 class Trainer:
     """Runs an algorithm with episodes from the workers, validation and the run's folder.
 
-    Each of several tasks has its own folder in that of the run, with controller and progress. Returns of the whole
-    run, which also select the controllers, are then weighted means over the tasks.
+    Each of several tasks has its own folder with controller and progress; returns of the run are weighted means over
+    them.
     """
 
     def __init__(
         self, folder: Path, config: RunConfig, workers: WorkerPool, on_iteration: IterationCallback | None = None
     ) -> None:
-        """Prepare a run, from its newest checkpoint if there is one."""
         self.folder, self.config, self.workers = folder, config, workers
         self.tasks = config.make_tasks()
         self.folders = [folder / task.name for task in self.tasks]
@@ -259,10 +255,9 @@ class Trainer:
             self._save_controllers(self.network(), is_best=True)
             self._best_validation = self._sampler.weighted_mean(self._expert_returns)
         if not self.config.evaluation.should_stop_early(read_progress(self.folder)):
-            with reporting_user_errors(self.config.agent):
-                run_iterations(
-                    self.algorithm, self.collector, self.config.steps, self.config.seed, self.finish_iteration
-                )
+            config = self.config
+            with reporting_user_errors(config.agent):
+                run_iterations(self.algorithm, self.collector, config.steps, config.seed, self.finish_iteration)
 
     def network(self) -> Network:
         """Return the present policy."""
@@ -303,10 +298,7 @@ class Trainer:
         return returns
 
     def finish_iteration(self, log: IterationLog) -> bool:
-        """Validate if it is due; write a row of progress, of the whole run and of each task, and a checkpoint.
-
-        Return whether to stop: by `on_iteration` or by `should_stop_early`.
-        """
+        """Validate if due, write progress and a checkpoint, and return whether to stop."""
         started, validation = time.perf_counter(), self.validate()
         seconds = {"collect": self.collector.seconds, **log.seconds, "validation": time.perf_counter() - started}
         log = replace(log, seconds=seconds)

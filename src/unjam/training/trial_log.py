@@ -22,7 +22,6 @@ class TuningTrial:
     """A trial of parameters of an expert."""
 
     driver: str
-    """name of the driver, as for `--driver`"""
     values: dict[str, Any]
     score: float | None
     """mean return, on several roads the mean gain; None if the driver is infeasible"""
@@ -46,7 +45,6 @@ class TrialLog:
             make_new_folder(folder, ", or that of the same request")
         current = manifest()
         self.starts = [*starts, {"commit": current["commit"], "started": current["started"]}]
-        """time and commit of each call"""
         atomic_write(path, to_json({"request": request, "starts": self.starts}, indent=1))
         self._path = folder / TRIALS_FILE
         self.verdicts: dict[tuple[int, str], TrialVerdict] = {}

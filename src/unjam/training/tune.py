@@ -1,7 +1,6 @@
 """Tuning of an expert's parameters with as many environment steps as a training: the baseline for trained controllers.
 
-`unjam tune`, with Optuna, on its own seeds, under the same limits and safety filter. Infeasible settings do not count,
-and those that amplify oscillations of the leader more than allowed are not tried.
+Infeasible settings do not count, and those with too large a string gain are not tried.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from optuna import create_study
+from optuna.samplers import TPESampler
+from optuna.trial import Trial, TrialState
 
 from unjam.controller.file import SUFFIX, controller_bytes
 from unjam.drivers.driver import label_with_parameters
@@ -30,7 +32,6 @@ from unjam.training.evaluate import raise_failure
 from unjam.training.fingerprint import file_hashes
 from unjam.training.run_folder import controller_origin
 from unjam.training.search_space import SearchSpace
-from unjam.training.setting_sampler import SettingSampler, invalid_reason
 from unjam.training.string_limit import find_operating_points
 from unjam.training.trial_log import TrialLog, TrialVerdict, TuningTrial
 from unjam.tree import named_parts
@@ -41,11 +42,11 @@ from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 TUNING_FILE = "tuned.json"
 TUNING_EPISODES = 8
-"""episodes of each trial"""
 TUNING_EPISODES_PER_ROAD = 2
-"""episodes of each trial on each of several roads"""
 TUNING_FINALISTS = 5
 """trials that run again on twice as many other seeds, because the best of many trials is partly lucky"""
+MAX_REFUSED_SETTINGS = 60
+"""settings in a row with too large string gains, after which there seem to be no others"""
 SCREENING_BATCH_SIZE = 8
 """trials that are screened at once, each on its own rings"""
 STRING_GAIN_SEED = -1
@@ -63,13 +64,69 @@ class TuningResult:
     default: TuningTrial
     """the expert with default parameters, on the seeds of the finalists"""
     trials: list[TuningTrial]
-    """all trials, in order"""
     environment_steps: int
     """control steps in SUMO"""
     batch_steps: int
     """control steps in batches"""
     file: Path
-    """the tuned expert as a controller"""
+
+
+def invalid_reason(driver: str) -> str:
+    """Return why a driver cannot be made, as for parameters that contradict each other; or an empty text."""
+    try:
+        driver_from_name(driver, 1.0)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+class SettingSampler:
+    """Proposes settings of an expert by Optuna's TPE; it learns from scores and from refused settings."""
+
+    def __init__(
+        self,
+        expert: str,
+        space: SearchSpace,
+        seed: int,
+        string_gain: Callable[[str], float],
+        max_string_gain: float = 0.0,
+    ) -> None:
+        """Take the function that measures the string gain of a driver's name; it is not called with the limit 0."""
+        self._expert, self._space = expert, space
+        self._string_gain, self._max_string_gain = string_gain, max_string_gain
+        self._study = create_study(direction="maximize", sampler=TPESampler(seed=seed, multivariate=True))
+
+    def ask(self, count: int) -> list[tuple[Trial, dict[str, Any]]]:
+        """Return new settings; raise `UnjamError` if too many in a row have too large a string gain."""
+        accepted: list[tuple[Trial, dict[str, Any]]] = []
+        refused: list[float] = []
+        while len(accepted) < count:
+            trial = self._study.ask(dict(self._space))
+            values = {key: float(f"{x:.4g}") if isinstance(x, float) else x for key, x in trial.params.items()}
+            if self._max_string_gain and not self._is_allowed(trial, values, refused):
+                continue
+            accepted.append((trial, values))
+            refused = []
+        return accepted
+
+    def tell(self, trial: Trial, score: float | None) -> None:
+        """Report the score of a setting; None: it is infeasible."""
+        self._study.tell(trial, score, state=TrialState.FAIL if score is None else None)
+
+    def _is_allowed(self, trial: Trial, values: dict[str, Any], refused: list[float]) -> bool:
+        """Return whether the string gain is allowed; if not, tell the sampler, and add it to `refused`."""
+        driver = label_with_parameters(self._expert, values)
+        gain = 0.0 if invalid_reason(driver) else self._string_gain(driver)
+        trial.set_constraint("excess_gain", gain - self._max_string_gain)
+        if gain <= self._max_string_gain:
+            return True
+        self._study.tell(trial, 0.0)
+        refused.append(gain)
+        if len(refused) == MAX_REFUSED_SETTINGS:
+            reason = f"{len(refused)} settings of {self._expert} in a row have a string gain of at least"
+            allowed = f"allowed: at most {self._max_string_gain:g}, or another expert, such as smooth-acc"
+            raise UnjamError(f"tune: {reason} {min(refused):.3g}; {allowed}")
+        return False
 
 
 def tune(
@@ -93,15 +150,9 @@ def tune(
 
     Args:
         roads: scenarios by name, with their limits and filters.
-        expert: its name.
-        space: parameters to vary, from `default_search_space` or `expert_search_space`.
         steps: total budget of control steps.
-        folder: new, empty, or that of this tuning.
-        workers: the result does not depend on their number.
         reward: objective on one road; empty: the scenario's own.
         seed: of the proposals.
-        backend: the simulator: `sumo`, `batch` or `path.py:name`.
-        on_message: called with a line for each trial.
         screen: whether trials run in batches on roads that support it (on several roads: exactly), and only the
             finalists and the default in SUMO; None: if any road supports it; not with another backend.
         max_string_gain: settings with a larger string gain on a closed road are not tried; 0: any are.
@@ -220,10 +271,7 @@ def _run_drivers(
     settings: tuple[str, str],
     runners: Mapping[str, TuningRunner],
 ) -> list[dict[str, EpisodeRows]]:
-    """Return the rows of each driver by road, with the runner of the road, on tuning seeds from `first` on.
-
-    `settings` are reward and backend.
-    """
+    """Return the rows of each driver by road on tuning seeds from `first` on; `settings`: reward and backend."""
     results: list[dict[str, EpisodeRows]] = [{} for _ in drivers]
     seeds, (reward, backend) = tuning_seeds(count, first), settings
     for road, scenario in roads.items() if drivers else ():

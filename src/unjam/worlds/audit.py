@@ -123,14 +123,9 @@ def is_recovering(
 ) -> Any:
     """Return whether a CAV still recovers from a change of its leader: a short time gap that opens.
 
-    Another vehicle that cuts in determines the first time gap, not the CAV. The CAV recovers as long as the
-    time gap to this leader has been short ever since and, after the first 5 s, increases in each step or the
-    leader is faster. Recovery that has ended does not begin again behind the same leader.
-    Source: UN Regulation No. 157, 5.2.3.3, which lets a vehicle that cannot respect the minimum time gap
-    because of other road users restore it at the next opportunity without harsh braking.
-
-    `was_recovering` and `previous` describe the previous step, behind the same leader. In the first step behind this
-    leader, `time_behind_leader` [s] is zero, and they do not matter.
+    It opens in each step after the first 5 s, or the leader is faster; recovery that has ended does not begin again.
+    `was_recovering` and `previous` are those of the previous step behind this leader; they do not matter in the first
+    one, where `time_behind_leader` [s] is zero. Source: UN Regulation No. 157, 5.2.3.3.
     """
     is_short = (current.speed > MIN_TIME_GAP_SPEED) & (current.gap < SHORT_TIME_GAP * current.speed)
     opens = (current.leader_speed > current.speed) | (current.gap * previous.speed > previous.gap * current.speed)
@@ -150,9 +145,8 @@ def following_statistics(
 ) -> FollowingStatistics:
     """Return statistics of speeds [m/s] and gaps [m]: shape (steps, CAVs), one `step` [s] apart, NaN without a CAV.
 
-    `is_overridden` are the commands that SUMO changed, `is_yielding` those given near a crossing, of any same shape.
-    Moments that are `in_recovery`, see `is_recovering`, do not count for time gaps.
-    Sources: TTC after Hayward 1972; DRAC after Almqvist et al. 1991; SAE J2944.
+    `is_overridden` are the commands that SUMO changed, `is_yielding` those near a crossing; `in_recovery` moments do
+    not count for time gaps. Sources: TTC after Hayward 1972; DRAC after Almqvist et al. 1991; SAE J2944.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         is_moving, closing = speed > MIN_TIME_GAP_SPEED, speed - leader_speed

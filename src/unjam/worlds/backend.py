@@ -37,9 +37,9 @@ DEFAULT_OPTIONS = WorldOptions()
 
 
 class Backend(Protocol):
-    """A simulator. One that holds resources is a context manager, too, which releases them.
+    """A simulator, which carries out or refuses all settings of a scenario and all that the user's own class replaces.
 
-    It must carry out or refuse all settings of a scenario, and everything that the user's own class replaces.
+    One that holds resources is a context manager, too, which releases them.
     """
 
     def supports(self, scenario: Scenario) -> str:
@@ -59,10 +59,7 @@ BackendLike = str | Backend | type[Backend]
 
 @contextmanager
 def open_backend(backend: BackendLike) -> Iterator[Backend]:
-    """Yield a backend: a given one, which stays open, or one by name or class, which is closed at the end.
-
-    Raise `InputError` if there is no such backend.
-    """
+    """Yield a given backend, which stays open, or one by name or class, which is closed at the end."""
     if not isinstance(backend, str | type):
         yield check_backend(backend, type(backend).__name__)
         return
@@ -135,9 +132,8 @@ def backend_notes(backend: BackendLike, scenario: Scenario) -> list[str]:
 def unread_reason(scenario: Scenario, kind: type[Scenario], names: Collection[str]) -> str:
     """Return why a backend for one `kind` of road, which reads only the members `names`, cannot simulate a scenario.
 
-    Empty if it can: all other settings have the defaults of `kind`, and the class of the scenario replaces no other
-    member. `SimulatedRoad` calls `draw`, which reads the settings of the road and `population`, and itself reads
-    `simulation_step`, `horizon`, `action_limit`, `safety`, `actuator` and `sensors`.
+    Empty if it can. `SimulatedRoad` calls `draw`, which reads the settings of the road and `population`, and itself
+    reads `simulation_step`, `horizon`, `action_limit`, `safety`, `actuator` and `sensors`.
     """
     if not isinstance(scenario, kind):
         return f"{scenario.title} is not a {kind.title}"

@@ -38,30 +38,26 @@ def backend_label(backend: Any) -> str:
 
 
 def call_backend(label: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return the result of a function of a user's backend; raise `InputError` with its last executed line if it fails.
-
-    Errors of unjam itself, such as those of a driver, pass through.
-    """
+    """Return the result of a user's backend; raise errors of unjam, and others as `InputError` with their last line."""
     try:
         with ending_forks():
             return function(*arguments)
     except UnjamError:
         raise
     except (Exception, SystemExit) as error:
-        frames = [(frame, line) for frame, line in walk_tb(error.__traceback__) if _is_user_code(frame.f_globals)]
-        where = f" ({Path(frames[-1][0].f_code.co_filename).name}, line {frames[-1][1]})" if frames else ""
+        frames = [
+            (Path(frame.f_code.co_filename).name, line)
+            for frame, line in walk_tb(error.__traceback__)
+            if str(frame.f_globals.get("__name__")).startswith(USER_MODULE_PREFIX)
+        ]
+        where = " ({}, line {})".format(*frames[-1]) if frames else ""
         raise InputError(f"backend: {label}: {type(error).__name__}: {error}{where}") from error
-
-
-def _is_user_code(module: dict[str, Any]) -> bool:
-    return str(module.get("__name__")).startswith(USER_MODULE_PREFIX)
 
 
 class CheckedWorld:
     """The world of a user's backend, whose states, speeds and record are checked; all else is that of the backend."""
 
     def __init__(self, world: Any, label: str, scenario: Scenario) -> None:
-        """Take a world that has not started."""
         self._world, self._label, self._scenario = world, label, scenario
         unknown = {"loop_length"} if not scenario.is_closed else set[str]()
         self._finite_fields = set(COMMON_FIELDS) - unknown - (set() if scenario.has_coordinate else {"route_position"})
@@ -115,7 +111,6 @@ class CheckedWorld:
         return array
 
     def _check_finite(self, name: str, values: np.ndarray, ids: Any, step: int | None = None) -> None:
-        """Raise `InputError` unless values of shape (vehicles,) are finite."""
         if not (is_finite := np.isfinite(values)).all():
             row = int(is_finite.argmin())
             raise self._error(f"{name} of {ids[row]} is {values[row]}", "finite", step)
@@ -153,7 +148,6 @@ class CheckedWorld:
             raise self._error(problem, f"{expected[row]:.1f} m, the sum of its speeds")
 
     def _check_last_state(self, episode: Episode) -> None:
-        """Raise `InputError` unless the record ends with the state of the world."""
         ids, state = list(self.cav_ids), self.exact_state()
         rows = {name: row for row, name in enumerate(ids)}
         names = ("speed", "leader_gap", "route_position")
@@ -169,10 +163,8 @@ class CheckedWorld:
                     raise self._error(problem, f"{recorded:.2f}, as in the record")
 
     def _count_overrides(self, episode: Episode) -> Episode:
-        """Return the record with all commands that were not carried out as overridden ones in its audit.
-
-        Where CAVs have an ACC, SUMO's human model or a slow actuator, the command is not the actual acceleration.
-        """
+        """Return the record with all commands that were not carried out as overridden ones in its audit."""
+        # Elsewhere the command is not the actual acceleration.
         if not self._scenario.actuator.is_instant or self._scenario.actuation not in ("raw", "shielded"):
             return episode
         flags = np.concatenate([np.zeros(0, bool), *map(self._is_ignored, episode.trajectories)])
@@ -181,12 +173,10 @@ class CheckedWorld:
         return replace(episode, audit=replace(audit, following=following))
 
     def _is_ignored(self, trip: Trajectory) -> Any:
-        """Return in which control steps a CAV did not carry out its command, and no added braking was recorded.
-
-        A standing vehicle cannot brake harder, and none exceeds its top speed.
-        """
+        """Return in which control steps a CAV did not carry out its command, and no added braking was recorded."""
         speed, actual = trip.states.speed[1:], np.diff(trip.states.speed) / self._scenario.control_step
         slower = trip.applied_acceleration - actual
         is_standing, is_fastest = speed < OVERRIDE_TOLERANCE, speed > self._scenario.top_speed - OVERRIDE_TOLERANCE
+        # A standing vehicle cannot brake harder, and none exceeds its top speed.
         is_braked = is_fastest | (trip.shield_braking > OVERRIDE_TOLERANCE)
         return (np.abs(slower) > COMMAND_TOLERANCE) & ~np.where(slower > 0, is_braked, is_standing)

@@ -27,11 +27,7 @@ class DriveLoop:
         memory: Memory | None = None,
         on_progress: ProgressCallback | None = None,
     ) -> None:
-        """Start the world; no control step is made yet.
-
-        Exploration noise of a policy is multiplied by `explore`. Without a `memory`, the driver only remembers the
-        world's history. `on_progress` is called now and then with the number of control steps made.
-        """
+        """Start the world; noise is multiplied by `explore`, and `memory` replaces the driver's initial one."""
         self.world, self.driver, self._on_progress = world, driver, on_progress
         size = driver.episode_noise_size
         draw = partial(world.noise, size) if size else world.noise

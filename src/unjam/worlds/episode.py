@@ -104,8 +104,8 @@ def run_episode(
 def seeded_generators(seed: Sequence[int]) -> Iterator[None]:
     """Seed the global generators of Python, NumPy and torch (on the CPU) for code of the user.
 
-    torch is not imported for that: if the code imports it, it is seeded then.
-    They are restored when the last of several blocks ends; other threads must not draw from them meanwhile.
+    torch is seeded when the code imports it. The generators are restored when the last of several blocks ends; other
+    threads must not draw from them meanwhile.
     """
     numbers, torch = np.random.SeedSequence(seed).generate_state(4), sys.modules.get("torch")
     torch_seeder = _TorchSeeder(int(numbers[0]))
@@ -140,7 +140,6 @@ class _TorchSeeder(MetaPathFinder):
         self._seed = seed
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
-        """Return the specification of torch with a loader that seeds, and None for other modules."""
         if fullname != "torch":
             return None
         self.remove()
@@ -157,7 +156,6 @@ class _TorchSeeder(MetaPathFinder):
         return specification
 
     def remove(self) -> None:
-        """Leave the list of finders."""
         if self in sys.meta_path:
             sys.meta_path.remove(self)
 

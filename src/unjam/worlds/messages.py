@@ -51,10 +51,7 @@ def answer_requests(answer: Callable[[dict[str, Any], Arrays], None]) -> None:
 
 
 def write_message(pipe: IO[bytes], content: dict[str, Any], arrays: Arrays | None = None) -> None:
-    """Write one message: `content` as JSON, and named arrays of numbers.
-
-    Arrays are removed from `arrays` once they are written, so that hours of traffic are in memory only once.
-    """
+    """Write `content` as JSON, and named arrays, which are removed once written: they may be hours of traffic."""
     unwritten = {} if arrays is None else arrays
     for name, array in unwritten.items():
         unwritten[name] = array = np.asarray(array, order="C")
@@ -83,10 +80,7 @@ def read_message(pipe: IO[bytes]) -> tuple[dict[str, Any], Arrays]:
 
 
 def has_message(pipe: IO[bytes], seconds: float) -> bool:
-    """Return whether an answer or the end arrives within a time; True at once where pipes cannot be polled (Windows).
-
-    Nothing of an earlier answer may be unread.
-    """
+    """Return whether an answer or the end arrives within a time; True at once where pipes cannot be polled."""
     if not hasattr(select, "poll"):
         return True
     poller = select.poll()

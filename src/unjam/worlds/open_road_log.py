@@ -1,7 +1,7 @@
 """The log of an episode on a road with ends, and the fields of the record made from it.
 
-An hour of an on-ramp has 2,000 vehicles, a corridor 10,000, each on the road for a small part of the time. A table with
-one column per vehicle would be 99 % empty: in large tables, vehicles of different times share a column.
+Each of thousands of vehicles is on the road for a small part of the time: in large tables, those of different times
+share a column.
 """
 
 from array import array
@@ -148,7 +148,6 @@ class OpenRoadLog:
     """Speeds, snapshots, CAV trips, braking, backlog and fuel of an episode on a road with ends."""
 
     def __init__(self, scenario: Scenario, names: Sequence[str], speeds: Floats) -> None:
-        """Start with the vehicles on the road now, and their speeds [m/s]."""
         self.traffic, self.trips = TrafficLog(), TripLog()
         self.backlog: list[int] = []
         self.fuel: list[float] = []
@@ -176,10 +175,7 @@ class OpenRoadLog:
     def episode_fields(
         self, trajectories: Sequence[Trajectory], branches: Sequence[str], teleported: Sequence[str]
     ) -> tuple[NDArray[np.intp], dict[str, Any]]:
-        """Return the column of each vehicle, and the fields of the record.
-
-        `branches` are the vehicles' origins, empty if unknown, `teleported` those not reinserted at the end.
-        """
+        """Return the column of each vehicle, and the fields of the record; empty `branches`: unknown origins."""
         vehicles, cavs = self.traffic.vehicle_ids, dict.fromkeys(each.vehicle for each in trajectories)
         groups = [(name in cavs, branch) for name, branch in zip(vehicles, branches, strict=True)]
         columns = self.traffic.columns(groups)
@@ -214,11 +210,7 @@ class OpenRoadLog:
 
 
 class MultiLaneLog(OpenRoadLog):
-    """The log of an episode on a road with lanes, where other vehicles cut in.
-
-    A vehicle that cuts in leaves a smaller gap than the CAV would choose. The audit counts separately how the CAV
-    brakes in the seconds after a cut-in, and excludes the time gaps until it has recovered.
-    """
+    """The log on a road with lanes: braking after cut-ins counts separately, time gaps not until recovery."""
 
     def __init__(
         self,

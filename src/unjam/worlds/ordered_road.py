@@ -51,7 +51,7 @@ def loop_state(
 
     Speeds [m/s] and positions of front bumpers, not wrapped [m], are in road order: arrays of shape (vehicles,) or
     (vehicles, moments), or lists. An infinite `loop_length` [m] is that of a road with ends. `crossings` are ranges
-    where the road crosses itself [m]. `penetration_rate` is that reported by a service; None: there is no such service.
+    where the road crosses itself [m]. `penetration_rate`: as reported by a service; None: there is none.
     """
     own, leader, follower = neighbors
     speed, position = speeds[own], positions[own]
@@ -85,8 +85,7 @@ def without_loop(state: LocalState) -> LocalState:
 def poses_along(outline: Floats, positions: Floats, loop_length: float) -> Floats:
     """Return rows (x, y, heading) of vehicles on a closed road, shape (..., 3): [m], and [rad] against the x axis.
 
-    The outline has rows (coordinate along the road, x, y) [m]. Positions of front bumpers are not wrapped [m], any
-    shape. A vehicle is a chord between its bumpers.
+    The outline has rows (coordinate along the road, x, y); positions of front bumpers are not wrapped [m], any shape.
     """
     (x, y), (rear_x, rear_y) = (
         [np.interp(along % loop_length, outline[:, 0], outline[:, axis]) for axis in (1, 2)]
@@ -131,10 +130,8 @@ class OrderedRoadLog:
         return self.speeds.T, np.column_stack([start, positions])
 
     def _local_states(self, speeds: Floats, positions: Floats) -> LocalState:
-        neighbors = loop_neighbors(self.cav_indices, len(self.start_positions))
-        return loop_state(
-            speeds, positions, neighbors, self.road.loop_length, self.road.crossings, self.penetration_rate
-        )
+        road, neighbors = self.road, loop_neighbors(self.cav_indices, len(self.start_positions))
+        return loop_state(speeds, positions, neighbors, road.loop_length, road.crossings, self.penetration_rate)
 
     def episode(
         self,
@@ -143,10 +140,7 @@ class OrderedRoadLog:
         driver_log: DriverLog,
         rows: Any,
     ) -> Episode:
-        """Return the record, with further `common_fields` and the decisions of the driver.
-
-        `rows` are those of the CAVs in these decisions, shape (C,); None: decisions are floats.
-        """
+        """Return the record; `rows` are those of the CAVs in the decisions, (C,), or None if these are floats."""
         road, stride = self.road, self.scenario.steps_per_control_step
         speeds, positions = (values[:, ::stride] for values in speeds_and_positions)
         control_steps = speeds.shape[1] - 1
@@ -179,7 +173,6 @@ class OrderedRoadLog:
         )
 
     def _audit(self, speeds: Floats, positions: Floats) -> Audit:
-        """Return the audit of every simulation step; arrays of shape (vehicles, moments)."""
         step, time_gap = self.scenario.simulation_step, self.scenario.safety.time_gap
         states = self._local_states(speeds, positions).map(lambda values: values.T)
         followed = states.speed, states.leader_speed, states.leader_gap
@@ -199,10 +192,7 @@ class OrderedRoadLog:
         )
 
     def _applied_and_filtered(self) -> tuple[Floats, Floats]:
-        """Return the CAVs' mean commands, and the filter's largest reductions of them [m/s2], (D, C) each.
-
-        For human drivers, these are the actual accelerations and zeros.
-        """
+        """Return the CAVs' mean commands, and the filter's largest reductions of them [m/s2], (D, C) each."""
         stride, requested = self.scenario.steps_per_control_step, self.requested_accelerations
         if len(requested):
             reductions = requested[:, None] - self.safe_accelerations.reshape(len(requested), stride, -1)
@@ -211,13 +201,11 @@ class OrderedRoadLog:
         return actual, np.zeros_like(actual)
 
     def _added_braking(self) -> Floats:
-        """Return the braking that SUMO added to each command in each step [m/s2], shape (S, C).
-
-        A command beyond the vehicle's top speed is not carried out; that does not count as braking.
-        """
+        """Return the braking that SUMO added to each command in each step [m/s2], shape (S, C)."""
         moved = self.noise_free_speeds[:, self.cav_indices]
         if not len(self.requested_accelerations):
             return np.zeros_like(moved)
+        # A command beyond the top speed is not carried out, which is no braking.
         commanded = np.minimum(self.commanded_speeds, self.scenario.top_speed)
         return (commanded - moved) / self.scenario.simulation_step
 
@@ -226,7 +214,6 @@ class OrderedRoadRecorder:
     """Collects the rows of a `OrderedRoadLog` while an episode runs; `series` has them by name, one after the other."""
 
     def __init__(self, scenario: Scenario, road: OrderedRoad, start_positions: Floats, speeds: Iterable[float]) -> None:
-        """Start with the positions of front bumpers, not wrapped [m], and the speeds [m/s] of all vehicles."""
         self._arguments = scenario, road, start_positions
         names = "noise_free_speeds", "requested_accelerations", "safe_accelerations", "commanded_speeds"
         self.series = {name: array("d") for name in names} | {"speeds": array("d", speeds)}

@@ -84,8 +84,8 @@ def make_trajectory(
 ) -> Trajectory:
     """Return the trajectory of a trip with the driver's decisions; arguments are as in `Trajectory`, or as follows.
 
-    `entry_number` is the number of earlier CAVs, `rows` the row among the CAVs in each step, shape (T + 1,), or None
-    if decisions are floats. `applied_acceleration` is the actual acceleration of human drivers.
+    `entry_number` counts earlier CAVs; `rows` are the rows among the CAVs in each step, shape (T + 1,), or None if
+    decisions are floats.
     """
     trip, commands = (vehicle, start_step, states), (applied_acceleration, filter_braking, shield_braking)
     if not driver_log.decisions:
@@ -108,10 +108,9 @@ def make_trajectory(
 
 @dataclass(frozen=True)
 class Trips:
-    """The trips of all n vehicles that were to depart in an episode; arrays have shape (n,).
+    """The trips of all n vehicles that were to depart in an episode, with durations so far; arrays have shape (n,).
 
-    A trip that has not ended counts with its duration so far. Source:
-    https://sumo.dlr.de/docs/Simulation/Output/TripInfo.html
+    Source: https://sumo.dlr.de/docs/Simulation/Output/TripInfo.html
     """
 
     vehicle_ids: tuple[str, ...] = ()
@@ -277,7 +276,7 @@ def assign_columns(
 ) -> NDArray[np.intp]:
     """Return a column for each of n trips, given the first and the last step of each (inclusive).
 
-    Only trips of the same group share a column, with at least `min_spacing` empty steps between two of them.
+    Only trips of one group share a column, with at least `min_spacing` empty steps between two of them.
     """
     columns, used = np.zeros(len(groups), np.intp), 0
     heaps: dict[Hashable, list[tuple[int, int]]] = {}

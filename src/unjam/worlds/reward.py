@@ -78,7 +78,6 @@ def _nan_mean(values: Array) -> Array:
 
 
 def _nan_sum(values: Array) -> Array:
-    """Sum over the last axis without NaN."""
     if type(values) is float:
         return 0.0 if isnan(values) else values
     xp = namespace(values)
@@ -86,10 +85,7 @@ def _nan_sum(values: Array) -> Array:
 
 
 def released_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward of Table 1 on ring and figure eight: 4 mean v / 20 - 4 mean |a|; 0 at a crash.
-
-    Source: the authors' released code, after Flow's wave attenuation environment.
-    """
+    """Reward of Table 1 on ring and figure eight, as in the authors' code: 4 mean v / 20 - 4 mean |a|; 0 at a crash."""
     running = outcome.has_crashed == 0
     return {
         "speed": 4.0 * _nan_mean(outcome.speeds) / 20.0 * running,
@@ -113,10 +109,9 @@ def printed_eq16_reward(outcome: Outcome) -> dict[str, Array]:
 
 
 def released_merge_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward of Table 1 on the merge; 0 at a crash, and never below 0.
+    """Reward of Table 1 on the merge, as in the authors' code; 0 at a crash, and never below 0.
 
     1 - ||20 - v|| / ||20|| (norms over all vehicles), minus 0.1 for each second by which a CAV's time gap is below 1 s.
-    Source: the authors' released code, after Flow's merge environment.
     """
     xp = namespace(outcome.speeds)
     running = outcome.has_crashed == 0
@@ -131,9 +126,8 @@ def released_merge_reward(outcome: Outcome) -> dict[str, Array]:
 def fuel_reward(outcome: Outcome) -> dict[str, Array]:
     """Reward little fuel of the CAVs for their distance [ml/s]: about 0 in steady driving, less with braking.
 
-    Fuel is that of the power at the wheels, see `unjam.physics.fuel`, without the part that becomes kinetic energy: it
-    is lost only when the CAV brakes. Time gaps below 1 s cost 0.1 for each second, and gaps beyond 90 m and 5 s 0.01
-    for each meter: a CAV must not save fuel by being late. A crash costs 10.
+    Fuel is that of `unjam.physics.fuel` without the part that becomes kinetic energy, which is lost only in braking.
+    Time gaps below 1 s cost 0.1 for each second, gaps beyond 90 m and 5 s 0.01 for each meter, a crash 10.
     """
     speeds, accelerations = outcome.cav_speeds, outcome.accelerations
     lost = fuel_rate(speeds, accelerations) - kinetic_fuel_rate(speeds, accelerations)
@@ -149,8 +143,7 @@ def fuel_reward(outcome: Outcome) -> dict[str, Array]:
 def power_reward(outcome: Outcome) -> dict[str, Array]:
     """Reward flow and speed together: the distance that all vehicles cover, times their mean speed; 0 at a crash.
 
-    About 1 if the merge flows freely; low in a jam with a high flow, and on an empty road.
-    Source: throughput over delay, the power of Kleinrock 1979 (IEEE ICC, 43.1), in vehicles.
+    About 1 in free flow on the merge. Source: the power of Kleinrock 1979 (IEEE ICC, 43.1), in vehicles.
     """
     flow = _nan_sum(outcome.speeds) / (MERGE_TARGET_SPEED * MERGE_FREE_FLOW_VEHICLES)
     return {"power": flow * _nan_mean(outcome.speeds) / MERGE_TARGET_SPEED * (outcome.has_crashed == 0)}
@@ -159,9 +152,8 @@ def power_reward(outcome: Outcome) -> dict[str, Array]:
 def travel_time_reward(outcome: Outcome) -> dict[str, Array]:
     """Reward short travel times: minus the number of vehicles on the road and in the backlog, in hundreds.
 
-    As the demand is given, the return is proportional to the mean travel time including insertion delays: keeping
-    vehicles out of the road does not increase it. Neither does a crash, which ends the episode: all these vehicles, and
-    at least `MIN_CRASH_BACKLOG`, then wait for `CRASH_CLOSURE_STEPS` control steps.
+    The return is proportional to the mean travel time including insertion delays. After a crash, which ends the
+    episode, all these vehicles, and at least `MIN_CRASH_BACKLOG`, wait for `CRASH_CLOSURE_STEPS` control steps.
     """
     vehicles = (~namespace(outcome.speeds).isnan(outcome.speeds)).sum(-1) + outcome.backlog
     closed = CRASH_CLOSURE_STEPS * clamp_min(vehicles, MIN_CRASH_BACKLOG) * outcome.has_crashed
@@ -226,10 +218,9 @@ def _cav_gaps(outcome: Outcome) -> Array:
 def make_reward(text: RewardLike) -> Reward:
     """Return the reward for a name, with weights of its terms, or for a user's function.
 
-    `released:acceleration=2,time_gap=0.5` is the reward `released` with double weight of its term `acceleration`, plus
-    half of the term `time_gap` of `REWARD_TERMS`. `path.py:name` is a function that takes an `Outcome` and returns
-    its terms by name, or one array; `text` may be such a function itself. Raise `InputError` for unknown names and
-    terms, and weights that are not numbers.
+    `released:acceleration=2,time_gap=0.5` has double weight of its term `acceleration`, plus half of the term
+    `time_gap` of `REWARD_TERMS`. A function, or `path.py:name` of one, takes an `Outcome` and returns its terms by
+    name, or one array. Raise `InputError` for unknown names and terms, and weights that are not numbers.
     """
     if not isinstance(text, str):
         return _user_reward(UserFunction.from_object(text, "an Outcome"))
@@ -240,7 +231,10 @@ def make_reward(text: RewardLike) -> Reward:
             raise invalid_value(f"reward {name}: {term}", weight, "a number")
     if not is_file_reference(name) and name not in REWARDS:
         raise unknown_name("reward", name, [*REWARDS, "path.py:name"])
-    reward = REWARDS.get(name) or _file_reward(FileReference.parse(name))
+    reward = REWARDS.get(name)
+    if reward is None:
+        reference = FileReference.parse(name)
+        reward = _user_reward(UserFunction.from_object(reference.load_object(), "an Outcome", reference))
 
     def weighted_reward(outcome: Outcome) -> dict[str, Array]:
         terms = dict(reward(outcome))
@@ -257,10 +251,6 @@ def make_reward(text: RewardLike) -> Reward:
 def is_packaged_reward(reward: RewardLike) -> bool:
     """Return whether a reward is one of the package, with or without weights, instead of a user's function."""
     return isinstance(reward, str) and not is_file_reference(split_parameters(reward)[0])
-
-
-def _file_reward(reference: FileReference) -> Reward:
-    return _user_reward(UserFunction.from_object(reference.load_object(), "an Outcome", reference))
 
 
 def _user_reward(function: UserFunction) -> Reward:
@@ -295,8 +285,7 @@ def episode_reward_terms(
 ) -> dict[str, Floats]:
     """Return the terms of a reward in a whole episode, each of shape (T,); raise `InputError` if one is invalid.
 
-    Speeds are those of all vehicles, shape (T + 1, N), trajectories those of CAVs. `has_crashed`: a collision ended the
-    last control step. The insertion backlog has shape (T + 1,), or (0,) if there is none.
+    Speeds are those of all vehicles, shape (T + 1, N); the backlog has shape (T + 1,), or (0,) if there is none.
     """
     steps, rows = len(speeds) - 1, max(1, MAX_REWARD_CELLS // max(1, speeds.shape[1]))
     parts = [slice(start, min(start + rows, steps)) for start in range(0, max(steps, 1), rows)]
@@ -334,10 +323,7 @@ def _step_outcomes(
 def validate_reward_terms(
     reward: Reward, outcome: Outcome, start: int = 0, row_name: str = "step"
 ) -> dict[str, Floats]:
-    """Return the terms of a reward for consecutive control steps, of which `start` is the first.
-
-    Raise `InputError` unless each is finite and has one value per control step. `row_name` says what the rows are.
-    """
+    """Return the terms in steps from `start` on; raise `InputError` unless each has a finite value per step."""
     label, terms = f"reward {object_label(reward)}", dict[str, Floats]()
     for name, answer in reward(outcome).items():
         values = answer_as_array(answer, len(outcome.speeds), label, f"term {name!r}", "control step")
@@ -349,9 +335,9 @@ def validate_reward_terms(
 
 
 def step_reward_terms(reward: Reward, outcome: Outcome, step: int, needs_rows: bool) -> dict[str, float]:
-    """Return the terms of a reward in one control step, whose `outcome` has no axis of rows.
+    """Return the terms of a reward, a user's if it `needs_rows`, in one step without the axis of rows.
 
-    `needs_rows`: the reward is a user's function. Raise `InputError` unless each term is one finite number.
+    Raise `InputError` unless each term is one finite number.
     """
     if not needs_rows:
         terms = {name: float(value) for name, value in reward(outcome).items()}

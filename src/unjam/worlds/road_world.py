@@ -61,10 +61,7 @@ class RoadWorld(World[Episode], Protocol):
         return self.local_state()
 
     def last_applied_acceleration(self) -> Array:
-        """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2].
-
-        Their shape is (CAVs,); that of a single CAV may be a float if the world `is_scalar`.
-        """
+        """Return the CAVs' accelerations in the last control step after the filter [m/s2], (CAVs,) or a float."""
         ...
 
     def scene(self) -> RoadScene:
@@ -79,7 +76,6 @@ class SimulatedRoad(RoadWorld):
     remaining_rows: Sequence[int] | None = None  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def __init__(self, scenario: Scenario, seed: Sequence[int], drawn: DrawnRoad | None = None) -> None:
-        """Draw the road of a seed, unless it is `drawn` already."""
         self.road, (noise_seed, exploration_seed, _, sensor_seed) = drawn or scenario.draw_from_seed(seed)
         self.scenario, self.seed, self.limits = scenario, tuple(seed), scenario.acceleration_limits
         self.has_crashed = False

@@ -1,7 +1,4 @@
-"""A worker process that runs episodes on request, one after the other. Free of torch.
-
-Started by `unjam.worlds.worker_pool` as `python -m unjam.worlds.worker`.
-"""
+"""A worker process that runs episodes on request, `python -m unjam.worlds.worker`, without torch."""
 
 import gc
 import sys
@@ -25,7 +22,6 @@ from unjam.worlds.sumo.sandboxed import enter_sandbox
 from unjam.worlds.sumo.simulation import Simulation
 
 PROGRESS_INTERVAL = 0.2
-"""seconds between two reports of progress"""
 
 
 def _answer_request(

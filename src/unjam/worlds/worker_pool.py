@@ -69,7 +69,7 @@ class EpisodeTask:
 class WorkerPool(AbstractContextManager["WorkerPool"]):
     """A fixed number of worker processes, started when first needed, and replaced when they die or hang.
 
-    The episodes depend only on the tasks, not on the number of workers, their order, or how often they were replaced.
+    The episodes depend only on the tasks.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
             self._idle_workers.put(worker)
 
     def run(self, tasks: Sequence[EpisodeTask], on_progress: Callable[[int, int], None] | None = None) -> list[Episode]:
-        """Run all tasks and return their episodes, in the order of the tasks; a failed one contains the reason.
+        """Run all tasks and return their episodes in order; a failed one contains the reason.
 
         `on_progress` is called with a task's index and its control steps so far, from several threads.
         """
@@ -97,10 +97,9 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
         transform: Callable[[int, Episode], ResultT],
         on_progress: Callable[[int, int], None] | None = None,
     ) -> list[ResultT]:
-        """Run all tasks and return `transform(index, episode)` of each: many whole episodes would need much memory.
+        """Run all tasks and return `transform(index, episode)` of each, called from several threads, to save memory.
 
-        `transform` is called when an episode ends, from several threads. If SUMO refuses the files of the very first
-        task, and so would refuse those of others, raise `SumoInputError`.
+        Raise `SumoInputError` if SUMO refuses the files of the very first task, and so would refuse those of others.
         """
         check_owner(self._owner, "worker pool: it")
         is_first, self._is_first = self._is_first, False

@@ -145,10 +145,7 @@ class CarFollowingWorld(_OfflineWorld):
         loop_length: float = np.nan,
         actuator: Actuator = INSTANT_ACTUATOR,
     ) -> None:
-        """Take the pairs' initial state, arrays of shape (n,), and leaders' accelerations [m/s2], shape (T, n).
-
-        The CAVs start without acceleration and pending commands.
-        """
+        """Take the pairs' initial state, arrays (n,), and leaders' accelerations [m/s2], (T, n)."""
         self.limits, self._step = limits, step
         self._states = [FollowingState(*(np.array(values, np.float64) for values in initial_state))]
         self._actuator, self._actuator_state = actuator, actuator.initial_state(self._states[0].speed, step)

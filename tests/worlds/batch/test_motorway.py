@@ -29,19 +29,12 @@ from unjam.worlds.batch.motorway.eidm import (
 )
 from unjam.worlds.batch.motorway.lane_changes import change_lanes
 from unjam.worlds.batch.motorway.traffic import BatchMotorways
-from unjam.worlds.batch.motorway.vehicles import (
-    NO_ADVICE,
-    MotorwayDrivers,
-    MotorwayVehicles,
-    find_neighbors,
-    find_road_neighbors,
-    neighbors_on_lane,
-    sort_vehicles,
-)
+from unjam.worlds.batch.motorway.vehicles import NO_ADVICE, MotorwayDrivers, MotorwayVehicles, sort_vehicles
 from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.run import run_batch, run_batched_if_supported
 from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.episode import run_episode
+from unjam.worlds.lane_neighbors import find_neighbors, find_road_neighbors, neighbors_on_lane
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.inputs import SumoInputs
@@ -267,11 +260,9 @@ def test_vehicles_slow_down_at_both_ramps_as_in_sumo(sumo: SumoBackend) -> None:
 
 
 def test_vehicles_of_different_ramps_are_no_neighbors_on_the_lane_of_ramps() -> None:
-    geometry, count = TWO_RAMPS.geometry, 4
+    geometry = TWO_RAMPS.geometry
     lane, position = np.array([0, 0, 0, 1]), np.array([3300.0, 3200.0, 2200.0, 2100.0])
-    columns = dict.fromkeys(MotorwayVehicles._fields, np.zeros(count))
-    vehicles = MotorwayVehicles(**columns | {"road": np.zeros(count, int), "lane": lane, "position": position})
-    neighbors = find_road_neighbors(vehicles, geometry)
+    neighbors = find_road_neighbors(np.zeros(4, int), lane, position, geometry)
     np.testing.assert_array_equal(neighbors_on_lane(neighbors.leaders, lane), [-1, 0, -1, -1])
     np.testing.assert_array_equal(neighbors_on_lane(neighbors.followers, lane), [1, -1, -1, -1])
     assert neighbors.leaders[0, 3] == 2  # adjacent on the right
@@ -365,7 +356,7 @@ def test_neighbours_are_those_next_on_each_way_of_the_same_road() -> None:
     order = np.lexsort((-place, road))
     columns = dict.fromkeys(MotorwayVehicles._fields, np.zeros(count)) | {"road": road, "lane": way, "position": place}
     vehicles = MotorwayVehicles(**columns).select(order)
-    near = find_neighbors(vehicles, 3)
+    near = find_neighbors(vehicles.road, vehicles.lane, 3)
     for row in range(count):
         for side in range(3):
             there = np.flatnonzero((vehicles.road == vehicles.road[row]) & (vehicles.lane == side))
@@ -387,7 +378,7 @@ def test_nobody_enters_before_the_time_or_without_room() -> None:
         vehicles = traffic.vehicles
         new = [row for row, entry in enumerate(vehicles.entry.tolist()) if entry not in known]
         assert all(times[vehicles.entry[row]] <= traffic.time for row in new)
-        row = neighbors_on_lane(find_neighbors(vehicles, 3).leaders, vehicles.lane)
+        row = neighbors_on_lane(find_neighbors(vehicles.road, vehicles.lane, 3).leaders, vehicles.lane)
         gaps = np.where(row >= 0, vehicles.position[row] - LENGTH - vehicles.position, np.inf)
         assert (gaps[new] >= vehicles.minimum_gap[new] - 1e-9).all()
     assert traffic.insertion_queue.entry_counts[0] >= len(traffic.vehicles.entry) > 20

@@ -1,9 +1,7 @@
 """SUMO's IDM of human drivers as one formula on arrays, with the limits that SUMO applies to it, and their leaders.
 
-SUMO's rings have four lanes in a row, and drivers brake for the last vehicle on each visible lane. On a driver's own
-lane, the leader is the vehicle ahead. On a lane further ahead, it is the last vehicle on that lane. If the vehicle
-ahead is still on the own lane, this is another vehicle, and drivers brake for it if it is much slower.
-Drivers always see the next lane, and further lanes as far as they need to stop, but at least 25 m of lanes.
+SUMO's rings have four lanes in a row. Drivers brake for the vehicle ahead on their own lane, and for the last vehicle
+on each visible lane further ahead: the next one, and others as far as they need to stop, but at least 25 m of lanes.
 Sources: SUMO's MSCFModel_IDM (`_v`), MSCFModel (`finalizeSpeed`, `brakeGap`) and MSVehicle (`executeMove`,
 `planMoveInternal`).
 """
@@ -42,7 +40,6 @@ CONTACT_GAP = -1e-3
 FREE_GAP = 1e6
 """gap in SUMO's `freeSpeed` without a leader; the leader then drives at the desired speed [m]"""
 HumanParameters = IDMParameters | IDMArrays
-"""parameters of all human drivers, or of each of them"""
 
 
 class Leader(NamedTuple):
@@ -57,8 +54,7 @@ def leaders(
 ) -> Iterator[Leader]:
     """Yield the leader of each vehicle on its own lane, on the next one, and so on as far as any driver sees.
 
-    Shapes: (vehicles, W); `loop_length` (W,). Units: m/s, m, m, s. Positions are those of front bumpers, wrapped or
-    not; `leader` is the vehicle ahead.
+    Shapes: (vehicles, W); `loop_length` (W,). Positions are those of front bumpers; `leader` is the vehicle ahead.
     """
     xp, lane_length, place = namespace(speed), loop_length / RING_EDGES, position % loop_length
     lane = xp.floor(place / lane_length)
@@ -90,38 +86,19 @@ def leaders(
 
 
 def look_ahead_distance(max_speed: Array, time_headway: Array, braking: Array, step: float) -> Array:
-    """Return how far drivers look ahead: far enough to stop after a headway at the maximum speed of this step [m].
-
-    Shapes: any, broadcast together. Units: m/s, s, m/s2, s.
-    """
+    """Return how far drivers look ahead [m]: far enough to stop after a headway at the maximum speed of this step."""
     return max_speed * (step + time_headway) + stopping_distance(max_speed, braking, step)
 
 
-def lane_end_leader(speed: Array, distance: Array, parameters: HumanParameters) -> Leader:
-    """Return the leader of drivers above their desired speed: the end of their lane, as a standing vehicle.
-
-    `distance` is that to the end [m]; the gap is at least that of SUMO's `getSecureGap` at the desired speed.
-    """
-    desired = parameters.desired_speed
-    secure_gap = desired * (parameters.time_headway + desired / parameters.interaction_scale)
-    return Leader(0.0 * speed, clamp_min(distance, secure_gap))
-
-
 def ring_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
-    """Return which vehicles touch the vehicle ahead according to SUMO, which requires both fronts on the same lane.
-
-    Shapes: (vehicles, ...); `loop_length` broadcasts with them. Units: m.
-    """
+    """Return which vehicles, (vehicles, ...), touch the one ahead: SUMO requires both fronts on the same lane."""
     xp = namespace(position)
     lane = xp.floor(position % loop_length / (loop_length / RING_EDGES))
     return (gap < CONTACT_GAP) & (lane == xp.concatenate([lane[1:], lane[:1]]))
 
 
 def human_idm_speed(speed: Array, leader_speed: Array, gap: Array, parameters: HumanParameters, step: float) -> Array:
-    """Return the speeds of human drivers after a step behind their leaders, before noise is added [m/s].
-
-    Shapes: any, broadcast together. Units: m/s, m/s, m, s. Steps are at most 0.375 s; SUMO divides longer ones.
-    """
+    """Return the speeds of human drivers after a step of at most 0.375 s behind their leaders, before noise [m/s]."""
     gap = clamp_min(gap, SUMO_MIN_GAP)
     acceleration = idm_acceleration(speed, leader_speed, gap, parameters, fast_power)
     desired = next_speed(speed, clamp_min(acceleration, -EMERGENCY_BRAKING), step)
@@ -142,14 +119,13 @@ def human_ring_speed(
 def slow_to_desired_speed(
     new_speed: Array, speed: Array, distance_to_end: Array, parameters: HumanParameters, step: float
 ) -> Array:
-    """Return the speeds after a step where drivers above their desired speed slow down for the end of their lane.
-
-    Shapes: any, broadcast together. Units: m/s, m/s, m, s.
-    """
-    xp, is_too_fast = namespace(speed), speed > parameters.desired_speed  # because of noise
-    if bool(is_too_fast.any()):
-        end = lane_end_leader(speed, distance_to_end, parameters)
-        slower = human_idm_speed(speed, *end, without_minimum_gap(parameters), step)
+    """Return the speeds after a step where drivers above their desired speed brake for the end of their lane [m/s]."""
+    xp, desired = namespace(speed), parameters.desired_speed
+    is_too_fast = speed > desired  # because of noise
+    if bool(is_too_fast.any()):  # the end of the lane is a standing leader, at least SUMO's `getSecureGap` ahead
+        secure_gap = desired * (parameters.time_headway + desired / parameters.interaction_scale)
+        gap = clamp_min(distance_to_end, secure_gap)
+        slower = human_idm_speed(speed, 0.0 * speed, gap, without_minimum_gap(parameters), step)
         braking = clamp_min(parameters.comfortable_deceleration, MIN_OVERSPEED_BRAKING)
         min_speed = speed - braking * step - OVERSPEED_BRAKING_TOLERANCE
         new_speed = xp.where(is_too_fast, xp.minimum(new_speed, xp.maximum(slower, min_speed)), new_speed)

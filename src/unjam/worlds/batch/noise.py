@@ -19,10 +19,7 @@ WorldSeeds = Sequence[Sequence[np.random.SeedSequence]]
 
 
 def draw_single_normal(generator: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return standard normal numbers in single precision, several times faster than `generator.standard_normal`.
-
-    Source: Box and Muller 1958, Ann. Math. Stat. 29:610.
-    """
+    """Return single-precision normal numbers, much faster than NumPy (Box and Muller 1958, Ann. Math. Stat.)."""
     size = prod(shape)
     uniform = generator.random((2, (size + 1) // 2), np.float32)
     radius, angle = np.sqrt(-2.0 * np.log(1.0 - uniform[0])), 2.0 * np.pi * uniform[1]
@@ -33,7 +30,6 @@ class NoiseState(NamedTuple):
     """State of the human drivers' noise in one world."""
 
     generator: Mapping[str, Any]
-    """state of the bit generator"""
     remaining_block: Floats
     """rest of the last block, the next step at the end, shape (steps, vehicles)"""
 
@@ -44,7 +40,6 @@ class SeededNoise:
     def __init__(
         self, seeds: WorldSeeds, vehicle_count: int, exploration_shape: tuple[int, int], to_array: ArrayFactory
     ) -> None:
-        """Take the numbers of vehicles, and of control steps and CAVs."""
         self._human_generators = [np.random.default_rng(noise) for noise, *_ in seeds]
         self._exploration_seeds = [exploration for _, exploration, *_ in seeds]
         self._block = np.empty((len(seeds), NOISE_BLOCK_STEPS, vehicle_count))

@@ -43,8 +43,7 @@ def start_batch_drive(
 ) -> DriveLoop:
     """Return the loop of a driver that starts to drive all CAVs of a batch.
 
-    `to_array` makes the world's arrays, which the driver must accept; `explore` is the factor of exploration noise.
-    Without a `memory`, the driver remembers only the warm-up.
+    `to_array` makes arrays that the driver must accept. Without a `memory`, it remembers only the warm-up.
     """
     world.measured_fields = driver.requirements().measured_fields
     has_fixed_rows = world.cav_count > 0  # otherwise CAVs enter later
@@ -70,10 +69,9 @@ def run_batch(
 ) -> list[Episode]:
     """Return the episodes of tasks, which are simulated at once; equal to `run_episode` in SUMO except for rounding.
 
-    The tasks differ at most in road length, seed and driver, and on motorways in exploration; otherwise, or if
-    `unjam.worlds.batch.support` says why they are not supported, raise `InputError`. Warm-ups of `upcoming`, similar
-    tasks that will follow, are simulated together with theirs. `allow_statistical` allows scenarios with episodes that
-    equal SUMO's only in distribution.
+    Tasks differ at most in road length, seed and driver, and on motorways in exploration; else, or if they are not
+    supported, raise `InputError`. Warm-ups of `upcoming` tasks are simulated with theirs. `allow_statistical` allows
+    scenarios with episodes that equal SUMO's only in distribution.
     """
     first = tasks[0]
     if any(_shared_settings(task) != _shared_settings(first) for task in tasks):
@@ -85,7 +83,6 @@ def run_batch(
 def _run_at_once(
     tasks: Sequence[EpisodeTask], to_array: ArrayFactory, upcoming: Sequence[EpisodeTask], allow_statistical: bool
 ) -> Sequence[Episode]:
-    """Return the episodes of tasks without rewards; arguments as of `run_batch`."""
     first, scenarios = tasks[0], [task.scenario for task in tasks]
     for task in tasks:
         check_can_drive(task.driver, task.scenario)
@@ -96,8 +93,11 @@ def _run_at_once(
         return [episode for task in tasks for episode in _run_at_once([task], to_array, (), allow_statistical)]
     world = kind.world.from_tasks(tasks, to_array)
     if first.scenario.warmup > 0:
-        keys, upcoming_keys = (list(map(_warm_up_key, each)) for each in (tasks, upcoming))
-        cast(RingBatch, world).warm_up_states = warm_up_states(keys, upcoming_keys)
+
+        def key(task: EpisodeTask) -> _WarmUpKey:
+            return cast(LoopScenario, task.scenario), task.seed, task.driver.requirements().measured_fields
+
+        cast(RingBatch, world).warm_up_states = warm_up_states([*map(key, tasks)], [*map(key, upcoming)])
     driver = _combined_driver(tasks, world.values_of_cavs)
     explore = float(any(task.explore for task in tasks)) if kind.has_own_drivers else first.explore
     episodes = finish_drive(start_batch_drive(world, driver, to_array, explore))
@@ -139,10 +139,6 @@ def _combined_driver(tasks: Sequence[EpisodeTask], to_cavs: Callable[[Array], Ar
     return DriverPerRoad(tuple(drivers), lambda: to_cavs(indices))
 
 
-def _warm_up_key(task: EpisodeTask) -> _WarmUpKey:
-    return cast(LoopScenario, task.scenario), task.seed, task.driver.requirements().measured_fields
-
-
 def warm_up_states(keys: Sequence[_WarmUpKey], upcoming: Sequence[_WarmUpKey]) -> list[WarmUpState]:
     """Return the state of each key after its warm-up; missing ones are simulated together with those of `upcoming`."""
     cache = WARM_UP_CACHE
@@ -160,7 +156,6 @@ def warm_up_states(keys: Sequence[_WarmUpKey], upcoming: Sequence[_WarmUpKey]) -
 
 
 def _warm_up(keys: Sequence[_WarmUpKey]) -> dict[_WarmUpKey, WarmUpState]:
-    """Return the states of rings of one class after their warm-up, simulated in batches."""
     states, size = dict[_WarmUpKey, WarmUpState](), support.required_batch_kind(keys[0][0]).max_roads
     for first in range(0, len(keys), size):
         batch = keys[first : first + size]

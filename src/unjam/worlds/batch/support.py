@@ -52,9 +52,8 @@ def unsupported_reason(scenario: Scenario) -> str:
 def statistically_unsupported_reason(scenario: Scenario) -> str:
     """Return why a batch cannot simulate a scenario at all; empty if it can, at least with SUMO's distribution.
 
-    On figure eights, all but a few steps in a million were equal to SUMO's where they were compared. But one different
-    decision about the right of way changes the order of the queue, so that only distributions agree. On on-ramps,
-    human drivers follow as in SUMO, but all vehicles change lanes at once, and drivers' errors are other draws.
+    On figure eights nearly all steps equal SUMO's, but one other decision about the right of way changes the queue. On
+    on-ramps, all vehicles change lanes at once, and drivers' errors are other draws.
     """
     if kind := batch_kind(scenario):
         return kind.reason(scenario)

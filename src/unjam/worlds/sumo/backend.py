@@ -32,8 +32,8 @@ TRAFFIC_CLASSES: dict[type[Road], type[Traffic[Any]]] = {
 class SumoBackend(AbstractContextManager["SumoBackend"]):
     """SUMO: a given simulation, or one that the first episode opens and the others reuse.
 
-    The latter runs in a sandboxed process (no writing, no network) for users' networks, and in its own process with a
-    warning if libsumo already holds a simulation in this process, unjam's or the user's.
+    It runs in a sandboxed process (no writing, no network) for users' networks, and in its own process with a warning
+    if libsumo already holds a simulation in this process.
     """
 
     label: ClassVar[str] = "sumo"
@@ -53,14 +53,7 @@ class SumoBackend(AbstractContextManager["SumoBackend"]):
 
     @contextmanager
     def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[Traffic[Any]]:
-        """Yield the traffic of an episode.
-
-        Raises:
-            SumoInputError: SUMO refuses files or options, at the start or later in the episode.
-            EpisodeError: SUMO cannot run the scenario for another reason, or other code in this process has started,
-                stepped or closed a simulation through libsumo meanwhile (`LostWorkerError`).
-            UnjamError: another episode runs in the simulation.
-        """
+        """Yield the traffic of an episode; raise errors as `run_episode`."""
         simulation = self._given or self._open_simulation(scenario.reads_user_files)
         if not simulation.episode_lock.acquire(blocking=False):
             raise UnjamError("simulation: an episode is running in it; allowed: one at a time")

@@ -34,10 +34,7 @@ def load_with_loops(
 
 
 class DetectorPool(AbstractContextManager["DetectorPool"]):
-    """A fixed number of sandboxed SUMO processes, started when first needed.
-
-    The passages depend only on scenario, seed and loops, not on the number of processes.
-    """
+    """A number of sandboxed SUMO processes, which does not change the passages; they start when first needed."""
 
     def __init__(self, count: int = 1) -> None:
         self._thread_pool = ThreadPoolExecutor(count, thread_name_prefix="unjam-detectors")

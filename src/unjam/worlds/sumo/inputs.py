@@ -14,7 +14,6 @@ from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE, is_harmless_attribute, is
 from unjam.worlds.sumo.networks import XMLAttributes, network_file, xml_element
 
 SUMO_CAV_COLOR = "215,38,61"
-"""red, in SUMO's window"""
 W99_ACCELERATION = 2.0
 """SUMO's default of `cc8`, the acceleration from a standstill of its model W99 [m/s2]"""
 CALIBRATED_TYPE_TEMPLATE = "{}_of_driver_{}"
@@ -52,10 +51,7 @@ def single_lane_inputs(scenario: Scenario, road: BuiltRoad) -> SumoInputs:
 
 
 def motorway_inputs(scenario: Scenario, road: MotorwayRoad) -> SumoInputs:
-    """Return SUMO's inputs for a motorway that is built for the episode.
-
-    Each vehicle type has a type of the CAV that may replace it, with the same desired speed.
-    """
+    """Return SUMO's inputs for a motorway; each vehicle type has one of the CAV that may replace it."""
     lines = []
     for name, kind in road.vehicle_types.items():
         common = {"length": kind.length, "emissionClass": kind.emission_class or scenario.emission_class}
@@ -118,11 +114,7 @@ def user_network_inputs(scenario: Scenario, road: UserNetworkRoad) -> SumoInputs
 
 
 def _user_network_types_xml(scenario: Scenario, road: UserNetworkRoad) -> str:
-    """Return the XML of a CAV type for each type that may become one, equal except for the car-following model.
-
-    Each calibrated driver has such a type for each type of passenger cars. When the type of a vehicle changes, SUMO
-    draws a new speed factor. From these types it draws none, and the vehicle gets its own back.
-    """
+    """Return the XML of the types of CAVs and calibrated drivers, from which SUMO draws no speed factor."""
     cav = {"sigma": 0.0, "delta": IDMParameters().exponent, **_cav_attributes(scenario)}
     if scenario.actuation != "cruise":
         cav["accel"] = None  # commands cannot exceed the acceleration of the vehicle
@@ -146,9 +138,8 @@ def _type_variant_xml(
     if attributes.get("carFollowModel") == "W99":  # which accelerates by its own parameter
         others["accel"] = attributes.get("cc8", W99_ACCELERATION)
     element = xml_element("vType", **{**others, "speedFactor": 1.0, "speedDev": 0.0, **car_following, "id": name})
-    nested = "".join(
-        xml_element("param", key=key, value=parameters[key]) for key in parameters if is_harmless_parameter(key)
-    )
+    harmless = filter(is_harmless_parameter, parameters)
+    nested = "".join(xml_element("param", key=key, value=parameters[key]) for key in harmless)
     return f"{element.removesuffix('/>')}>{nested}</vType>"
 
 
@@ -192,23 +183,14 @@ def _idm_attributes(parameters: IDMParameters) -> XMLAttributes:
 
 
 def _single_lane_cav_attributes(scenario: Scenario) -> XMLAttributes:
-    """Return the attributes of the CAVs on a road with one lane.
-
-    With Flow's actuation they are those of human-driven vehicles, with a gap: otherwise CAVs would creep up to contact.
-    """
-    if scenario.actuation == "flow":
+    if scenario.actuation == "flow":  # without a gap CAVs would creep up to contact
         attributes = _human_attributes(scenario, scenario.humans)
         return {"color": SUMO_CAV_COLOR, **attributes, "minGap": max(attributes["minGap"], MIN_CAV_GAP)}
     return {**_cav_attributes(scenario), "maxSpeed": scenario.top_speed}
 
 
 def _cav_attributes(scenario: Scenario) -> XMLAttributes:
-    """Return the attributes of a CAV: those of its own ACC, or of a type that executes any safe command exactly.
-
-    With SUMO's safe-speed check, a Krauss vehicle with a reaction time of one step and a small minimum gap follows its
-    commands until one would lead to a crash. With a safety filter, it has a car's engine and brakes: then SUMO
-    only makes it yield, and other vehicles expect its actual capabilities.
-    """
+    """Return the attributes of a CAV: those of its own ACC, or of a type that executes any safe command exactly."""
     cruise, step = scenario.cruise, scenario.simulation_step
     if scenario.actuation == "cruise":
         return {
@@ -219,6 +201,8 @@ def _cav_attributes(scenario: Scenario) -> XMLAttributes:
             "decel": cruise.deceleration,
             "minGap": cruise.minimum_gap,
         }
+    # Such a Krauss vehicle follows commands until one would lead to a crash. With a safety filter, it has a car's
+    # limits, which other vehicles expect, and SUMO only makes it yield.
     car_acceleration = max(SUMO_ACCELERATION, scenario.acceleration_limits.highest)
     return {
         "color": SUMO_CAV_COLOR,
@@ -232,9 +216,8 @@ def _cav_attributes(scenario: Scenario) -> XMLAttributes:
 
 
 def lane_change_parameters(scenario: Scenario) -> dict[str, str]:
-    """Return the lane-change parameters that a vehicle gets as a CAV, by the names of SUMO's LC2013.
+    """Return the parameters of SUMO's LC2013 that a vehicle gets as a CAV, which its new type does not change.
 
-    The new vehicle type alone would not change them. Source:
     https://sumo.dlr.de/docs/Definition_of_Vehicles,_Vehicle_Types,_and_Routes.html#lane-changing_models
     """
     if scenario.actuation != "cruise":

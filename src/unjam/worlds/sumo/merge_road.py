@@ -1,8 +1,7 @@
 """Traffic on a main road with a ramp: human drivers are commanded, and neighbors are computed from positions.
 
-All vehicles are in one list: those past the merge point, then those on the main road, then those on the ramp, each from
-front to back. As overtaking is impossible, a vehicle's leader is the previous one in the list. The first vehicle on the
-ramp follows the last one past the merge point instead.
+All vehicles are in one list: those past the merge point, on the main road, and on the ramp, each from front to back. A
+vehicle's leader is the previous one in the list; that of the first on the ramp is the last one past the merge point.
 """
 
 from collections.abc import Collection, Sequence
@@ -37,7 +36,6 @@ class MergingStreams:
         self.positions: Floats = np.zeros(0)
         """positions of the front bumpers, zero at the merge point and negative before it [m]"""
         self.speeds: Floats = np.zeros(0)
-        """speeds [m/s]"""
         self._branches = np.zeros(0, np.intp)
         """0: the main road; 1: the ramp"""
 
@@ -125,10 +123,7 @@ class MergingTraffic(OpenTraffic[MergeRoad]):
             streams.enter(name, origins[name], simulation.speeds([name])[0])
 
     def _command_humans(self) -> None:
-        """Command speeds of the IDM with noise, except on the junction, where SUMO drives.
-
-        This includes CAVs: their own commands in the same step replace these.
-        """
+        """Command the IDM with noise, except on the junction; CAVs, too, until their own commands replace these."""
         scenario, streams = self.scenario, self._streams
         leaders, speeds = streams.leaders(), streams.speeds
         gaps = streams.gaps(leaders).clip(MIN_IDM_GAP, None)

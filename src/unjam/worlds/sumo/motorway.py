@@ -1,18 +1,20 @@
 """Traffic on a motorway with lanes and ramps: SUMO drives human-driven vehicles, which overtake; CAVs have an ACC."""
 
 from collections.abc import Sequence
+from itertools import chain
 from math import inf
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.drivers.local_state import LocalState, observe_neighbor
+from unjam.drivers.local_state import LocalState
 from unjam.drivers.roadside import MeasuredVehicles, RoadSections, RoadsideMessages, SpeedMeasurement
 from unjam.drivers.safety import FollowingState
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
+from unjam.worlds.lane_neighbors import find_unsorted_neighbors, neighbors_on_lane, observe_lane
 from unjam.worlds.open_road_log import TrackedLeader
 from unjam.worlds.record import Floats
 from unjam.worlds.sumo.inputs import motorway_inputs
@@ -38,10 +40,8 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         self._measurement = SpeedMeasurement(road.roadside, self._road_sections, limit, step)
         self._messages = RoadsideMessages(road.roadside, step, self.noise_generator)
         self._entered_is_cav: list[bool] = []
-        scenario, ramps = (
-            cast(Motorway, self.scenario),
-            zip(self._geometry.ramps, self._geometry.route_names[1:], strict=True),
-        )
+        scenario = cast(Motorway, self.scenario)
+        ramps = zip(self._geometry.ramps, self._geometry.route_names[1:], strict=True)
         is_controlled = scenario.speed_limit_control.active or scenario.ramp_meter.active
         self._ramp_controls = [
             RampControl(self._simulation, self._speed_caps, scenario, *ramp) for ramp in ramps if is_controlled
@@ -62,13 +62,8 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         self._lane = lane = self._lane_of_edge_lane[edge_lanes]
         self._position = self._edge_lane_starts[edge_lanes] + np.array(simulation.lane_offsets(names), np.float64)
         self._sections = self._geometry.sections(lane, self._position)
-        self._order = order = np.lexsort((self._position, lane))
-        before, after = order[:-1], order[1:]
-        is_same_ramp = (lane[before] > 0) | (self._sections.ramp[before] == self._sections.ramp[after])
-        is_same_lane = (lane[before] == lane[after]) & is_same_ramp
-        self._leader, self._follower = np.full((2, len(names)), -1)
-        self._leader[before[is_same_lane]] = after[is_same_lane]
-        self._follower[after[is_same_lane]] = before[is_same_lane]
+        self._neighbors = find_unsorted_neighbors(lane, self._position, self._geometry)
+        self._leader, self._follower = (neighbors_on_lane(each, lane) for each in self._neighbors)
 
     def _command_humans(self) -> None:
         """Let the road operator control speed limits and meters."""
@@ -104,8 +99,10 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
             lane_speeds, road_speeds = self._receive_speeds_ahead(rows)
             state = state._replace(lane_speeds=lane_speeds, road_speeds=road_speeds)
         if "adjacent_gaps" in fields or "adjacent_speeds" in fields:
-            adjacent_gaps, adjacent_speeds = self._adjacent_vehicles(rows)
-            state = state._replace(adjacent_gaps=adjacent_gaps, adjacent_speeds=adjacent_speeds)
+            motion, lane = (self._position, self._speed, self._length), self._lane[rows]
+            sides = (observe_lane(self._neighbors, rows, lane + each, *motion) for each in (1, -1))  # left, right
+            speeds, gaps = (np.stack(each, -1) for each in zip(*chain(*sides), strict=True))
+            state = state._replace(adjacent_gaps=gaps, adjacent_speeds=speeds)
         factors = np.array([self._speed_factors[name] for name in names])
         return state._replace(
             route_position=position - geometry.origin,
@@ -123,29 +120,11 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
             return None, None
         return self._road_sections.speeds_ahead(self._messages.latest, self._lane[rows], self._position[rows])
 
-    def _adjacent_vehicles(self, rows: NDArray[np.intp]) -> tuple[Floats, Floats]:
-        """Return gaps and speeds of the neighbors on adjacent lanes, as in `LocalState`."""
-        order, lane_offset = self._order, 2.0 * self._geometry.length  # lanes one after the other on one axis
-        along = self._lane[order] * lane_offset + self._position[order]
-        found = list[tuple[Floats, Floats]]()
-        for lane in (self._lane[rows] + 1, self._lane[rows] - 1):  # left, right
-            first_ahead = np.searchsorted(along, lane * lane_offset + self._position[rows])
-            for index, sign in ((first_ahead, 1.0), (first_ahead - 1, -1.0)):
-                other = order[index.clip(0, len(order) - 1)]
-                length = self._length[other if sign > 0.0 else rows]
-                gap = sign * (self._position[other] - self._position[rows]) - length
-                is_present = (index >= 0) & (index < len(order)) & (self._lane[other] == lane)
-                found.append(observe_neighbor(is_present, gap, self._speed[other], self._speed[rows]))
-        return np.stack([gap for _, gap in found], -1), np.stack([speed for speed, _ in found], -1)
-
     def _following_states(self, names: Sequence[str]) -> list[FollowingState]:
         return [state for _, state in self._tracked_leaders(names)]
 
     def _collisions(self) -> tuple[Sequence[str], bool]:
-        """Return the vehicles that collided in the last step; the episode ends if a controlled CAV is one of them.
-
-        Collisions among human drivers are those of their model: they are counted, and SUMO removes the vehicles.
-        """
+        """Return the vehicles that collided; only a controlled CAV ends the episode: SUMO removes human drivers."""
         colliding, _ = super()._collisions()
         return colliding, self.is_controlled and not self.road.cav_ids.isdisjoint(colliding)
 

@@ -165,10 +165,7 @@ def xml_element(tag: str, /, **attributes: Any) -> str:
 
 
 def run_netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
-    """Return the network that netconvert makes in a folder, from the content of files by (option, name).
-
-    Raise `EpisodeError` with netconvert's message if it refuses them.
-    """
+    """Return the network that netconvert makes of files by (option, name); or raise `EpisodeError` with its message."""
     network = folder / "road.net.xml"
     for (_, name), content in files.items():
         (folder / name).write_text(content)
@@ -185,10 +182,7 @@ def run_netconvert(files: dict[tuple[str, str], str], options: list[str], folder
 
 
 def cache_folder() -> Path:
-    """Return the folder for networks: `$UNJAM_CACHE`, or the user's cache folder.
-
-    Raise `InputError` if SUMO would read its name as a list, or as a variable.
-    """
+    """Return the folder for networks; raise `InputError` if SUMO would read its name as a list or a variable."""
     folder = os.environ.get("UNJAM_CACHE") or platformdirs.user_cache_dir("unjam")
     if any(character in folder for character in ",;$%"):
         raise invalid_value("UNJAM_CACHE", folder, "a folder without , ; $ % in its name")

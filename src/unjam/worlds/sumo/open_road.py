@@ -18,8 +18,8 @@ from unjam.worlds.record import Episode, Floats
 from unjam.worlds.road_world import RoadScene
 from unjam.worlds.sumo.inputs import lane_change_parameters
 from unjam.worlds.sumo.networks import network_file, network_geometry
+from unjam.worlds.sumo.road_control import SpeedCaps
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.speed_caps import SpeedCaps
 from unjam.worlds.sumo.traffic import OpenRoadT, Traffic
 from unjam.worlds.world import DriverLog, ProgressCallback
 
@@ -32,10 +32,7 @@ def neighbor_state(
     speeds: Floats,
     leader_gaps: Callable[[NDArray[np.intp], NDArray[np.intp]], Floats],
 ) -> LocalState:
-    """Return the local states of some rows of vehicles; a missing neighbor is -1, or beyond `MAX_OBSERVED_GAP`.
-
-    `leader_gaps` returns the gaps from rows of vehicles to the rows of their leaders [m].
-    """
+    """Return the local states of some rows, given rows of neighbors (-1: none) and a function for gaps [m]."""
     values = [speeds[rows]]
     for neighbors, gaps in ((leaders, leader_gaps(rows, leaders)), (followers, leader_gaps(followers, rows))):
         values += observe_neighbor(neighbors >= 0, gaps, speeds[neighbors], speeds[rows])
@@ -54,10 +51,7 @@ class ActiveVehicles:
         self.arrivals = self.teleports = 0
 
     def update(self, simulation: Simulation, is_cav: Callable[[str], bool]) -> tuple[list[str], Sequence[str]]:
-        """Update after a simulation step, and return the names of vehicles that left and of those that entered.
-
-        `is_cav` decides whether a vehicle that has just entered is a CAV.
-        """
+        """Update after a step, and return the vehicles that left and that entered, which `is_cav` judges."""
         entered, arrived = simulation.departed_vehicles(), simulation.arrived_vehicles()
         teleporting = simulation.teleporting_vehicles()
         self.arrivals += len(arrived)
@@ -86,23 +80,20 @@ class ActiveVehicles:
 class OpenTraffic(Traffic[OpenRoadT]):
     """Common part of the roads with ends.
 
-    A vehicle becomes a CAV at the first control step after its entry; until then a human drives it. Its trip ends with
-    the last control step after which it is still on the road.
+    A vehicle becomes a CAV at the first control step after its entry. Its trip ends with the last control step after
+    which it is still on the road.
     """
 
     _fuel_interval = 1
-    """control steps between two measurements of fuel"""
     _cav_type_template = "cav"
     """vehicle type of a CAV; `{}` stands for its own type"""
 
     # What the kinds of roads do in their own way:
 
     def _network_file(self) -> Path:
-        """Return SUMO's network file."""
         return network_file(cast(BuiltRoad, self.road).network)
 
     def _is_cav(self, name: str) -> bool:
-        """Return whether a vehicle that has just entered is a CAV."""
         return name in self.road.cav_ids
 
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
@@ -112,7 +103,6 @@ class OpenTraffic(Traffic[OpenRoadT]):
         """Command the speeds of human drivers, unless SUMO drives them."""
 
     def _command_cavs(self, speeds: dict[str, float]) -> None:
-        """Command the speeds of CAVs after the next step [m/s]."""
         self._simulation.command_speeds(speeds.keys(), speeds.values())
 
     def _collisions(self) -> tuple[Sequence[str], bool]:
@@ -145,7 +135,6 @@ class OpenTraffic(Traffic[OpenRoadT]):
         return {name: self._log.traffic.snapshots(name, columns) for name in names}
 
     def _branches(self, vehicles: Sequence[str]) -> Sequence[str]:
-        """Return the origin of each vehicle; empty if unknown."""
         return [""] * len(vehicles)
 
     def _make_log(self) -> OpenRoadLog:
@@ -192,9 +181,8 @@ class OpenTraffic(Traffic[OpenRoadT]):
         shield = dict.fromkeys(names, 0.0)
         reductions: dict[str, list[float]] = {name: [] for name in names}
         for _ in range(scenario.steps_per_control_step):
-            active = {
-                name: value for name, value in zip(names, requested, strict=False) if name in self._vehicles.is_cav
-            }
+            values = zip(names, requested, strict=False)
+            active = {name: value for name, value in values if name in self._vehicles.is_cav}
             commanded, safe = self._safe_speeds(active)
             for name, value in safe.items():
                 reductions[name].append(active[name] - value)
@@ -230,7 +218,6 @@ class OpenTraffic(Traffic[OpenRoadT]):
         return speeds, safe
 
     def _simulate(self, cav_speeds: dict[str, float]) -> None:
-        """Simulate one step with these commanded speeds of CAVs [m/s]."""
         self._command_humans()
         self._command_cavs(cav_speeds)
         self._simulation.step()
@@ -336,11 +323,7 @@ class MultiLaneTraffic(OpenTraffic[OpenRoadT]):
         return False
 
     def _command_cavs(self, speeds: dict[str, float]) -> None:
-        """Give a CAV with its own ACC a set-speed cap, or none if it may drive freely.
-
-        SUMO still drives such a CAV: it brakes as hard as its ACC must, and makes room for vehicles that change lanes.
-        A CAV with a commanded speed does neither. Without a leader, the ACC accelerates as commanded.
-        """
+        """Give a CAV with its own ACC, which SUMO still drives, a set-speed cap, or none if it may drive freely."""
         cruise, simulation, names = self.scenario.cruise, self._simulation, list(speeds)
         if self.scenario.actuation != "cruise":
             super()._command_cavs(speeds)

@@ -1,7 +1,6 @@
 """Traffic on a road with one lane: the same vehicles in the same order from the first step to the last.
 
-The inner loop works on lists of plain floats. Between two steps of SUMO the caches are cold, and a NumPy call on 22
-numbers then takes longer than a list comprehension.
+The inner loop works on lists of floats: between two steps of SUMO the caches are cold, and NumPy is slower.
 """
 
 from collections.abc import Sequence
@@ -68,8 +67,7 @@ class OrderedTraffic(Traffic[OrderedRoad]):
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
         """Run the warm-up, then hand the CAVs to the driver unless they stay human (`is_controlled` false).
 
-        Return the CAVs' states in the last minute of the warm-up, one per control step, shape (CAVs, moments), oldest
-        first; None without a warm-up that may be remembered.
+        Return the CAVs' states in the last minute of the warm-up, (CAVs, moments), oldest first, or None.
         """
         scenario, road, history = self.scenario, self.road, None
         self._penetration_rate = road.provided_penetration_rate(self.options.measured_fields)
@@ -132,10 +130,7 @@ class OrderedTraffic(Traffic[OrderedRoad]):
         self._simulation.command_speeds(self.cav_ids, commanded)
 
     def _simulate(self) -> None:
-        """Simulate one step, and add noise to the speeds of human-driven vehicles.
-
-        Three formulas of `physics.kinematics` are inlined here: calls would take a tenth of the episode.
-        """
+        """Simulate one step, and add noise to human drivers' speeds; formulas of `kinematics` are inlined for speed."""
         simulation, positions, step = self._simulation, self._tracked_positions, self.scenario.simulation_step
         if self._commands_humans:
             self._command_humans()

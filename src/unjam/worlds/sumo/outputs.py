@@ -42,11 +42,9 @@ def trip_options(path: Path) -> list[str]:
 
 
 def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
-    """Return the trips in a file that SUMO has closed, in SUMO's order.
+    """Return the trips in a file that SUMO has closed, except those that ended by `warmup_end` [s] or depart later.
 
-    `vehicle_classes` has the vehicle class of each vehicle type. Trips that ended during the warm-up, which ends at
-    `warmup_end` [s], and trips of vehicles that were to depart later are left out. Raise `DiskError` if the file is not
-    complete.
+    `vehicle_classes` has the vehicle class of each vehicle type. Raise `DiskError` if the file is not complete.
     """
     ids, kinds, entrances, times = list[str](), list[str](), list[str](), list[list[float]]()
     try:
@@ -89,11 +87,7 @@ def _vehicle_class(kind: str, vehicle_classes: dict[str, str]) -> str:
 
 
 def read_warnings(log_path: Path) -> tuple[SumoWarning, ...]:
-    """Return the warnings and errors in a complete log, except those that unjam counts itself.
-
-    SUMO must have written it with `aggregate-warnings` at `MAX_EXAMPLES_OPTION` and closed it. Raise `EpisodeError` if
-    it cannot be read.
-    """
+    """Return warnings and errors in a closed log that unjam does not count itself; raise `EpisodeError` without it."""
     try:
         with log_path.open(errors="replace") as file:
             text = file.read(MAX_LOG_BYTES)

@@ -1,5 +1,6 @@
-"""Variable speed limits and ramp meters of a motorway in SUMO."""
+"""Variable speed limits and ramp meters of a motorway in SUMO, and caps of vehicles' speeds from several sources."""
 
+from collections.abc import Hashable
 from math import inf
 from typing import NamedTuple
 
@@ -11,7 +12,6 @@ from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_road import RampGeometry
 from unjam.scenarios.road_control import MEASURED_DOWNSTREAM
 from unjam.worlds.sumo.simulation import Simulation
-from unjam.worlds.sumo.speed_caps import SpeedCaps
 
 QUEUE_GAP = 3.0
 """length of the ramp that a queuing vehicle needs in front of it [m]"""
@@ -19,6 +19,41 @@ BRAKING_DISTANCE = 150.0
 """length of the ramp that stays free for vehicles that enter it at speed [m]"""
 LIMIT_DECELERATION = 1.0
 """braking of vehicles towards a lower speed limit [m/s2]"""
+
+
+class SpeedCaps:
+    """The caps of all vehicles; a vehicle without one has its own maximum speed."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self._caps: dict[str, dict[Hashable, float]] = {}
+        self.own_max_speeds: dict[str, float] = {}
+        """maximum speeds of the vehicles that have a cap, without it [m/s]"""
+
+    def capped(self, source: Hashable) -> list[str]:
+        """Return the vehicles that have a cap from a source; some of them may have left the road."""
+        return [name for name, caps in self._caps.items() if source in caps]
+
+    def set(self, name: str, source: Hashable, cap: float) -> None:
+        """Set the cap of a vehicle on the road from one source [m/s]; infinite: none."""
+        caps = self._caps.get(name)
+        if caps is None:
+            if cap == inf:
+                return
+            caps = self._caps[name] = {}
+            self.own_max_speeds[name] = self._simulation.max_speed(name)
+        if cap < inf:
+            caps[source] = cap
+        elif caps.pop(source, None) is None:
+            return
+        self._simulation.set_max_speed(name, min(self.own_max_speeds[name], *caps.values(), inf))
+        if not caps:
+            self.forget(name)
+
+    def forget(self, name: str) -> None:
+        """Forget a vehicle that has no cap, or has left the road."""
+        self._caps.pop(name, None)
+        self.own_max_speeds.pop(name, None)
 
 
 class ControlledVehicles(NamedTuple):
@@ -32,7 +67,6 @@ class ControlledVehicles(NamedTuple):
     speeds: Floats
     """[m/s]"""
     lengths: Floats
-    """[m]"""
 
 
 class RampControl:
@@ -41,7 +75,6 @@ class RampControl:
     def __init__(
         self, simulation: Simulation, speed_caps: SpeedCaps, scenario: Motorway, ramp: RampGeometry, ramp_edge: str
     ) -> None:
-        """Start with an unlimited speed and no metering."""
         self._simulation, self._speed_caps, self._ramp, self._edge = simulation, speed_caps, ramp, ramp_edge
         self._limits, self._meter = scenario.speed_limit_control, scenario.ramp_meter
         self._lanes, self._speed_limit, self._step = scenario.lanes, scenario.speed_limit, scenario.simulation_step
@@ -49,7 +82,6 @@ class RampControl:
         self._held: list[str] = []
         """vehicles that must stop at the meter, from the first one on"""
         self._known = set[str]()
-        """vehicles of the ramp"""
         self._time, self._wait = 0.0, 0.0
 
     def act(self, vehicles: ControlledVehicles) -> None:

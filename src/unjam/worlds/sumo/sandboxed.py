@@ -20,14 +20,7 @@ from unjam.errors import LostWorkerError, as_unjam_error, error_from_name
 from unjam.processes import PrivateFolder, check_owner, remove_stale_private_folders
 from unjam.sandbox import confine_process, limit_resources
 from unjam.tree import Arrays, pack, unpack
-from unjam.worlds.messages import (
-    answer_requests,
-    has_message,
-    open_answer_pipe,
-    read_message,
-    start_child,
-    write_message,
-)
+from unjam.worlds import messages
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.transports import InUseError
@@ -39,10 +32,9 @@ MAX_ANSWER_SECONDS = 150.0
 
 
 def open_simulation(is_sandboxed: bool) -> Simulation:
-    """Open a simulation, a sandboxed one or one in this process.
+    """Open a sandboxed simulation or one in this process.
 
-    If libsumo already holds one there, unjam's or the user's, it runs in its own process, too, with a warning: another
-    thread may use libsumo at the same time. So it does where SUMO could not read numbers.
+    It is in its own, with a warning, if libsumo holds one here, or could not read numbers.
     """
     if not is_sandboxed and (point := locale.localeconv()["decimal_point"]) != ".":
         warnings.warn(
@@ -90,7 +82,7 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
         self._folder = PrivateFolder()
         with _process_starter_lock:
             starter = _process_starter(os.getpid())
-        start = starter.submit(start_child, "unjam.worlds.sumo.sandboxed", TMPDIR=self._folder.name)
+        start = starter.submit(messages.start_child, "unjam.worlds.sumo.sandboxed", TMPDIR=self._folder.name)
         self._process, self._owner = start.result(), os.getpid()
         self.episode_lock = Lock()
 
@@ -122,10 +114,10 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
             list(each) if hasattr(each, "__iter__") and not isinstance(each, str | dict) else each for each in arguments
         ]
         try:
-            write_message(self._process.stdin, {"call": name, "arguments": lists})
-            if not has_message(self._process.stdout, MAX_ANSWER_SECONDS):
+            messages.write_message(self._process.stdin, {"call": name, "arguments": lists})
+            if not messages.has_message(self._process.stdout, MAX_ANSWER_SECONDS):
                 raise LostWorkerError(f"SUMO was lost: it did not answer for {MAX_ANSWER_SECONDS:g} s")
-            content, arrays = read_message(self._process.stdout)
+            content, arrays = messages.read_message(self._process.stdout)
         except (BrokenPipeError, EOFError):
             raise LostWorkerError(f"SUMO was lost: its process ended with code {self._process.wait()}") from None
         except BaseException:  # silence, or an interrupt: the next call would take this answer for its own
@@ -161,10 +153,10 @@ def _return_type(name: str) -> Any:
 def _answer_request(simulation: Simulation, output: IO[bytes], request: dict[str, Any], arrays: Arrays) -> None:
     try:
         answer, arrays = pack(_execute(simulation, request["call"], request["arguments"]))
-        write_message(output, {"answer": answer}, arrays)
+        messages.write_message(output, {"answer": answer}, arrays)
     except Exception as error:
         unjam_error = as_unjam_error(error)
-        write_message(output, {"error": [type(unjam_error).__name__, str(unjam_error)]})
+        messages.write_message(output, {"error": [type(unjam_error).__name__, str(unjam_error)]})
 
 
 def _execute(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
@@ -178,7 +170,7 @@ def _execute(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
 
 
 if __name__ == "__main__":
-    answer_pipe = open_answer_pipe()
+    answer_pipe = messages.open_answer_pipe()
     enter_sandbox()
     with Simulation(owns_stdout=True) as own_simulation:
-        answer_requests(partial(_answer_request, own_simulation, answer_pipe))
+        messages.answer_requests(partial(_answer_request, own_simulation, answer_pipe))

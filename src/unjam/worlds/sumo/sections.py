@@ -15,7 +15,6 @@ from unjam.worlds.sumo.networks import NetworkLane
 from unjam.worlds.sumo.simulation import Simulation
 
 NO_SECTION = -1
-"""section beyond the end of a route"""
 MAX_QUEUE_LENGTH = 1000.0
 """distance before a stop line within which slow vehicles may be its queue: no congestion is reported there [m]"""
 MIN_MONITORED_LENGTH = 50.0
@@ -34,7 +33,6 @@ class LaneSections:
             (lane, number) for lane, count in zip(self._lanes.values(), counts, strict=True) for number in range(count)
         ]
         self.speed_limits: Floats = np.array([lane.speed_limit for lane, _ in sections])
-        """speed limits [m/s]"""
         rows: dict[tuple[str, int], int] = {}
         cross_sections = [rows.setdefault((lane.edge, number), len(rows)) for lane, number in sections]
         self.cross_sections = np.array(cross_sections, np.intp)
@@ -48,20 +46,17 @@ class LaneSections:
         return lane in self._lanes
 
     def measure(self, lane_positions: Sequence[tuple[str, float]], speeds: Floats) -> tuple[Floats, Floats]:
-        """Return the number of vehicles in each section, and the sum of their speeds [m/s].
-
-        `lane_positions` are the vehicles' lanes and positions along them [m].
-        """
+        """Return the number of vehicles in each section, and the sum of their speeds [m/s]; positions in [m]."""
         count = len(self.speed_limits)
         cells = [self._section_at(*each) if each[0] in self else count for each in lane_positions]
         vehicles, total = (np.bincount(cells, weight, count + 1)[:count] for weight in (None, speeds))
         return vehicles.astype(np.float64), total.astype(np.float64)
 
     def sections_ahead(self, lane: str, position: float, route: Sequence[str]) -> list[int]:
-        """Return a vehicle's own section and those ahead; `route` has its edge and the following ones.
+        """Return a vehicle's own section and those ahead, which contain the centers of the next 100 m ranges.
 
-        The sections ahead contain the centers of the next 100 m ranges. If a lane does not follow the route, its
-        adjacent lane does; beyond the end of the route is `NO_SECTION`.
+        `route` has its edge and the following ones. Where a lane does not follow it, an adjacent lane does; beyond its
+        end is `NO_SECTION`.
         """
         sections, edges, length = [self._section_at(lane, position)], iter(route[1:]), self._lanes[lane].length
         end = min((position // ROAD_SECTION_LENGTH + 1) * ROAD_SECTION_LENGTH, length)
@@ -92,11 +87,9 @@ class RoadsideService:
     """Roadside information for CAVs; in a junction, that of the last lane before it."""
 
     def __init__(self, simulation: Simulation, messages: RoadsideMessages, step: float) -> None:
-        """Start without measurements; `step` is the time between two measurements [s]."""
         self._simulation, self._messages, self._sections = simulation, messages, LaneSections(simulation)
         self._monitor = CongestionMonitor(1 + int(self._sections.cross_sections.max()), step)
         self._last_sections: defaultdict[str, list[int]] = defaultdict(lambda: [NO_SECTION] * SECTIONS_AHEAD)
-        """sections ahead of each CAV when it was last on a lane"""
         self._desired_speeds: dict[str, tuple[float, float]] = {}
         """desired speed over the speed limit, and maximum speed [m/s], of each CAV"""
 

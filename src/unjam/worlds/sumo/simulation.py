@@ -73,9 +73,8 @@ def loop_name(number: int) -> str:
 class Simulation(AbstractContextManager["Simulation"]):
     """One SUMO simulation, loaded again for each episode.
 
-    libsumo holds one simulation per process and silently replaces the first by a second. So this class
-    refuses to open another while one is open, including the user's own, and detects if other code in the
-    process starts, steps or closes one meanwhile. Over TraCI there may be several, each in its own process.
+    libsumo silently replaces the simulation of a process by a second one. So this class refuses to open another, and
+    detects if other code starts, steps or closes one meanwhile. Over TraCI each has its own process.
     """
 
     is_sandboxed = False
@@ -83,10 +82,7 @@ class Simulation(AbstractContextManager["Simulation"]):
     def __init__(
         self, transport: Transport = "libsumo", gui_options: Sequence[str] = (), owns_stdout: bool = False
     ) -> None:
-        """Open a simulation; nothing runs before `load`. Raise `InUseError` if libsumo already runs one here.
-
-        `gui_options` are for SUMO's window. `owns_stdout`: this process prints nothing else while SUMO starts.
-        """
+        """Open a simulation; raise `InUseError` if libsumo already runs one. `owns_stdout`: nothing else is printed."""
         if "," in (folder := gettempdir()):  # separates the names of SUMO's files
             raise invalid_value("TMPDIR", folder, "a folder without , in its name")
         self.transport = transport
@@ -121,7 +117,6 @@ class Simulation(AbstractContextManager["Simulation"]):
             return lambda ids: list(map(function, ids))
 
         self.speeds = call_for_each("getSpeed")
-        """speeds of vehicles [m/s]"""
         self.lane_offsets = call_for_each("getLanePosition")
         """positions of vehicles along their lanes [m]"""
         self.distances = call_for_each("getDistance")
@@ -129,14 +124,11 @@ class Simulation(AbstractContextManager["Simulation"]):
         self.fuel = call_for_each("getFuelConsumption")
         """fuel rates of vehicles in the last step [mg/s], by their emission class"""
         self.now: Callable[[], float] = call("simulation", "getTime")
-        """SUMO's time [s]"""
         self.max_speed: Callable[[str], float] = call("vehicle", "getMaxSpeed")
         """maximum speed of a vehicle, whatever the road allows [m/s]"""
         self.set_max_speed: Callable[[str, float], object] = call("vehicle", "setMaxSpeed")
         self.set_time_gap: Callable[[str, float], object] = call("vehicle", "setTau")
-        """sets the time gap that a vehicle keeps [s]"""
         self.vehicles_on_lane: Callable[[str], Sequence[str]] = call("lane", "getLastStepVehicleIDs")
-        """vehicles with their front bumper on a lane"""
         self.vehicle_count: Callable[[], int] = call("vehicle", "getIDCount")
         self.departed_vehicles: Callable[[], Sequence[str]] = call("simulation", "getDepartedIDList")
         """vehicles that entered the road in the last step"""
@@ -146,7 +138,6 @@ class Simulation(AbstractContextManager["Simulation"]):
         """vehicles that SUMO teleported in the last step; below: those that it reinserted"""
         self.reinserted_vehicles: Callable[[], Sequence[str]] = call("simulation", "getEndingTeleportIDList")
         self.colliding_vehicles: Callable[[], Sequence[str]] = call("simulation", "getCollidingVehiclesIDList")
-        """vehicles that collided in the last step"""
         self._vehicles_on_loop = call("inductionloop", "getVehicleData")
         self.pending_vehicles: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
 
@@ -157,8 +148,8 @@ class Simulation(AbstractContextManager["Simulation"]):
     def load(self, inputs: SumoInputs, step: float, seed: int) -> None:
         """Start an episode: load network and traffic, and insert the first vehicles.
 
-        Raise `SumoInputError` with SUMO's reason if it refuses the files, `LostWorkerError` if other code of this
-        process has changed the simulation, and `EpisodeError` for other reasons.
+        Raise `SumoInputError` if SUMO refuses the files, `LostWorkerError` if other code has changed the simulation,
+        and `EpisodeError` for other reasons.
         """
         self.check()
         self._traffic_file.write_text(inputs.traffic_xml, encoding="utf-8")
@@ -252,10 +243,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         return list(zip(map(self._sumo.vehicle.getSpeedFactor, ids), map(self.max_speed, ids), strict=True))
 
     def neighbors(self, ids: Sequence[str], max_distance: float) -> list[NeighborStates]:
-        """Return the vehicles' neighbors as SUMO sees them.
-
-        A neighbor beyond `max_distance` [m] counts as missing: it has the vehicle's speed, and this distance.
-        """
+        """Return the vehicles' neighbors as SUMO sees them; beyond `max_distance` [m], this gap and their own speed."""
         return [self._neighbors_of(name, max_distance) for name in ids]
 
     def _neighbors_of(self, name: str, max_distance: float) -> NeighborStates:
@@ -301,11 +289,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         self.set_max_speed(name, max_speed)
 
     def change_type(self, name: str, kind: str, is_modified_later: bool = False) -> None:
-        """Change the type of a vehicle without changing its speed factor, which SUMO would draw again.
-
-        SUMO also draws it again when a property of the vehicle itself changes for the first time. With
-        `is_modified_later`, this change is made here.
-        """
+        """Change the type of a vehicle but not its speed factor, now and when its properties are first modified."""
         vehicle = self._sumo.vehicle
         factor = vehicle.getSpeedFactor(name)
         vehicle.setType(name, kind)
@@ -349,8 +333,7 @@ class Simulation(AbstractContextManager["Simulation"]):
     ) -> None:
         """Make vehicles CAVs, which obey `command_speeds`, with or without right of way.
 
-        Their new type is `type_template`, in which `{}` stands for the old one. `parameters` are further parameters of
-        the vehicles, by SUMO's names.
+        In `type_template`, `{}` stands for the old type; `parameters` are further ones, by SUMO's names.
         """
         for name in ids:
             self.change_type(name, type_template.format(self.type_of(name)), actuation == "cruise")
@@ -359,10 +342,9 @@ class Simulation(AbstractContextManager["Simulation"]):
                 self._sumo.vehicle.setParameter(name, key, value)
 
     def passages(self, loops: Sequence[InductionLoop], steps: int) -> list[DetectorPassage]:
-        """Simulate a number of steps, or until no vehicle is expected, and return the passages over these loops.
+        """Simulate steps, until no vehicle is expected, and return the passages over these loops.
 
-        A vehicle that leaves a loop by changing lanes counts without a speed, as with SUMO's own detectors
-        (https://sumo.dlr.de/docs/Simulation/Output/Induction_Loops_Detectors_(E1).html).
+        A vehicle that leaves a loop by changing lanes counts without a speed, as with SUMO's own detectors.
         """
         found: dict[tuple[int, str, float], DetectorPassage] = {}
         for _ in range(steps):

@@ -23,7 +23,6 @@ ODOMETER_RELATIVE_TOLERANCE = 1e-10
 """the same relative to the distance driven: sums of many steps are rounded"""
 WARMUP_PROGRESS_STEPS = 10
 NO_SPEED_COMMAND = -1.0
-"""speed command with which SUMO drives"""
 
 RoadT = TypeVar("RoadT", bound=Road)
 OpenRoadT = TypeVar("OpenRoadT", bound=OpenRoad)
@@ -42,7 +41,6 @@ class Traffic(SimulatedRoad, Generic[RoadT]):
         options: WorldOptions,
         drawn: DrawnRoad | None = None,
     ) -> None:
-        """Put the vehicles on the road; nothing moves yet."""
         super().__init__(scenario, seed, drawn)
         self.options, self._simulation = options, simulation
         simulation.load(self.inputs(scenario, self.road), scenario.simulation_step, sumo_seed(self.seed))
@@ -76,10 +74,7 @@ class Traffic(SimulatedRoad, Generic[RoadT]):
             raise EpisodeError(f"positions differ from SUMO's odometer by {error:.2g} m")
 
     def record(self, driver_log: DriverLog) -> Episode:
-        """Return the record since the start, with SUMO's warnings; this ends SUMO.
-
-        Raise `LostWorkerError` if other code has changed the simulation.
-        """
+        """Return the record since the start, with SUMO's warnings; this ends SUMO."""
         self._simulation.check()
         episode = self._make_record(driver_log)
         return replace(episode, warnings=self._simulation.finish())

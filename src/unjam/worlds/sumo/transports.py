@@ -1,7 +1,6 @@
 """Transports to SUMO, and the only module that imports libsumo or traci; `sandboxed` puts one into another process.
 
-Both libraries keep state of the whole process, in which the user may run another simulation. unjam never closes, steps
-or replaces it, and the user's TraCI connection stays the active one.
+unjam never closes, steps or replaces the user's simulation in this process, and their TraCI connection stays active.
 """
 
 import importlib
@@ -53,7 +52,6 @@ class Libsumo:
         """the error log of the running simulation, by which it is identified; None: it does not run"""
         self._step_count, self._begin_time = 0, 0.0
         self.has_refused = False
-        """whether a step has failed since the start"""
         self._is_claimed = _libsumo_lock.acquire(blocking=False)
         if not self._is_claimed or self._is_loaded():
             self.close()
@@ -207,10 +205,7 @@ def close_sumo(sumo: Any) -> None:
 
 
 def sumo_function(sumo: Any, domain: str, name: str) -> Callable[..., Any]:
-    """Return a function of libsumo or traci; of libsumo the compiled one, without its Python wrapper.
-
-    The wrapper only passes its arguments on, and takes a third of the time of a call.
-    """
+    """Return a function of libsumo or traci; of libsumo without its Python wrapper, a third of the time of a call."""
     compiled = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
     wrapper = sumo.simulationStep if name == "step" else getattr(getattr(sumo, domain), name)
     return getattr(compiled, f"{domain}_{name}", wrapper)

@@ -76,10 +76,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         return is_cav
 
     def _is_selected(self, name: str) -> bool:
-        """Return whether a vehicle may be a CAV: by its type, or by a hash of its id and the seed.
-
-        So the same vehicles are CAVs for every driver, even if a vehicle enters later because of the driver.
-        """
+        """Return whether a vehicle may be a CAV with every driver: by its type, or a hash of its id and the seed."""
         road, kind = self.road, self._simulation.type_of(name)
         if kind in road.cav_types:
             return True
@@ -168,11 +165,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         return [self._cached_neighbors[name] for name in names]
 
     def _collisions(self) -> tuple[Sequence[str], bool]:
-        """Return SUMO's collisions under the user's settings, plus CAVs in contact with their leader.
-
-        With `collision.action` none, SUMO reports no collisions. A collision ends the episode if a CAV is involved.
-        Human-only traffic, the baseline, has no CAVs.
-        """
+        """Return SUMO's collisions and CAVs in contact with their leader, and whether that ends the episode."""
         colliding = dict.fromkeys(self._simulation.colliding_vehicles())
         if not self.is_controlled:
             return list(colliding), False
@@ -259,10 +252,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         return replace(episode, trips=trips, contacts=len(self._contact_cavs), slow_entrances=slow)
 
     def _snapshot_fields(self, columns: NDArray[np.intp]) -> dict[str, Any]:
-        """Return the fields for figures; positions are those along the most frequent route.
-
-        Lanes of this route are counted from the left, as roads are usually widened on the right.
-        """
+        """Return the fields for figures: positions along the most frequent route, and its lanes from the left."""
         if not self.options.record_details:
             return super()._snapshot_fields(columns)
         gaps, poses, edge = (self._log.traffic.snapshots(name, columns) for name in ("gaps", "poses", "edge"))

@@ -25,7 +25,6 @@ class CarFollowingModels:
     """The models of all vehicles of a road: CAVs and commanded human drivers."""
 
     def __init__(self, scenario: Scenario, vehicle_count: int, cav_indices: list[int], to_array: ArrayFactory) -> None:
-        """Take the indices of the vehicles that a driver of CAVs commands."""
         self._cav_indices, self._cav_braking = cav_indices, scenario.cav_max_braking
         self.speed_limit, self._step = scenario.top_speed, scenario.simulation_step
         """of the road [m/s]"""

@@ -20,15 +20,8 @@ from unjam.physics.kinematics import gap_on_loop
 from unjam.scenarios.figure_eight import CROSSING_LINK, INNER_LINK, OUTER_LINK, figure_eight_radius, lane_lengths
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import SUMO_ACCELERATION, VEHICLE_LENGTH, Scenario
+from unjam.worlds.batch import human_idm
 from unjam.worlds.batch.figure_eight.car_following import HALTING_SPEED, CarFollowingModels, speed_after_distance
-from unjam.worlds.batch.human_idm import (
-    CONTACT_GAP,
-    FREE_GAP,
-    STANDSTILL_ACCELERATION,
-    SUMO_MIN_GAP,
-    HumanSpeedModel,
-    Leader,
-)
 from unjam.worlds.batch.noise import ArrayFactory
 
 FOE_VISIBILITY_DISTANCE = 4.5
@@ -48,9 +41,7 @@ CONFLICT_AREA_START = CROSSING_LINK / 2.0 - CROSSED_LANE_WIDTH / 2.0
 STOPPING_FOE_DELAY = 30.0
 """additional arrival time of foes that can stop before the crossing [s]"""
 LANE_LENGTH_DIGITS = 6
-"""decimal places of lane lengths in SUMO's networks [m]"""
 COMMANDED_SPEED_TOLERANCE = 1e-9
-"""tolerance of a commanded speed [m/s]"""
 
 
 class CrossingMemory(NamedTuple):
@@ -88,7 +79,6 @@ class _Approach(NamedTuple):
     distance: Array
     """distance to the crossing [m]; negative on it"""
     is_approaching: Array
-    """whether SUMO registers them"""
     approach_speed: Array
     """maximum speed in this step before the crossing [m/s]"""
     stop_speed: Array
@@ -96,9 +86,7 @@ class _Approach(NamedTuple):
     go_speed: Array
     """maximum speed of vehicles that may enter [m/s]"""
     arrival_time: Array
-    """time of arrival at the crossing [s]"""
     leave_time: Array
-    """time of leaving the crossing [s]"""
 
 
 def _last_vehicle(speed: Array, distance_past: Array) -> _Vehicle:
@@ -120,12 +108,9 @@ class FigureEightMovement:
         roads: Sequence[ClosedRoad],
         cav_indices: list[int],
         to_array: ArrayFactory,
-        human_model: HumanSpeedModel | None = None,
+        human_model: human_idm.HumanSpeedModel | None = None,
     ) -> None:
-        """Take roads that cross themselves once, the direction with the right of way first.
-
-        Humans drive the CAVs, which have these indices, until `hand_over`. `human_model` replaces the road's IDM.
-        """
+        """Take roads that cross themselves once; humans drive the CAVs, which have these indices, until `hand_over`."""
         idm = partial(commanded_speed, parameters=scenario.humans, step=scenario.simulation_step)
         self._human_model, self._cav_indices = human_model or idm, cav_indices
         self._models, self._models_with_cavs = (
@@ -154,13 +139,12 @@ class FigureEightMovement:
         """Hand the CAVs over to their driver."""
         self._models = self._models_with_cavs
 
-    def move(self, speed: Array, position: Array, leader: Leader, noise: Array, cav_speeds: Array) -> Array:
-        """Return the speeds after a step [m/s], shape (vehicles, W).
-
-        `noise` is added to each speed; `cav_speeds` are commands, shape (CAVs, W), or None if the CAVs are human.
-        """
+    def move(self, speed: Array, position: Array, leader: human_idm.Leader, noise: Array, cav_speeds: Array) -> Array:
+        """Return the speeds after a step, (vehicles, W), with `noise` [m/s], and commands (CAVs, W) or None."""
         commanded = clamp_min(self._human_model(speed, *leader) + noise, 0.0)
-        is_commanded = ~self._is_on_crossing(position)
+        place = position % self._loop_length
+        (major_start, major_end), (minor_start, minor_end) = self._crossings  # where SUMO drives humans itself
+        is_commanded = ((place < major_start) | (major_end <= place)) & ((place < minor_start) | (minor_end <= place))
         if cav_speeds is not None:
             commanded[self._cav_indices], is_commanded[self._cav_indices] = cav_speeds, True
         return self._next_speeds(speed, position, leader, commanded, is_commanded)
@@ -170,14 +154,8 @@ class FigureEightMovement:
         sumo_position = position + self._position_offset
         return [(sumo_position - side.start) % self._sumo_loop_length for side in self._sides]
 
-    def _is_on_crossing(self, position: Array) -> Array:
-        """Return which vehicles are on the crossing, where SUMO itself drives human-driven vehicles."""
-        place = position % self._loop_length
-        (major_start, major_end), (minor_start, minor_end) = self._crossings
-        return ((major_start <= place) & (place < major_end)) | ((minor_start <= place) & (place < minor_end))
-
     def _next_speeds(
-        self, speed: Array, position: Array, leader: Leader, commanded_speed: Array, is_commanded: Array
+        self, speed: Array, position: Array, leader: human_idm.Leader, commanded_speed: Array, is_commanded: Array
     ) -> Array:
         """Return the speeds after a step [m/s], shape (vehicles, W), and update the memory."""
         xp, models = namespace(speed), self._models
@@ -186,7 +164,7 @@ class FigureEightMovement:
         distances_past, (major_side, minor_side) = self.distances_past(position), self._sides
         is_visible = leader.gap <= self._visible_distance(look_ahead, distances_past)
         leader_speed = xp.where(is_visible, leader.speed, models.speed_limit)
-        follow_speed = models.follow_speed(speed, leader_speed, xp.where(is_visible, leader.gap, FREE_GAP))
+        follow_speed = models.follow_speed(speed, leader_speed, xp.where(is_visible, leader.gap, human_idm.FREE_GAP))
         motion = speed, leader, free_speed, follow_speed, look_ahead
         major_last, minor_last = (_last_vehicle(speed, each) for each in distances_past)
         safe = xp.minimum(free_speed, follow_speed)
@@ -201,13 +179,14 @@ class FigureEightMovement:
         may_enter, can_brake = self._may_enter(speed, major, minor, first)
         # A vehicle that would have to slow down to enter, and can still stop before the crossing, stops.
         go_speed = minor.go_speed[first]
-        slows_down = go_speed + SUMO_MIN_GAP < xp.minimum(minor.approach_speed, models.max_speed(speed))[first]
+        usual_speed = xp.minimum(minor.approach_speed, models.max_speed(speed))[first]
+        slows_down = go_speed + human_idm.SUMO_MIN_GAP < usual_speed
         slows_down = slows_down & can_brake & (go_speed < speed[first])
         stop_speed = xp.maximum(models.stop_speed(speed, minor.distance), models.min_speed(speed))[first]
         go_speed = xp.where(slows_down, xp.minimum(go_speed, stop_speed), go_speed)
         safe[first] = xp.where(may_enter, go_speed, safe[first])
         uncommanded = models.finalize_speed(speed, safe)
-        uncommanded = uncommanded * (uncommanded > STANDSTILL_ACCELERATION * self._step)
+        uncommanded = uncommanded * (uncommanded > human_idm.STANDSTILL_ACCELERATION * self._step)
         commanded = models.clip_speed(speed, xp.minimum(commanded_speed, safe))
         next_speed = xp.where(is_commanded, commanded, uncommanded)
         self.update_memory(speed, next_speed, distances_past)
@@ -229,7 +208,7 @@ class FigureEightMovement:
     def _approach(
         self,
         speed: Array,
-        leader: Leader,
+        leader: human_idm.Leader,
         free_speed: Array,
         follow_speed: Array,
         look_ahead: Array,
@@ -239,10 +218,7 @@ class FigureEightMovement:
         last: _Vehicle,
         foe: _Vehicle,
     ) -> _Approach:
-        """Return the plans of all vehicles for one side, `last` being the last vehicle past its start.
-
-        `free_speed` is the maximum speed without other vehicles, `follow_speed` that behind the leader [m/s].
-        """
+        """Return the plans of all vehicles for one side, `last` being the last vehicle past its start."""
         xp, models, speed_limit = namespace(speed), self._models, self._models.speed_limit
         is_approaching, is_on_lane = distance <= side.approach_distance, distance <= side.lane_length
         front = xp.where(is_on_lane, -distance, self._sumo_loop_length - distance)
@@ -321,7 +297,7 @@ class FigureEightMovement:
         expected = major.arrival_time + impatience * self._foe_delay(major, arrival, impatience)
         expected = xp.where(arrival < major.arrival_time, expected, major.arrival_time)
         has_room = (major.leave_time < arrival) | (expected > leave + FOE_TIME_MARGIN)
-        moves = major.approach_speed > STANDSTILL_ACCELERATION * self._step
+        moves = major.approach_speed > human_idm.STANDSTILL_ACCELERATION * self._step
         is_blocked = (major.is_approaching & moves & ~has_room).any(0)
         return (distance <= FOE_VISIBILITY_DISTANCE) & minor.is_approaching[first] & ~is_blocked, can_brake
 
@@ -379,17 +355,14 @@ def may_follow_commands(
     motion: tuple[Floats, Floats],
     commanded_speeds: Floats,
 ) -> NDArray[np.bool_]:
-    """Return whether the right of way lets vehicles follow their commands; all have the shape (steps, vehicles).
-
-    `memories` are those of `crossing_memories`; `motion` is speeds [m/s] and positions [m].
-    """
+    """Return whether the right of way allows speeds; `motion`: speeds and positions; all (steps, vehicles)."""
     speed, position, commanded = (each.T for each in (*motion, commanded_speeds))
     roads = [road] * len(commanded_speeds)
     movement = FigureEightMovement(scenario, roads, cav_indices, np.asarray, lambda *_: commanded)
     movement.hand_over()
     movement.restore_memory([CrossingMemory(*each) for each in zip(*memories, strict=True)])
     gap = gap_on_loop(position, np.roll(position, -1, 0), road.loop_length, VEHICLE_LENGTH)
-    leader = Leader(np.roll(speed, -1, 0), gap)
+    leader = human_idm.Leader(np.roll(speed, -1, 0), gap)
     moved = movement.move(speed, position, leader, 0.0, commanded[cav_indices])
     return (np.abs(moved - commanded) < COMMANDED_SPEED_TOLERANCE).T
 
@@ -397,7 +370,7 @@ def may_follow_commands(
 def figure_eight_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
     """Return which vehicles touch the leader on the same lane, or overlap on the crossing; see `ring_contacts`."""
     xp, place = namespace(position), position % loop_length
-    lengths, touches = lane_lengths(figure_eight_radius(loop_length)), gap < CONTACT_GAP
+    lengths, touches = lane_lengths(figure_eight_radius(loop_length)), gap < human_idm.CONTACT_GAP
     if bool(touches.any()):
         lane, end = 0.0 * place, 0.0
         for length in lengths[:-1]:

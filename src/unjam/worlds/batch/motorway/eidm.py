@@ -1,8 +1,7 @@
-"""SUMO's extended intelligent driver model (EIDM) as formulas on arrays.
+"""SUMO's extended intelligent driver model (EIDM) as formulas on arrays of shape (n,) for n vehicles; m/s, m and s.
 
 It is the improved IDM of Treiber and Kesting, with coolness towards vehicles that cut in, a bounded jerk, slow starts,
-and errors in the estimation of gaps and speeds. Arrays have shape (n,) for n vehicles; units are m/s, m and s. Each
-`step` of the simulation has `EIDM_SUBSTEPS` steps of the model. All drivers act in each: SUMO's reaction time is one.
+and errors in the estimation of gaps and speeds. All drivers act in each of the `EIDM_SUBSTEPS` of a simulation step.
 Sources: SUMO's MSCFModel_EIDM (`_v`, `finalizeSpeed`, `slowToStartTerm`); Salles, Kaufmann and Reuss 2020.
 """
 
@@ -28,13 +27,11 @@ START_UP_DURATION, START_UP_SHAPE, START_UP_SHIFT, MIN_START_UP_INTERVAL = 1.2, 
 """duration of a start [s], shape and shift of its profile, and minimum time between two starts [s]"""
 COOLNESS = 0.99
 MAX_JERK = 3.0
-"""maximum jerk [m/s3]"""
 GAP_ERROR_STRENGTH, LEADER_SPEED_ERROR_STRENGTH, DRIVING_ERROR_STRENGTH = 0.1, 0.02, 0.04
 """strengths of the three errors"""
 ESTIMATION_ERROR_TIME, DRIVING_ERROR_TIME = 10.0, 3.0
 """correlation times of the errors [s]"""
 EIDM_EMERGENCY_BRAKING = 9.0
-"""emergency deceleration [m/s2]"""
 EIDM_HALTING_SPEED, LEADER_STANDING_SPEED = 0.1, 0.1
 """speeds below which a vehicle halts, and a leader counts as standing [m/s]"""
 
@@ -195,7 +192,7 @@ def finalize_eidm_speed(
 ) -> tuple[Array, Array]:
     """Return the speeds after a step with bounded jerk and slow starts, and the time of the last start [s].
 
-    `acceleration` is that of the previous step; the step ends at `end_time`; speeds are those of `eidm_speed_bounds`.
+    `acceleration` is that of the previous step; speeds are those of `eidm_speed_bounds`.
     """
     is_rolling = speed > 2.0 * CLUTCH_ENGAGE_SPEED
     change, previous_change = desired - speed, acceleration * step

@@ -1,9 +1,8 @@
 """SUMO's lane changes of human drivers on a motorway, all in one step.
 
-SUMO decides for one vehicle after the other, from front to back. Here, vehicles on the ramp's lane, which must change,
-come first, and then all that gain by a change, which agrees in distribution. From each lane, only one change is
-possible: left from the ramp's lane and the right lane, right from the left lane. Vehicles that must change ask others
-to make room, to go, or to change, too.
+SUMO decides for one vehicle after the other. Here, vehicles on the ramp's lane, which must change, come first, and then
+all that gain by a change, which agrees in distribution. From each lane, only one change is possible: left from the
+ramp's lane and the right lane, right from the left lane. Vehicles that must change ask others to make room.
 Sources: SUMO's MSLaneChanger (`getRealLeader`, `getRealFollower`, `checkChange`) and MSLCM_LC2013 (`_wantsChange`,
 `anticipateFollowSpeed`, `informLeader`, `informFollower`, `slowDownForBlocked`).
 """
@@ -14,20 +13,10 @@ import numpy as np
 
 from unjam.physics.arrays import Array, clamp_min
 from unjam.scenarios.motorway_road import MotorwayGeometry, MotorwaySections
-from unjam.worlds.batch.motorway.vehicles import (
-    ADVICE_FIELDS,
-    NO_ADVICE,
-    NO_VEHICLE,
-    MotorwayDrivers,
-    MotorwayVehicles,
-    as_rows,
-    find_neighbors,
-    find_road_neighbors,
-    neighbors_on_lane,
-)
+from unjam.worlds.batch.motorway.vehicles import ADVICE_FIELDS, NO_ADVICE, MotorwayDrivers, MotorwayVehicles, as_rows
+from unjam.worlds.lane_neighbors import NO_VEHICLE, find_neighbors, find_road_neighbors, neighbors_on_lane
 
 NO_NEIGHBOR_GAP = 1e6
-"""gap without a neighbor [m]"""
 MERGE_LOOK_AHEAD_TIME, LEFT_LOOK_AHEAD_FACTOR = 10.0, 2.0
 """look-ahead time of a mandatory change [s], and its factor for changes to the left"""
 URGENCY_FACTOR = 2.0
@@ -73,12 +62,9 @@ class LaneChangeContext(NamedTuple):
     """`NO_VEHICLE`: none"""
     leader: Neighbor
     target_leader: Neighbor
-    """on the target lane"""
     target_follower: Neighbor
     follower_drivers: MotorwayDrivers
-    """of the target followers"""
     is_leader_blocking: Array
-    """whether the target leader prevents a change"""
     is_follower_blocking: Array
     sections: MotorwaySections
     step: float
@@ -92,7 +78,7 @@ def lane_change_context(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, 
     target_lane = np.where((lane == 0) & is_merging, 1, NO_VEHICLE)
     if geometry.lane_count > 1:
         target_lane = np.where(lane == 1, 2, np.where(lane == 2, 1, target_lane))
-    neighbors = find_road_neighbors(vehicles, geometry)
+    neighbors = find_road_neighbors(vehicles.road, lane, position, geometry)
     drivers, length = vehicles.drivers, geometry.vehicle_length
     section_end = np.where(is_merging, sections.merge_end, geometry.length)
     section_end = np.where(sections.is_before, sections.merge_start, section_end)
@@ -154,11 +140,8 @@ def mandatory_lane_changes(
     rows = np.arange(len(position))[is_urgent]
     if len(rows) == 0:
         return vehicles, is_urgent, is_asked
-    own, cooperative, bias = (
-        vehicles.own_advice.copy(),
-        vehicles.cooperative_advice.copy(),
-        vehicles.speed_bias.copy(),
-    )
+    own, cooperative = vehicles.own_advice.copy(), vehicles.cooperative_advice.copy()
+    bias = vehicles.speed_bias.copy()
     merging = _MergingVehicles(vehicles, context, geometry, rows)
     leader, follower = merging.leader, merging.follower
     planned, own_advice, overtakes = merging.plan_with_leader()
@@ -382,8 +365,7 @@ def _has_change_conflict(vehicles: MotorwayVehicles, changes_lane: Array, geomet
         return conflict
     rows = np.flatnonzero(np.isin(vehicles.road, vehicles.road[merges]))
     vehicles, merges = vehicles.select(rows), merges[rows]
-    neighbors = find_neighbors(vehicles._replace(lane=np.where(merges, 1, vehicles.lane)), 2)
-    ahead, behind = (each[1] for each in neighbors)
+    ahead, behind = (each[1] for each in find_neighbors(vehicles.road, np.where(merges, 1, vehicles.lane), 2))
     position, min_distance = vehicles.position, 2.0 * (geometry.vehicle_length + vehicles.minimum_gap)
     is_tight_ahead = (ahead >= 0) & merges[ahead] & (position[ahead] - position < min_distance)
     is_tight_behind = (behind >= 0) & merges[behind] & (position - position[behind] < min_distance)

@@ -13,21 +13,12 @@ from unjam.drivers.safety import FollowingState
 from unjam.physics.arrays import Floats
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_road import MotorwayRoad
-from unjam.worlds import audit
+from unjam.worlds import audit, record
 from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, MotorwayVehicles
-from unjam.worlds.record import (
-    SHARED_COLUMN_FRAMES,
-    Episode,
-    Trajectory,
-    assign_columns,
-    common_fields,
-    make_trajectory,
-)
 from unjam.worlds.world import DriverLog
 
 Integers = NDArray[np.intp]
 NO_END_STEP = int(np.iinfo(np.intp).max)
-"""last control step of roads without a collision"""
 _DRIVER_KINDS = (audit.HUMAN_DRIVER, audit.CAV_DRIVER, audit.CAV_AFTER_CUT_IN)
 
 
@@ -60,7 +51,6 @@ class MotorwayLog:
         self._leader, self._leader_since = np.full((2, *shape), -1)
         self._step_count, self._steady_following = 0, list[Floats]()
         self._is_recovering = np.zeros(shape, bool)
-        """whether each CAV recovers from a change of leader"""
         self._following_pairs = np.zeros((len(FollowingState._fields), *shape))
         """each CAV and its leader in the last step, with the fields of `FollowingState`"""
 
@@ -102,7 +92,7 @@ class MotorwayLog:
         self._cav_numbers.append(cav_numbers)
         self.states.append(states)
 
-    def make_episodes(self, driver_log: DriverLog, seeds: Sequence[Sequence[int]]) -> tuple[Episode, ...]:
+    def make_episodes(self, driver_log: DriverLog, seeds: Sequence[Sequence[int]]) -> tuple[record.Episode, ...]:
         """Return the record of each road."""
         trips = self._trips(driver_log)
         steady = np.concatenate(self._steady_following, 1) if self._steady_following else np.zeros((5, 0))
@@ -121,7 +111,7 @@ class MotorwayLog:
             )
         return tuple(episodes)
 
-    def _trips(self, driver_log: DriverLog) -> list[list[Trajectory]]:
+    def _trips(self, driver_log: DriverLog) -> list[list[record.Trajectory]]:
         """Return the trips of the CAVs on each road that last at least one control step, in order of entry."""
         counts = [len(each) for each in self._cav_numbers]
         step_index = np.repeat(np.arange(len(counts)), counts)
@@ -131,7 +121,7 @@ class MotorwayLog:
         groups = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1) if len(order) else []
         first, *others = self.states
         states = first.map(lambda *values: np.concatenate(values), *others)
-        trips: list[list[Trajectory]] = [[] for _ in self._roads]
+        trips: list[list[record.Trajectory]] = [[] for _ in self._roads]
         for entry_number, rows in enumerate(sorted(groups, key=lambda group: group[0])):
             road, entry = divmod(int(numbers[rows[0]]), NUMBERS_PER_ROAD)
             end = self.end_steps[road]
@@ -143,7 +133,7 @@ class MotorwayLog:
             applied = np.diff(state.speed) / self._scenario.control_step
             trip = name, entry_number, start, row[rows], state, applied, zeros, zeros
             is_last = bool(step_index[rows[-1]] == end)
-            trips[road].append(make_trajectory(*trip, terminated=is_last, driver_log=driver_log))
+            trips[road].append(record.make_trajectory(*trip, terminated=is_last, driver_log=driver_log))
         return trips
 
     def _make_episode(
@@ -151,10 +141,10 @@ class MotorwayLog:
         road_index: int,
         seed: Sequence[int],
         placements: _Placements,
-        trips: list[Trajectory],
+        trips: list[record.Trajectory],
         backlog: Floats,
         steady_following: Floats,
-    ) -> Episode:
+    ) -> record.Episode:
         road, steps = self._roads[road_index], placements.step_index
         geometry = road.geometry
         moments = min(len(backlog), int(self.end_steps[road_index]) + 1)
@@ -167,7 +157,7 @@ class MotorwayLog:
         cav_ids = dict.fromkeys(each.vehicle for each in trips)
         entries = [road.entries[number] for number in numbers[order].tolist()]
         groups = [(each.name in cav_ids, each.route) for each in entries]
-        columns = assign_columns(first, last, groups, max(1, moments // SHARED_COLUMN_FRAMES))
+        columns = record.assign_columns(first, last, groups, max(1, moments // record.SHARED_COLUMN_FRAMES))
         branches = dict(zip(columns.tolist(), [each.route for each in entries], strict=True))
 
         def as_table(values: Floats) -> Floats:
@@ -175,8 +165,8 @@ class MotorwayLog:
             table[steps, columns[vehicle]] = values
             return table
 
-        return Episode(
-            **common_fields(self._scenario, road, seed, bool(has_crashed)),
+        return record.Episode(
+            **record.common_fields(self._scenario, road, seed, bool(has_crashed)),
             collisions=2 * int(has_crashed),
             vehicle_ids=tuple(each.name for each in entries),
             cav_ids=tuple(cav_ids),
@@ -196,7 +186,7 @@ class MotorwayLog:
             audit=self._audit(road_index, trips, steady_following),
         )
 
-    def _audit(self, road_index: int, trips: list[Trajectory], steady_following: Floats) -> audit.Audit:
+    def _audit(self, road_index: int, trips: list[record.Trajectory], steady_following: Floats) -> audit.Audit:
         first = road_index * len(_DRIVER_KINDS)
         humans, cavs, cut_ins = (self._braking.statistics(first + kind) for kind in _DRIVER_KINDS)
         jerks = [np.abs(np.diff(each.states.speed, 2)).max(initial=0.0) for each in trips]

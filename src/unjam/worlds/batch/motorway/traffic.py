@@ -19,18 +19,15 @@ from unjam.worlds.batch.motorway.lane_changes import change_lanes
 from unjam.worlds.batch.motorway.vehicles import (
     ADVICE_FIELDS,
     NO_ADVICE,
-    LaneNeighbors,
     MotorwayVehicles,
     as_rows,
-    find_road_neighbors,
-    neighbors_on_lane,
     sort_vehicles,
     sorted_rows,
 )
 from unjam.worlds.batch.noise import DrawNormal
+from unjam.worlds.lane_neighbors import LaneNeighbors, find_road_neighbors, neighbors_on_lane
 
 LONG_BEFORE_START = -1000.0
-"""long before an episode starts [s]"""
 LIMIT_ADAPTATION_TIME = 4.0
 """time in which EIDM drivers adapt to a higher limit [s]"""
 FREE_DRIVING_GAP = 500.0
@@ -40,7 +37,6 @@ INSERTION_OFFSET = 0.1
 LEADER_BRAKING_THRESHOLD = 0.5
 """braking that drivers never exceed without a leader [m/s2]"""
 NO_SPEED_CAP = 1e6
-"""speed cap of vehicles without one [m/s]"""
 
 LearnedCorrection = Callable[[Array, Array, Array, Array], Array]
 """A learned model of human drivers: from own speed, leader speed, gap, and known speed after a control step, to the
@@ -48,10 +44,7 @@ difference of the speed after that step [m/s]; arrays of shape (n,)"""
 
 
 class InsertionQueue:
-    """The vehicles of W equal roads that wait to enter, by origin in the order of their entry times.
-
-    Origins are the ramps from upstream to downstream, and then the lanes of the main road from right to left.
-    """
+    """The vehicles of W roads that wait, by origin: ramps from upstream on, then main lanes from the right on."""
 
     def __init__(self, roads: Sequence[MotorwayRoad]) -> None:
         self._roads, self._geometry = list(roads), roads[0].geometry
@@ -160,7 +153,6 @@ class BatchMotorways:
         correction: LearnedCorrection | None = None,
         steps_per_control_step: int = 1,
     ) -> None:
-        """Take empty roads; `correction` is that of a control step."""
         self._correction, self._steps_per_control_step = correction, steps_per_control_step
         self.geometry = roads[0].geometry
         columns = dict.fromkeys(MotorwayVehicles._fields, np.zeros(0)) | {"is_eidm": np.zeros(0, bool)}
@@ -175,7 +167,8 @@ class BatchMotorways:
         """The neighbors of the vehicles."""
         lane = self.vehicles.lane  # a new column if vehicles enter, leave, change lanes or are sorted
         if self._cached_neighbors is None or self._cached_neighbors[0] is not lane:
-            self._cached_neighbors = lane, find_road_neighbors(self.vehicles, self.geometry)
+            found = find_road_neighbors(self.vehicles.road, lane, self.vehicles.position, self.geometry)
+            self._cached_neighbors = lane, found
         return self._cached_neighbors[1]
 
     def replace_roads(self, roads: Sequence[int], source: Self, source_roads: Sequence[int]) -> None:

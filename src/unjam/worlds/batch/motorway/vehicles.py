@@ -1,7 +1,6 @@
-"""The vehicles of W motorways in one table, those of each road from front to back, with their neighbors and drivers.
+"""The vehicles of W motorways in one table, those of each road from front to back, with their drivers.
 
-Arrays have shape (n,) for all n vehicles that are on a road now; units are m/s, m and s. Records and their columns are
-never changed in place: functions return new ones.
+Arrays have shape (n,) for the n vehicles on a road now; m/s, m and s. Functions return new records and columns.
 """
 
 from collections.abc import Callable
@@ -9,20 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unjam.physics.arrays import Array, clamp_max, clamp_min, square_root
+from unjam.physics.arrays import Array, clamp_min, square_root
 from unjam.physics.idm import IDMArrays, desired_gap, fast_power, idm_acceleration
 from unjam.physics.kinematics import next_speed, stopping_distance
-from unjam.scenarios.motorway_road import MotorwayGeometry
 from unjam.worlds.batch.human_idm import SUMO_MIN_GAP
 from unjam.worlds.batch.motorway import eidm
 from unjam.worlds.batch.motorway.eidm import DesiredSpeed, DriverErrors, LeaderMotion
+from unjam.worlds.lane_neighbors import NO_VEHICLE
 
-NO_VEHICLE = -1
-"""row or lane of a vehicle or lane that does not exist"""
 NUMBERS_PER_ROAD = 100_000
 """more than the vehicles that enter a road in an episode"""
 NO_ADVICE = 1e6
-"""advised acceleration of vehicles without advice [m/s2]"""
 ADVICE_FIELDS = ("own_advice", "cooperative_advice", "adjacent_advice")
 MIN_IDM_STOP_DISTANCE = 0.01
 """distance below which an IDM stands [m]"""
@@ -37,7 +33,6 @@ class MotorwayVehicles(NamedTuple):
     """All vehicles."""
 
     road: Array
-    """index of the road, an integer"""
     entry: Array
     """index among the entries of the road, an integer"""
     lane: Array
@@ -49,7 +44,6 @@ class MotorwayVehicles(NamedTuple):
     """acceleration in the last step [m/s2]"""
     time_headway: Array
     max_acceleration: Array
-    """maximum acceleration [m/s2]"""
     braking: Array
     """comfortable deceleration [m/s2]"""
     minimum_gap: Array
@@ -74,7 +68,6 @@ class MotorwayVehicles(NamedTuple):
     own_advice: Array
     """acceleration that helps the own change [m/s2]; `NO_ADVICE`: none"""
     cooperative_advice: Array
-    """acceleration that helps the change of another vehicle"""
     adjacent_advice: Array
     """acceleration that avoids passing on the right, or lets a stuck vehicle merge"""
     speed_bias: Array
@@ -147,7 +140,7 @@ class MotorwayDrivers(NamedTuple):
     def safe_speed(self, gap: Array, leader_speed: Array, leader_braking: Array, step: float) -> Array:
         """Return the maximum speed from which drivers that brake a headway later stop behind leaders that brake.
 
-        Source: SUMO's MSCFModel (`maximumSafeFollowSpeed`), for all drivers; gaps are beyond the minimum gap.
+        Source: SUMO's MSCFModel (`maximumSafeFollowSpeed`); gaps are beyond the minimum gap.
         """
         braking = self.parameters.comfortable_deceleration
         change, delay = braking * step, self.parameters.time_headway / step
@@ -189,13 +182,6 @@ def _idm_stop_speed(speed: Array, distance: Array, parameters: IDMArrays, step: 
     return _idm_follow_speed(speed, distance, 0.0 * speed, near, step) * (distance >= MIN_IDM_STOP_DISTANCE)
 
 
-class LaneNeighbors(NamedTuple):
-    """Rows of the nearest vehicles ahead and behind on each lane, shape (lanes, n); `NO_VEHICLE`: none."""
-
-    leaders: Array
-    followers: Array
-
-
 def vehicle_numbers(vehicles: MotorwayVehicles) -> Array:
     """Return road and entry of each vehicle as one number."""
     return vehicles.road * NUMBERS_PER_ROAD + vehicles.entry
@@ -219,33 +205,3 @@ def sorted_rows(vehicles: MotorwayVehicles) -> Array:
 def sort_vehicles(vehicles: MotorwayVehicles) -> MotorwayVehicles:
     """Return the vehicles road by road, from front to back."""
     return vehicles.select(sorted_rows(vehicles))
-
-
-def find_neighbors(vehicles: MotorwayVehicles, lane_count: int) -> LaneNeighbors:
-    """Return the neighbors of sorted vehicles."""
-    road, count = vehicles.road, len(vehicles.road)
-    found = np.empty((2, lane_count, count), np.intp)
-    for lane, (leaders, followers) in enumerate(found.swapaxes(0, 1)):
-        rows = np.flatnonzero(vehicles.lane == lane)
-        distances = np.diff(np.concatenate([[-1], rows, [count]]))
-        leaders[:] = np.concatenate([[NO_VEHICLE], rows]).repeat(distances)[:-1]
-        followers[:] = np.concatenate([rows, [NO_VEHICLE]]).repeat(distances)[1:]
-    return LaneNeighbors(*np.where((found >= 0) & (road[found] == road), found, NO_VEHICLE))
-
-
-def find_road_neighbors(vehicles: MotorwayVehicles, geometry: MotorwayGeometry) -> LaneNeighbors:
-    """Return the neighbors of sorted vehicles on all lanes; on lane 0, vehicles of different ramps are none."""
-    found = find_neighbors(vehicles, geometry.lane_count + 1)
-    if len(geometry.ramps) > 1:
-        ramp = geometry.sections(vehicles.lane, vehicles.position).ramp
-        for rows in found:
-            rows[0, (vehicles.lane == 0) & (ramp[rows[0]] != ramp)] = NO_VEHICLE
-    return found
-
-
-def neighbors_on_lane(neighbors: Array, lane: Array) -> Array:
-    """Return each vehicle's neighbor on a lane given for each; `NO_VEHICLE` for lanes that do not exist."""
-    lane_count = neighbors.shape[0]
-    rows = np.arange(neighbors.shape[1])
-    found = neighbors[clamp_max(clamp_min(lane, 0), lane_count - 1), rows]
-    return np.where((lane >= 0) & (lane < lane_count), found, NO_VEHICLE)

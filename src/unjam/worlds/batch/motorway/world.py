@@ -1,7 +1,4 @@
-"""W motorways as one world: CAVs reduce the set speeds of their own ACCs, as in SUMO.
-
-The rows of CAVs are in the order in which they entered, regardless of their road.
-"""
+"""W motorways as one world: CAVs, in rows by order of entry, reduce the set speeds of their own ACCs, as in SUMO."""
 
 from collections.abc import Collection, Sequence
 from typing import NamedTuple, Self, cast
@@ -10,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, batch_commanded_accelerations, commanded_time_gaps
-from unjam.drivers.local_state import LocalState, observe_neighbor
+from unjam.drivers.local_state import LocalState
 from unjam.drivers.roadside import MeasuredVehicles, RoadSections, RoadsideMessages, SpeedMeasurement
 from unjam.errors import InputError
 from unjam.physics.arrays import Array, Floats, replace_padded_rows
@@ -20,8 +17,9 @@ from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.worlds.batch.human_idm import CONTACT_GAP
 from unjam.worlds.batch.motorway.record import NO_END_STEP, MotorwayLog
 from unjam.worlds.batch.motorway.traffic import NO_SPEED_CAP, BatchMotorways, LearnedCorrection, enable_acc
-from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, find_rows, neighbors_on_lane, vehicle_numbers
+from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, find_rows, vehicle_numbers
 from unjam.worlds.batch.noise import ArrayFactory
+from unjam.worlds.lane_neighbors import neighbors_on_lane, observe_lane
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import Outcome, time_gap
 from unjam.worlds.worker_pool import EpisodeTask
@@ -36,9 +34,7 @@ class ReplayOptions(NamedTuple):
     control_steps: int
     """number of control steps after which the replay ends"""
     has_driver_errors: bool
-    """whether human drivers make errors"""
     correction: LearnedCorrection | None
-    """correction of the speeds of human drivers"""
 
 
 class MotorwayBatch:
@@ -57,10 +53,7 @@ class MotorwayBatch:
         replay: ReplayOptions | None = None,
         keep_record: bool = True,
     ) -> None:
-        """Take empty roads, one for each seed; `explore` is the factor of exploration noise on each.
-
-        `keep_record`: whether to keep whole episodes, some 10 MB for each road and 1,000 control steps.
-        """
+        """Take empty roads, one for each seed; whole episodes take 10 MB a road and 1,000 control steps."""
         self._exploration_scales = np.ones(len(seeds)) if explore is None else np.array(explore)
         self.scenario, self._seeds, self._replay, self._keep_record = scenario, seeds, replay, keep_record
         drawn = [scenario.draw_from_seed(seed) for seed in seeds]
@@ -84,16 +77,12 @@ class MotorwayBatch:
         self._cav_numbers: NDArray[np.intp] = np.zeros(0, np.intp)
         """road and entry of each CAV as one number, in order of entry"""
         self._cav_entry_counts = np.zeros(len(seeds))
-        """number of CAVs that have entered each road"""
         self._start_steps = np.zeros(len(seeds), np.intp)
         """number of control steps of the batch before the episode of each road"""
         self.backlogs = np.zeros(len(seeds), np.intp)
-        """insertion backlog of each road now"""
         self._cav_speeds_before = np.zeros(0)
-        """speeds of the CAVs before the last control step [m/s]"""
         self._is_controlled, self._has_time_gap_commands = False, False
         self._episode_noise: Floats | None = None
-        """per-episode exploration noise of each road"""
         self._log = MotorwayLog(self.roads, scenario)
 
     def _draw_errors(self, shape: tuple[int, ...]) -> Floats:
@@ -159,8 +148,7 @@ class MotorwayBatch:
     def replace_roads(self, roads: Sequence[int], source: Self, source_roads: Sequence[int]) -> None:
         """Continue on some roads with those of another batch that has just been started, which are empty.
 
-        `roads` and `source_roads` have equal lengths. Both batches keep no record, and have the same scenario. Roadside
-        information must not be that of detectors: their intervals are those of the batch.
+        Both keep no record and have the same scenario, without detectors, whose intervals are those of the batch.
         """
         rows = np.flatnonzero(~np.isin(self.cav_roads, roads))
         self._cav_numbers, self.cav_count = self._cav_numbers[rows], len(rows)
@@ -251,16 +239,10 @@ class MotorwayBatch:
 
     def _exact_state(self) -> LocalState:
         traffic, vehicles = self._traffic, self._traffic.vehicles
-        rows, neighbors, geometry = find_rows(self._cav_numbers, vehicles), traffic.neighbors, traffic.geometry
+        rows, geometry = find_rows(self._cav_numbers, vehicles), traffic.geometry
         roads, _, lane, position, speed = (each[rows] for each in vehicles[:5])
-
-        def neighbor_state(neighbors: NDArray[np.intp], lane_offset: int, direction: float) -> tuple[Floats, Floats]:
-            row = neighbors_on_lane(neighbors[:, rows], lane + lane_offset)
-            gap = direction * (vehicles.position[row] - position) - geometry.vehicle_length
-            return observe_neighbor(row >= 0, gap, vehicles.speed[row], speed)
-
-        sides = ((neighbors.leaders, 1.0), (neighbors.followers, -1.0))
-        own, left, right = ([neighbor_state(each, offset, sign) for each, sign in sides] for offset in (0, 1, -1))
+        motion = vehicles.position, vehicles.speed, np.broadcast_to(geometry.vehicle_length, vehicles.speed.shape)
+        own, left, right = (observe_lane(traffic.neighbors, rows, lane + each, *motion) for each in (0, 1, -1))
         limit = geometry.speed_limits(lane, geometry.sections(lane, position))
         lane_speeds, road_speeds = self._road_sections.speeds_ahead(self._messages.latest, lane, position, roads)
         if self.roads[0].roadside.source == "none":

@@ -26,17 +26,10 @@ def make_ring_episodes(
     driver_log: DriverLog,
     penetration_rate: float | None,
 ) -> tuple[Episode, ...]:
-    """Return the record of each ring until its last control step.
+    """Return the record of each of `rings`: scenario, road, seed, number of control steps, and whether it has crashed.
 
-    Vehicles that touched may be separate again at the end, because a control step has several simulation steps.
-
-    Args:
-        rings: scenario, road, seed, number of control steps, and whether there was a collision.
-        start_positions: front bumpers at the start [m], shape (vehicles, W).
-        series: those of `OrderedRoadLog` by name; arrays of shape (vehicles, W) or (CAVs * W,) for each step.
-        find_contacts: see `FindContacts`.
-        driver_log: the driver's decisions.
-        penetration_rate: as reported to the CAVs; None: not reported.
+    `start_positions` are front bumpers [m], (vehicles, W); `series` those of `OrderedRoadLog` by name, (vehicles, W) or
+    (CAVs * W,) for each step; `penetration_rate` is that reported to the CAVs.
     """
     last = driver_log.last_observation
     decisions = [tuple(map(as_numpy, decision)) for decision in driver_log.decisions]
@@ -56,6 +49,7 @@ def make_ring_episodes(
         position = motion[1][:, -1]
         # The leader's position is not wrapped: a vehicle that touches its leader may be a little beyond it.
         gaps = np.append(position[1:], position[0] + road.loop_length) - position - VEHICLE_LENGTH
+        # Vehicles that touched may be separate again: a control step has several simulation steps.
         touches = find_contacts(position, gaps, road.loop_length)
         is_touched = np.roll(touches & (gaps < CONTACT_GAP), 1)  # on a crossing, `touches` contains both vehicles
         collisions = max(2 * int(has_crashed), int((touches | is_touched).sum()))

@@ -15,10 +15,7 @@ from unjam.worlds.ordered_road import without_loop
 
 
 class RecordedBatch(RingBatch):
-    """W recorded roads of one platoon, each with its own seed and recording; they equal SUMO's except for rounding.
-
-    After the end of its recording, a road is simulated behind a vehicle of constant speed, and no longer counted.
-    """
+    """W recorded roads of one platoon, each with its own seed and recording; they equal SUMO's except for rounding."""
 
     _road_arrays = (*RingBatch._road_arrays, "_next_samples", "_road_ends")
 
@@ -29,10 +26,10 @@ class RecordedBatch(RingBatch):
         to_array: ArrayFactory = np.asarray,
         **options: Any,
     ) -> None:
-        """Put the vehicles on the roads; arguments as of `RingBatch`."""
         super().__init__(scenarios, seeds, to_array, **options)
         recorded = [np.asarray(road.replayed_speeds) for road in self.roads]
         longest = max(map(len, recorded))
+        # After the end of its recording, a road is simulated behind a vehicle of constant speed, and no longer counted.
         padded = [np.pad(speeds, (0, longest - len(speeds)), "edge") for speeds in recorded]
         self._replayed_speeds, self._next_samples = to_array(np.stack(padded, 1)), to_array(np.ones(len(recorded)))
         self._columns = np.arange(len(recorded))
@@ -40,7 +37,7 @@ class RecordedBatch(RingBatch):
         self._ends = to_array(np.minimum(counts, scenarios[0].horizon).astype(np.float64))
         self._road_ends = to_array(np.array([road.network.edges[0].length for road in self.roads]))
         self._noise_scale[-1] = 0.0
-        self._find_contacts = platoon_contacts
+        self._find_contacts = lambda position, gap, loop_length: gap < CONTACT_GAP
 
     @property
     def is_running(self) -> Array:
@@ -78,8 +75,3 @@ class RecordedBatch(RingBatch):
         replayed = self._replayed_speeds[as_indices(self._next_samples), self._columns][None]
         self._next_samples = clamp_max(self._next_samples + 1.0, len(self._replayed_speeds) - 1.0)
         return xp.concatenate([moved[:-1], replayed]), xp.concatenate([speeds[:-1], replayed])
-
-
-def platoon_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
-    """Return which vehicles touch the vehicle ahead; shapes as of `ring_contacts`."""
-    return gap < CONTACT_GAP

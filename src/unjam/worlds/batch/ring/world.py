@@ -1,8 +1,7 @@
-"""W rings as one world, stepped as arrays without the simulator.
+"""W rings as one world, stepped as arrays of shape (vehicles, W), in road order, without the simulator.
 
-Arrays have the vehicles of a ring along their first axis, in road order, and the rings along their second. The first
-row of the vehicles' speeds is repeated at the end, so that the leaders' speeds are a slice. The CAVs' rows are those of
-the first CAV of every ring, then of the second one, and so on.
+The first row of the vehicles' speeds is repeated at the end, so that the leaders' speeds are a slice. The CAVs' rows
+are those of the first CAV of every ring, then of the second one, and so on.
 """
 
 from collections.abc import Collection, Sequence
@@ -21,16 +20,8 @@ from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, replace
 from unjam.physics.kinematics import gap_on_loop, next_position, next_speed
 from unjam.scenarios.road import ClosedRoad, OrderedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
+from unjam.worlds.batch import human_idm
 from unjam.worlds.batch.figure_eight.crossing import CrossingMemory, FigureEightMovement, figure_eight_contacts
-from unjam.worlds.batch.human_idm import (
-    CONTACT_GAP,
-    HumanSpeedModel,
-    Leader,
-    human_idm_speed,
-    human_parameters,
-    human_ring_speed,
-    ring_contacts,
-)
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, NoiseState, QuickNoise, SeededNoise, WorldSeeds
 from unjam.worlds.batch.ring.record import as_numpy, make_ring_episodes
 from unjam.worlds.ordered_road import MAX_RECALL_SECONDS
@@ -50,19 +41,16 @@ class WarmUpState(NamedTuple):
     gap: Floats
     """gaps to the vehicle ahead [m], shape (vehicles,)"""
     has_crashed: bool
-    """whether human drivers collided"""
     noise: NoiseState
     history: LocalState | None
     """what the CAVs observed in the last minute, shape (CAVs, moments); None if it is not remembered"""
     crossing_memory: CrossingMemory | None = None
-    """memory of the crossing of a figure eight; None on rings"""
 
 
 class RingBatch:
     """W closed roads of one kind, each with its own seed; rings equal SUMO's except for rounding.
 
-    With quick noise, human drivers follow only the vehicle ahead. In SUMO they also look at the last vehicle of the
-    next lanes, see `unjam.worlds.batch.human_idm`.
+    With quick noise, human drivers follow only the vehicle ahead, and not also the last ones on the next lanes.
     """
 
     is_scalar, remaining_rows = False, None
@@ -85,15 +73,12 @@ class RingBatch:
         to_array: ArrayFactory = np.asarray,
         keep_record: bool = True,
         draw: DrawNormal | None = None,
-        human_model: HumanSpeedModel | None = None,
+        human_model: human_idm.HumanSpeedModel | None = None,
     ) -> None:
         """Put the vehicles on the roads, at rest; the scenarios differ only in their lengths.
 
-        Args:
-            to_array: makes the arrays of the simulation, for instance NumPy's or torch's, in any precision.
-            keep_record: whether to keep whole episodes, some 16 bytes for each vehicle and step in float64.
-            draw: draws all noise; None: each road draws the same noise as SUMO's episode.
-            human_model: of human drivers away from junctions, instead of SUMO's IDM.
+        Arrays are those of `to_array`. Whole episodes take 16 bytes for each vehicle and step (`keep_record`). `draw`
+        draws all noise, or each road that of SUMO's episode. `human_model` replaces SUMO's IDM away from junctions.
         """
         scenario = self.scenario = scenarios[0]
         drawn = [each.draw_from_seed(seed) for each, seed in zip(scenarios, seeds, strict=True)]
@@ -112,8 +97,9 @@ class RingBatch:
         self._loop_lengths, self._cav_loop_lengths = to_array(loops), to_array(np.tile(loops, cavs))
         start = np.stack([road.start_positions for road in roads], 1)
         self._set_motion(np.tile([road.start_speed for road in roads], (vehicles, 1)), start, loops)
-        self._human_parameters, self._human_model = human_parameters(roads, scenario.humans, to_array), human_model
-        self._figure_eight, self._find_contacts = None, ring_contacts
+        self._human_parameters = human_idm.human_parameters(roads, scenario.humans, to_array)
+        self._human_model = human_model
+        self._figure_eight, self._find_contacts = None, human_idm.ring_contacts
         if roads[0].crossings:
             self._figure_eight = FigureEightMovement(
                 scenario, cast(Sequence[ClosedRoad], roads), self._cav_indices, to_array, human_model
@@ -168,8 +154,8 @@ class RingBatch:
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
         """Run the warm-up, unless `warm_up_states` are set; then hand the CAVs over, unless they stay human.
 
-        Return what the CAVs observed at the control steps of the last minute of the warm-up, NumPy arrays of shape
-        (CAVs * W, moments), oldest first; None without a warm-up that may be remembered.
+        Return what the CAVs observed in the last minute of the warm-up, NumPy arrays of shape (CAVs * W, moments),
+        oldest first; None without a warm-up that may be remembered.
         """
         history = self._restore(self.warm_up_states) if self.warm_up_states else self._drive_warm_up()
         if bool(self.crashed_roads.any()):
@@ -223,8 +209,7 @@ class RingBatch:
     def replace_roads(self, roads: Any, source: Self, source_roads: Any) -> None:
         """Continue on some roads with those of another batch that has just been started; one CAV on each.
 
-        `roads` and `source_roads` are lists of equal length. Both batches keep no record, and have the same kind of
-        arrays, noise and scenario.
+        Both batches keep no record, and have the same kind of arrays, noise and scenario.
         """
         for name in self._road_arrays:
             setattr(self, name, replace_columns(getattr(self, name), roads, getattr(source, name), source_roads))
@@ -315,14 +300,14 @@ class RingBatch:
         self.control_step_counts = self.control_step_counts + self._is_running
         self._is_running = self._is_running * (~self.crashed_roads & ~self.completed_roads)
 
-    def _human_speeds(self, speed: Array, leader: Leader) -> Array:
+    def _human_speeds(self, speed: Array, leader: human_idm.Leader) -> Array:
         """Return the speeds of all vehicles after this step if humans drive them, shape (vehicles, W)."""
         parameters, step = self._human_parameters, self.scenario.simulation_step
         if self._human_model is not None:
             return self._human_model(speed, *leader)
         if self._has_quick_noise:
-            return human_idm_speed(speed, *leader, parameters, step)
-        return human_ring_speed(speed, self._position, leader, self._loop_lengths, parameters, step)
+            return human_idm.human_idm_speed(speed, *leader, parameters, step)
+        return human_idm.human_ring_speed(speed, self._position, leader, self._loop_lengths, parameters, step)
 
     def _simulate(self, accelerations: Array | None) -> Array:
         """Simulate one step, and return the CAVs' safe accelerations; None: the CAVs are human."""
@@ -334,12 +319,12 @@ class RingBatch:
             if self._keep_record:
                 self._series["safe_accelerations"].append(safe)
                 self._series["commanded_speeds"].append(commanded)
-        moved, speeds = self._next_speeds(speed[:-1], Leader(speed[1:], self._gap), commanded)
+        moved, speeds = self._next_speeds(speed[:-1], human_idm.Leader(speed[1:], self._gap), commanded)
         xp = namespace(moved)
         leader_moved = xp.concatenate([moved[1:], moved[:1]])
         self._gap = self._gap + (leader_moved - moved) * step
         self._position = next_position(self._position, moved, step)
-        if self._figure_eight or bool((self._gap < CONTACT_GAP).any()):
+        if self._figure_eight or bool((self._gap < human_idm.CONTACT_GAP).any()):
             contacts = self._find_contacts(self._position, self._gap, self._loop_lengths)
             self.crashed_roads = self.crashed_roads | (contacts.any(0) & (self._is_running > 0.0))
         self._speed = xp.concatenate([speeds, speeds[:1]])
@@ -348,7 +333,7 @@ class RingBatch:
             self._series["speeds"].append(speeds)
         return safe
 
-    def _next_speeds(self, speed: Array, leader: Leader, cav_speeds: Array | None) -> tuple[Array, Array]:
+    def _next_speeds(self, speed: Array, leader: human_idm.Leader, cav_speeds: Array | None) -> tuple[Array, Array]:
         """Return the speeds with which all vehicles move in this step, and those after it, (vehicles, W) each."""
         commanded = None if cav_speeds is None else cav_speeds.reshape(self._shape)
         if self._figure_eight:

@@ -18,10 +18,7 @@ INPUT_FILES = {
 
 
 def write_example_road(name: str, folder: Path) -> Path:
-    """Write the files of an example network into a folder that exists, and return SUMO's configuration.
-
-    Raise `InputError` for an unknown name, `MissingPartError` without netconvert.
-    """
+    """Write the files of an example network into a folder that exists, and return SUMO's configuration."""
     if name not in EXAMPLE_ROADS:
         raise unknown_name("road", name, EXAMPLE_ROADS)
     contents = {
