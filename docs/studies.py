@@ -158,7 +158,9 @@ def unfiltered_table(study: str, road: str, columns: tuple[str, ...] = RING_COLU
     """Return `evaluation_table` without the safety filter, for PI, tuned experts and the trainings."""
     names = f"{study}-unfiltered", UNFILTERED_ROADS[road]
     learned = tuple(row["name"] for row in study_rows(*names) if row["is_learned"])
-    return evaluation_table(*names, (*columns, "max braking [m/s²]"), ("PI (paper)", "tuned PI", "tuned pacer", *learned))
+    return evaluation_table(
+        *names, (*columns, "max braking [m/s²]"), ("PI (paper)", "tuned PI", "tuned pacer", *learned)
+    )
 
 
 def _feasibility_text(verdicts: str | list[str]) -> str:

@@ -51,27 +51,16 @@ if TYPE_CHECKING:
 
 # Imported when first used: workers must stay free of torch, and the command line quick.
 _LAZY_IMPORTS = {
-    name: module
-    for module, names in {
-        "unjam.benchmarks.run": "benchmark",
-        "unjam.controller": "load_controller make_driver",
-        "unjam.drivers": "Driver LocalState check_driver",
-        "unjam.environments.pettingzoo_env": "parallel_env",
-        "unjam.measures.metrics": "measure",
-        "unjam.models.differentiable_rings": "DifferentiableRings",
-        "unjam.resource_limits": "verify_controller write_report",
-        "unjam.scenarios": "make_scenario",
-        "unjam.seeds": "held_out_seeds",
-        "unjam.training.config": "load_config",
-        "unjam.training.evaluate": "drive",
-        "unjam.training.export": "export_controller",
-        "unjam.training.learned_model": "load_world_model",
-        "unjam.training.runs": "list_runs",
-        "unjam.training.train": "train",
-        "unjam.trust": "trusting_code",
-        "unjam.worlds.episode": "run_episode",
-    }.items()
-    for name in names.split()
+    **{"Driver": "unjam.drivers", "LocalState": "unjam.drivers", "check_driver": "unjam.drivers"},
+    **{"make_scenario": "unjam.scenarios", "load_controller": "unjam.controller"},
+    **{"make_driver": "unjam.controller", "parallel_env": "unjam.environments.pettingzoo_env"},
+    **{"measure": "unjam.measures.metrics", "DifferentiableRings": "unjam.models.differentiable_rings"},
+    **{"benchmark": "unjam.benchmarks.run", "verify_controller": "unjam.resource_limits"},
+    **{"write_report": "unjam.resource_limits", "held_out_seeds": "unjam.seeds"},
+    **{"load_config": "unjam.training.config", "drive": "unjam.training.evaluate"},
+    **{"export_controller": "unjam.training.export", "load_world_model": "unjam.training.learned_model"},
+    **{"list_runs": "unjam.training.runs", "train": "unjam.training.train", "trusting_code": "unjam.trust"},
+    **{"run_episode": "unjam.worlds.episode"},
 }
 
 register_environments()

@@ -10,10 +10,7 @@ _adam = torch.optim.Adam
 
 
 class Adam(_adam):
-    """torch's Adam with identical results, but without torch's compiler, which takes a second in each learning process.
-
-    The wrappers of torch's own methods load it, to exclude them from compilation. Not for `torch.compile`.
-    """
+    """torch's Adam with identical results, but without its compiler, which takes a second; not for `torch.compile`."""
 
     add_param_group = cast(Callable[..., None], unwrap(_adam.add_param_group))
     zero_grad = cast(Callable[..., None], unwrap(_adam.zero_grad))

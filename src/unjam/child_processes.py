@@ -15,10 +15,8 @@ from unjam.processes import bind_to_parent, follow_parent
 from unjam.trust import expected_code_environment
 from unjam.user_code import is_package_folder
 
-PACKAGE_PARENT = str(Path(__file__).parents[1])
-"""folder from which unjam itself is imported"""
-DATA_FOLDER = Path(__file__).with_name("controllers")
-"""folder of the package without Python modules and settings of libraries"""
+PACKAGE_PARENT = str(Path(__file__).parents[1])  # folder from which unjam itself is imported
+DATA_FOLDER = Path(__file__).with_name("controllers")  # without Python modules and settings of libraries
 
 
 def python_command(*arguments: str) -> list[str]:

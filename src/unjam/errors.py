@@ -1,7 +1,4 @@
-"""Errors of unjam, with the exit codes of the command line.
-
-Every error that a user can cause or correct is one of these: one clear line, no traceback.
-"""
+"""Errors that a user can cause or correct: one clear line, no traceback, and an exit code of the command line."""
 
 import errno
 import shlex
@@ -29,7 +26,6 @@ class RowError(InputError):
     """An invalid value in a row of CAVs; the loop that drives them adds the name of the CAV and the step."""
 
     def __init__(self, message: str, row: int = 0) -> None:
-        """Store the row."""
         super().__init__(message)
         self.row = row
 
@@ -47,20 +43,13 @@ class MissingPartError(UnjamError):
 EXTRAS = {
     **dict.fromkeys(("torch", "stable_baselines3", "sb3_contrib", "tensorboard"), "train"),
     **dict.fromkeys(("onnx", "onnxscript", "onnxruntime"), "train"),
-    "optuna": "tune",
-    "imageio_ffmpeg": "video",
-    "cryptography": "sign",
-    "pettingzoo": "marl",
-    "ray": "ray",
+    **{"optuna": "tune", "imageio_ffmpeg": "video", "cryptography": "sign", "pettingzoo": "marl", "ray": "ray"},
 }
 """extra of unjam that installs each optional package; `drive` and `assess` need none of them"""
 
 
 def missing_package_error(error: ImportError, name: str | None = None) -> MissingPartError:
-    """Return the error for a package of an extra, or a shared library, that cannot be imported; raise any other error.
-
-    `name` is the package that was imported; None: the one that the error names.
-    """
+    """Return the error for a package of an extra (`name`, or else the error's) or a shared library; raise any other."""
     package = (name or error.name or "").partition(".")[0]
     reason = f"cannot be imported ({' '.join(str(error).split())})"
     if package not in EXTRAS:
@@ -100,17 +89,13 @@ class LostWorkerError(EpisodeError):
     """The process that ran an episode was lost; the same episode may succeed when repeated."""
 
 
-MAX_LISTED_NAMES = 20
-"""names that a message lists of a list from a file"""
+MAX_LISTED_NAMES = 20  # names that a message lists of a list from a file
 INVISIBLE_LETTERS = {
     *"\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0",
     *map(chr, (*range(0x180B, 0x1810), *range(0xFE00, 0xFE10), *range(0xE0100, 0xE01F0))),
 }
 """letters and marks that are not shown, although Unicode does not count them as control characters"""
-DISK_ERRNOS = (
-    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS),
-    *(errno.EACCES, errno.EPERM, errno.EIO, errno.ENOTDIR),
-)
+DISK_ERRNOS = errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.ENOTDIR
 
 
 def disk_error(error: OSError, path: object) -> DiskError:
@@ -126,20 +111,13 @@ def error_from_name(name: str, message: str) -> UnjamError:
 
 
 def one_line(value: object, length: int = 200) -> str:
-    """Return a text of a stranger on one line of at most `length` letters, the last one `…` if more were cut.
-
-    It has no control characters.
-    """
+    """Return a text of a stranger without control characters on one line, cut to `length` letters with `…`."""
     text = printable(" ".join(str(value).split()))
     return text if len(text) <= length else f"{text[: length - 1]}…"
 
 
 def printable(text: str) -> str:
-    """Return a text for a terminal, with a question mark for each control, bidirectional or invisible character.
-
-    Otherwise file names, names in TOML files or messages of SUMO could move the cursor, turn the direction of text, or
-    look like other names.
-    """
+    """Return a text with `?` for characters that move the cursor, turn the direction of text or are invisible."""
     letters = set(text) - {"\n"}
     hidden = {each for each in letters if not each.isprintable() and category(each) != "Zs"}
     hidden |= letters & INVISIBLE_LETTERS

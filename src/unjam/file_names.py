@@ -7,20 +7,14 @@ from typing import Any
 
 from unjam.errors import InputError, one_line
 
-_SEPARATOR = re.compile(r"\+(?=[^\W\d]|[./~])")
-"""+ between two names, but not that in 1e+5"""
-_MAX_LENGTH = 4096
-"""letters of a path, the limit of Linux"""
-MAX_NAMES = 100
-"""maximum number of names that are joined"""
+_SEPARATOR = re.compile(r"\+(?=[^\W\d]|[./~])")  # + between two names, but not that in 1e+5
+_MAX_LENGTH = 4096  # letters of a path, the limit of Linux
+MAX_NAMES = 100  # joined by +
 _PATH_END = re.compile(rf":|$|{_SEPARATOR.pattern}")
 
 
 def split_names(text: str, folder: Path = Path()) -> list[str]:
-    """Return the names that are joined by +, which paths of existing files in `folder` may contain, too.
-
-    Raise `InputError` for more than `MAX_NAMES`.
-    """
+    """Return names joined by +, which existing paths in `folder` may contain; `InputError` above `MAX_NAMES`."""
     names = list[str]()
     while separator := _SEPARATOR.search(text, len(_existing_path(text, folder))):
         if len(names) == MAX_NAMES - 1:
@@ -31,22 +25,17 @@ def split_names(text: str, folder: Path = Path()) -> list[str]:
 
 
 def absolute_names(values: Any, folder: Path) -> Any:
-    """Return a configuration in which names of existing files and folders, relative to `folder`, are absolute.
-
-    Only those with a dot or a slash are changed: `ring` is a scenario, whatever the folder contains.
-    """
+    """Return a configuration with absolute names of existing files in `folder`, of those with a dot or a slash."""
     if isinstance(values, dict):
         return {key: absolute_names(value, folder) for key, value in values.items()}
     if isinstance(values, list):
         return [absolute_names(value, folder) for value in values]
     if not isinstance(values, str):
         return values
-    return "+".join(_absolute_name(name, folder) for name in split_names(values, folder))
-
-
-def _absolute_name(name: str, folder: Path) -> str:
-    path = _existing_path(name, folder)
-    return f"{folder / path}{name[len(path) :]}" if "." in path or os.sep in path else name
+    names = [(name, _existing_path(name, folder)) for name in split_names(values, folder)]
+    return "+".join(
+        f"{folder / path}{name[len(path) :]}" if "." in path or os.sep in path else name for name, path in names
+    )
 
 
 def _existing_path(text: str, folder: Path) -> str:

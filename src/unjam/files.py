@@ -1,8 +1,7 @@
 """Write files so that nothing is lost or half-written, and nothing outside is written through a link.
 
-All of unjam writes, renames and removes through these functions; `tests/test_layers.py` checks it. They raise
-`InputError` for a link, or for a path through a link inside a protected folder (`unjam.folders`), and `DiskError` if
-the disk is full or cannot be written.
+All of unjam writes, renames and removes through these functions. They raise `InputError` for a link, or for a path
+through a link inside a protected folder (`unjam.folders`), and `DiskError` if the disk is full or cannot be written.
 """
 
 import errno
@@ -23,22 +22,17 @@ from typing import Any
 from safetensors import SafetensorError
 
 from unjam.errors import DISK_ERRNOS, DiskError, InputError, disk_error
-from unjam.folders import Folder, link_error, open_folder, protected_root
+from unjam.folders import link_error, open_folder, protected_root
 
-MAX_INTEGER_LENGTH = 20
-"""characters of an integer of 64 bits"""
-PACKAGED_PREFIX = "unjam:"
-"""beginning of the names of controllers and populations that are part of the package"""
+MAX_INTEGER_LENGTH = 20  # characters of an integer of 64 bits
+PACKAGED_PREFIX = "unjam:"  # beginning of the names of controllers and populations that are part of the package
 INVALID_DATA_ERRORS = (
     *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
     SafetensorError,
-)
-"""errors of reading JSON and arrays that unjam did not write"""
+)  # of reading JSON and arrays that unjam did not write
 UNREADABLE_ERRORS = (*INVALID_DATA_ERRORS, zipfile.BadZipFile, zlib.error, EOFError, MemoryError, RuntimeError)
 """errors of reading a damaged file; zipfile raises `RuntimeError` for an unknown kind of compression"""
-
-APPEND_FLAGS = os.O_WRONLY | os.O_APPEND | os.O_CREAT
-"""flags of `open_in_place`: append to a file, and create a missing one"""
+APPEND_FLAGS = os.O_WRONLY | os.O_APPEND | os.O_CREAT  # create a missing file, too
 
 
 @contextmanager
@@ -61,32 +55,25 @@ def _disk_errors(path: Path, *extra_errnos: int) -> Iterator[None]:
         raise
 
 
-@contextmanager
-def _replacement(path: Path) -> Iterator[tuple[Folder, str]]:
-    """Yield the folder of `path` and a temporary name, which is renamed to `path`, or removed after an error."""
-    temporary = f".{secrets.token_hex(8)}.part"  # a name that cannot be guessed, see `is_leftover`
-    with _disk_errors(path), open_folder(path.parent) as folder:
-        try:
-            yield folder, temporary
-            folder.rename(temporary, path.name or ".")
-        except OSError:
-            with suppress(OSError):
-                folder.remove(temporary)
-            raise
-
-
 def atomic_write(path: Path, content: bytes | str) -> None:
     """Write a complete file, or keep the previous one: under a temporary name, synced to the disk, then renamed.
 
     The rights of the previous file stay.
     """
-    with _replacement(path) as (folder, temporary):
-        folder.check_writable(path.name or ".")
-        descriptor = folder.create(temporary)
-        if rights := folder.mode(path.name) & 0o777:
-            with suppress(OSError):  # the file system has none
-                os.fchmod(descriptor, rights)
-        _write_and_sync(descriptor, content)
+    name, temporary = path.name or ".", f".{secrets.token_hex(8)}.part"  # it cannot be guessed, see `is_leftover`
+    with _disk_errors(path), open_folder(path.parent) as folder:
+        folder.check_writable(name)
+        try:
+            descriptor = folder.create(temporary)
+            if rights := folder.mode(name) & 0o777:
+                with suppress(OSError):  # the file system has none
+                    os.fchmod(descriptor, rights)
+            _write_and_sync(descriptor, content)
+            folder.rename(temporary, name)
+        except OSError:
+            with suppress(OSError):
+                folder.remove(temporary)
+            raise
 
 
 def write_new_file(path: Path, content: bytes, mode: int) -> None:
@@ -118,10 +105,7 @@ def _write_and_sync(descriptor: int, content: bytes | str) -> None:
 
 
 def open_in_place(path: Path, flags: int, mode: int = 0o666) -> int:
-    """Open a regular file as it is, with the flags of `os.open`, and return its descriptor.
-
-    To be written it must not have other names (hard links), which can be those of a file elsewhere: `InputError`.
-    """
+    """Open a regular file with flags of `os.open`; `InputError` if one to be written has other names."""
     with open_folder(path.parent) as folder:
         folder.check_writable(path.name)
         descriptor = folder.open(path.name, flags, mode)
@@ -146,10 +130,7 @@ def remove(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path, min_age: float = -math.inf) -> None:
-    """Remove unfinished files that killed processes have left in a folder, where they can be removed.
-
-    They are older than `min_age` [s], which is only needed if other processes may write to the folder now.
-    """
+    """Remove unfinished files older than `min_age` [s], which killed processes have left in a folder, if possible."""
     for leftover in filter(is_leftover, [*folder.glob(".*")]):
         with suppress(FileNotFoundError, DiskError):  # another process has just removed it
             if time.time() - leftover.lstat().st_mtime > min_age:
@@ -197,9 +178,8 @@ def make_folder(path: Path) -> None:
 def parse_json(content: bytes | str) -> Any:
     """Return the document in strict JSON.
 
-    Raises:
-        ValueError: it is not JSON in UTF-8, is nested too deep, names a key twice, or has a number that is not finite,
-            or an integer of more than 64 bits.
+    Raise `ValueError` if it is not JSON in UTF-8, is nested too deep, names a key twice, or has a number that is not
+    finite, or an integer of more than 64 bits.
     """
     text = content.decode() if isinstance(content, bytes) else content
     try:

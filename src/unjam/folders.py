@@ -1,8 +1,7 @@
 """Folders that are opened without following links that a stranger may have planted in them.
 
-Links on the way to a folder that the user names are the user's own choice. Inside a protected folder
-(`protect_folder`) no link is followed: each part of a path is opened from the handle of its parent. On systems without
-such handles (Windows), paths are checked before they are used.
+Links on the way to a folder that the user names are the user's own choice. Inside a protected one no link is followed:
+each part of a path is opened from the handle of its parent, or on Windows checked before.
 """
 
 import json
@@ -15,8 +14,7 @@ from pathlib import Path
 
 from unjam.errors import DiskError, InputError
 
-PROTECTED_FOLDERS_VARIABLE = "UNJAM_PROTECTED_FOLDERS"
-"""environment variable with the folders that the parent processes of a child protect"""
+PROTECTED_FOLDERS_VARIABLE = "UNJAM_PROTECTED_FOLDERS"  # folders that the parent processes protect
 NO_FOLLOW_FLAGS = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
 """flags of `os.open`: follow no link, and do not wait for a pipe; not every system has all of them"""
 FOLDER_FLAGS = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0)
@@ -24,10 +22,9 @@ _protected: list[Path] = []
 
 
 class Folder:
-    """An open folder; its entries are named relative to its handle."""
+    """An open folder; its entries are named relative to its handle, None on systems without such handles."""
 
     def __init__(self, path: Path, handle: int | None) -> None:
-        """Take the folder's handle; None on systems without such handles."""
         self.path, self.handle = path, handle
 
     def entry_path(self, name: str) -> str:
@@ -55,10 +52,6 @@ class Folder:
     def create(self, name: str, mode: int = 0o666) -> int:
         """Open a new file for writing; raise `FileExistsError` if an entry has that name."""
         return self.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-
-    def make_subfolder(self, name: str) -> None:
-        """Make a folder in this one; raise `FileExistsError` if an entry has that name."""
-        os.mkdir(self.entry_path(name), dir_fd=self.handle)
 
     @contextmanager
     def enter(self, name: str) -> Iterator["Folder"]:
@@ -101,14 +94,7 @@ def _open_by_name(path: Path, name: Path | str, parent: int | None) -> Iterator[
 
 @contextmanager
 def open_folder(path: Path, make: bool = False) -> Iterator[Folder]:
-    """Open a folder; links are followed, except inside a protected folder.
-
-    With `make`, missing folders inside a protected folder are made.
-
-    Raises:
-        InputError: inside a protected folder the path leads through a link, or out again.
-        OSError: it cannot be opened.
-    """
+    """Open a folder, or make a missing protected one; `InputError` for a link, or `..`, inside a protected folder."""
     path = path.absolute()
     root = protected_root(path)
     with ExitStack() as stack:
@@ -116,7 +102,7 @@ def open_folder(path: Path, make: bool = False) -> Iterator[Folder]:
         for name in path.relative_to(root).parts:
             if make:
                 with suppress(FileExistsError):
-                    folder.make_subfolder(name)
+                    os.mkdir(folder.entry_path(name), dir_fd=folder.handle)
             folder = stack.enter_context(folder.enter(name))
         yield folder
 
@@ -134,11 +120,7 @@ def protected_folders() -> list[Path]:
 
 @contextmanager
 def protect_folder(folder: Path) -> Iterator[None]:
-    """Protect a folder: inside it no link is followed within the block.
-
-    Raises:
-        InputError: one of its entries is a link.
-    """
+    """Protect a folder: inside it no link is followed within the block; `InputError` if one of its entries is one."""
     with os.scandir(folder) as entries:
         for entry in entries:
             if entry.is_symlink():
@@ -154,8 +136,7 @@ def protect_folder(folder: Path) -> Iterator[None]:
 def reject_unsafe_files(folder: Path) -> None:
     """Raise `InputError` if a folder contains a file that must not be read.
 
-    Reading a pipe, a socket or a device could wait forever. A link that leads out of the folder could name a secret,
-    which a report would show.
+    A pipe, a socket or a device could wait forever; a link out of the folder could name a secret for a report.
     """
     root = os.path.realpath(folder)
     for parent, subfolders, names in os.walk(folder):

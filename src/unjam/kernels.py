@@ -1,8 +1,7 @@
 """The same bits on every x86-64 machine with AVX2: the kernels with which NumPy and torch compute.
 
-Each library chooses its kernels by the processor, and each kernel rounds in its own way. `pin_kernels` selects those
-that every processor with AVX2 has; it must run before NumPy is imported. `UNJAM_KERNELS=native` changes nothing.
-docs/training.md says which processors were tested, and what still differs.
+Each kernel rounds in its own way. `pin_kernels` selects those that every processor with AVX2 has, before NumPy is
+imported; `UNJAM_KERNELS=native` changes nothing. docs/training.md says which processors were tested.
 
 MKL's square roots begin with an estimate that depends on the processor's maker, in every mode: so Adam is fused, and
 square roots of tensors are those of `unjam.physics.arrays`.
@@ -15,6 +14,7 @@ import sys
 import warnings
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -70,27 +70,24 @@ def kernel_settings() -> dict[str, str]:
 def kernel_info() -> dict[str, Any]:
     """Return the processor and the active kernels of the loaded libraries, for manifests."""
     numpy, torch = (sys.modules.get(name) for name in KERNEL_LIBRARIES)
+    core = sys.modules["numpy._core._multiarray_umath"] if numpy else None
     return {
         "processor": processor_info().get("model name", platform.processor() or platform.machine()),
         "pinned": has_pinned_kernels(),
         "unpinned_reason": _unpinned_reason,
         "settings": {name: os.environ.get(name) for name in KERNEL_SETTINGS},
         "openblas": _openblas_core(numpy) if numpy else None,
-        "numpy": _numpy_features() if numpy else None,
+        "numpy": [name for name in core.__cpu_dispatch__ if core.__cpu_features__.get(name)] if core else None,
         "torch": torch.backends.cpu.get_cpu_capability() if torch else None,
     }
 
 
 def processor_info() -> dict[str, str]:
     """Return Linux's description of the first processor; empty on other systems."""
-    info: dict[str, str] = {}
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            name, colon, value = line.partition(":")
-            if not colon:
-                break
-            info[name.strip()] = value.strip()
-    return info
+        entries = (line.partition(":") for line in takewhile(lambda line: ":" in line, lines))
+        return {name.strip(): value.strip() for name, _, value in entries}
+    return {}
 
 
 def _find_obstacle() -> str | None:
@@ -112,12 +109,6 @@ def _openblas_core(numpy: Any) -> str | None:
             core_name.restype = ctypes.c_char_p
             return core_name().decode()
     return None
-
-
-def _numpy_features() -> list[str]:
-    """Return the groups of instructions from which NumPy chooses kernels, in addition to its baseline."""
-    core = sys.modules["numpy._core._multiarray_umath"]
-    return [name for name in core.__cpu_dispatch__ if core.__cpu_features__.get(name)]
 
 
 _unpinned_reason: str | None = "pin_kernels() was not called"

@@ -4,6 +4,7 @@ import os
 import platform
 import subprocess
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -36,14 +37,11 @@ def without_folders(command: list[str]) -> list[str]:
 
 def package_versions() -> dict[str, str | None]:
     """Return the installed versions of the packages that results depend on; None: not installed."""
-    return {name: _package_version(name) for name in RECORDED_PACKAGES}
-
-
-def _package_version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+    versions: dict[str, str | None] = dict.fromkeys(RECORDED_PACKAGES)
+    for name in versions:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions
 
 
 def _source_commit() -> str | None:

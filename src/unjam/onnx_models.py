@@ -14,29 +14,24 @@ from typing import Any
 
 from unjam.errors import InputError, import_optional, invalid_value, one_line
 
-ALLOWED_OPERATORS = {
-    *("Abs", "Add", "And", "BatchNormalization", "Cast", "Ceil", "Clip", "Concat", "Constant", "Cos", "Div"),
-    *("Elu", "Equal", "Erf", "Exp", "Expand", "Flatten", "Floor", "Gather", "GatherElements", "GatherND", "Gelu"),
-    *("Gemm", "Greater", "GreaterOrEqual", "HardSigmoid", "HardSwish", "Identity", "IsNaN", "LayerNormalization"),
-    *("LeakyRelu", "Less", "LessOrEqual", "Log", "LogSoftmax", "MatMul", "Max", "Mean", "Min", "Mish", "Mod"),
-    *("Mul", "Neg", "Not", "Or", "PRelu", "Pow", "Reciprocal", "ReduceMax", "ReduceMean", "ReduceMin"),
-    *("ReduceSum", "Relu", "Reshape", "Round", "ScatterElements", "Selu", "Shape", "Sigmoid", "Sign", "Sin"),
-    *("Slice", "Softmax", "Softplus", "Softsign", "Split", "Sqrt", "Squeeze", "Sub", "Sum", "Tan", "Tanh"),
-    *("ThresholdedRelu", "Transpose", "Unsqueeze", "Where"),
-}
-"""all allowed operators: arithmetic, without subgraphs"""
-VALUE_FIELDS = {"INT": "i", "FLOAT": "f", "STRING": "s", "TENSOR": "t", "INTS": "ints"}
-"""field that stores the value of an attribute, by the allowed types of attributes"""
-REFUSED_ATTRIBUTES = {"value_string", "value_ints", "saturate", "round_mode"}
-"""attributes of allowed operators that no policy needs"""
+_OPERATORS = """
+Abs Add And BatchNormalization Cast Ceil Clip Concat Constant Cos Div Elu Equal Erf Exp Expand Flatten Floor Gather
+GatherElements GatherND Gelu Gemm Greater GreaterOrEqual HardSigmoid HardSwish Identity IsNaN LayerNormalization
+LeakyRelu Less LessOrEqual Log LogSoftmax MatMul Max Mean Min Mish Mod Mul Neg Not Or PRelu Pow Reciprocal ReduceMax
+ReduceMean ReduceMin ReduceSum Relu Reshape Round ScatterElements Selu Shape Sigmoid Sign Sin Slice Softmax Softplus
+Softsign Split Sqrt Squeeze Sub Sum Tan Tanh ThresholdedRelu Transpose Unsqueeze Where
+"""
+ALLOWED_OPERATORS = set(_OPERATORS.split())  # arithmetic, without subgraphs
+VALUE_FIELDS = {"INT": "i", "FLOAT": "f", "STRING": "s", "TENSOR": "t", "INTS": "ints"}  # by type of attribute
+REFUSED_ATTRIBUTES = {"value_string", "value_ints", "saturate", "round_mode"}  # no policy needs them
+TENSOR_KINDS = "double", "float", "int32", "int64"
 ALLOWED_FIELDS = {
     "ModelProto": {"ir_version", "producer_name", "producer_version", "opset_import", "graph"},
     "OperatorSetIdProto": {"domain", "version"},
     "GraphProto": {"name", "node", "initializer", "input", "output", "value_info"},
     "NodeProto": {"name", "op_type", "domain", "input", "output", "attribute"},
     "AttributeProto": {"name", "type", "i", "f", "s", "t", "ints"},
-    "TensorProto": {"name", "dims", "data_type", "raw_data", "double_data", "float_data"}
-    | {"int32_data", "int64_data"},
+    "TensorProto": {"name", "dims", "data_type", "raw_data", *(f"{kind}_data" for kind in TENSOR_KINDS)},
     "ValueInfoProto": {"name", "type"},
     "TypeProto": {"tensor_type"},
     "Tensor": {"elem_type", "shape"},
@@ -44,17 +39,13 @@ ALLOWED_FIELDS = {
     "Dimension": {"dim_param", "dim_value"},
 }
 """all fields that messages of a model may set: no function, subgraph, sparse or external tensor, metadata"""
-ONNX_DOMAINS = "", "ai.onnx"
-"""both names of the domain of ONNX itself"""
+ONNX_DOMAINS = "", "ai.onnx"  # both names of the domain of ONNX itself
 TEXT_FIELDS = {"doc_string", "metadata_props", "model_version", "producer_name", "producer_version", "denotation"}
 """fields with texts for readers, which change no number"""
 MAX_MODEL_BYTES = 64 * 2**20
-MAX_TENSOR_NUMBERS = MAX_MODEL_BYTES // 4
-"""maximum count of numbers in a constant"""
-MAX_TRIAL_SECONDS = 10.0
-"""maximum time of the trial runs of a model; a network of the usual size needs milliseconds"""
-MAX_RUN_BYTES = 256 * 2**20
-"""maximum memory of all running models of this process"""
+MAX_TENSOR_NUMBERS = MAX_MODEL_BYTES // 4  # of a constant
+MAX_TRIAL_SECONDS = 10.0  # of all trial runs of a model; a network of the usual size needs milliseconds
+MAX_RUN_BYTES = 256 * 2**20  # of all running models of this process
 
 
 def parse_model(content: bytes) -> Any:
@@ -69,11 +60,9 @@ def parse_model(content: bytes) -> Any:
 
 
 def remove_texts(message: Any) -> None:
-    """Remove the texts of a message, and of all messages nested in it.
-
-    Also remove the statement of constants that their data are in the graph, which `onnx.save` writes.
-    """
+    """Remove the texts of a message, and of all messages nested in it."""
     for each, value in message.ListFields():
+        # `onnx.save` states of constants that their data are in the graph.
         if each.name in TEXT_FIELDS or (each.name == "data_location" and value == message.DEFAULT):
             message.ClearField(each.name)
         elif each.message_type is not None:
@@ -143,10 +132,7 @@ def _check_node(node: Any, opset: int) -> None:
 
 
 def open_session(content: bytes) -> Any:
-    """Return the session of onnxruntime for a checked model, on one thread and with at most `MAX_RUN_BYTES`.
-
-    Raise `InputError` if onnxruntime refuses it, `MissingPartError` if it is not installed.
-    """
+    """Return the session of onnxruntime for a checked model, on one thread and with at most `MAX_RUN_BYTES`."""
     runtime = import_optional("onnxruntime")
     _limit_memory()
     options = runtime.SessionOptions()
@@ -177,10 +163,7 @@ _run_options: ContextVar[Any] = ContextVar("run_options", default=None)
 
 @contextmanager
 def time_limit() -> Iterator[None]:
-    """Within the context, end all runs of models after `MAX_TRIAL_SECONDS` together, with `InputError`.
-
-    The runtime looks at the clock between two operators.
-    """
+    """Within the context, end all runs of models after `MAX_TRIAL_SECONDS` together, with `InputError`."""
     options = import_optional("onnxruntime").RunOptions()
     timer = Timer(MAX_TRIAL_SECONDS, setattr, (options, "terminate", True))
     timer.daemon = True

@@ -7,32 +7,20 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import field, fields, is_dataclass
 from functools import cache, wraps
 from inspect import get_annotations, getattr_static
+from itertools import accumulate, pairwise
 from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar, dataclass_transform
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PydanticUserError,
-    Strict,
-    TypeAdapter,
-    ValidationError,
-)
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Strict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
+from pydantic.errors import PydanticUserError
 
 from unjam.errors import InputError, invalid_value, one_line, spelling_hint
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
-"""Configuration of every parameter dataclass: an unknown name or a NaN is an error.
-
-`unjam drivers` and the documentation show the texts under the fields.
-"""
-
-Number = Annotated[float, Strict()]
-"""a number, not a text that contains one"""
+"""configuration of parameter dataclasses, of which `unjam drivers` and the documentation show the texts under fields"""
+Number = Annotated[float, Strict()]  # a number, not a text that contains one
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 PositiveInt = Annotated[int, Field(ge=1)]
@@ -63,16 +51,10 @@ def _without_tuples(options: dict[str, Any]) -> dict[str, Any]:
     return {key: list(value) if isinstance(value, tuple) else value for key, value in options.items()}
 
 
-Options = Annotated[dict[str, Any], AfterValidator(_without_tuples)]
-"""arguments by name, of a class that the configuration names"""
-NumberOrRange = BeforeValidator(as_range)
-"""allows a single number for a parameter that is a range"""
-MAX_INTEGER_BITS = 63
-"""maximum number of bits of the absolute value of an integer"""
-MAX_KEY_PARTS = 100
-"""parts of a key between its dots"""
-CERTAIN_SIMILARITY = 0.8
-"""from which on a name in the body of a class is taken for a misspelt field"""
+Options = Annotated[dict[str, Any], AfterValidator(_without_tuples)]  # arguments of a class, by name
+NumberOrRange = BeforeValidator(as_range)  # allows a single number for a parameter that is a range
+MAX_INTEGER_BITS, MAX_KEY_PARTS = 63, 100  # of an absolute value, and of a key between its dots
+CERTAIN_SIMILARITY = 0.8  # from which on a name in the body of a class is taken for a misspelt field
 _KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]++|\\.)*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?<![\w\\-])(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS}}}")
 """without backtracking, and not from within a word, so that the time is proportional to the length of a text"""
@@ -87,10 +69,7 @@ class Subclassable:
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Give values that replace inherited defaults the types of their fields, those of other bases included.
-
-        Raise `InputError` for a value with the misspelt name of a field.
-        """
+        """Give values that replace inherited defaults the types of their fields; refuse a field's misspelt name."""
         super().__init_subclass__(**options)
         for base in reversed(cls.__mro__[1:]):
             _apply_decorator(base)
@@ -137,10 +116,7 @@ def replaced_member(kind: type[Any], base: type[Any], ignored: Collection[str]) 
 
 
 def _apply_decorator(cls: type[Any]) -> None:
-    """Make a class with fields a dataclass of parameters, as its bases are, unless it is one or has an `__init__`.
-
-    Raise `InputError` if that is impossible, as with a list as a default or a field without one.
-    """
+    """Make a class with fields a dataclass of parameters, as its bases are, unless it is one or has an `__init__`."""
     is_complete = not get_annotations(cls) or not {"__dataclass_fields__", "__init__"}.isdisjoint(vars(cls))
     if is_dataclass(cls) and issubclass(cls, Subclassable) and not is_complete:
         config: ConfigDict = {**STRICT, "validate_default": True, "arbitrary_types_allowed": True}
@@ -156,24 +132,16 @@ def is_packaged(kind: type[Any]) -> bool:
 
 
 def check_part(name: str, part: Any) -> None:
-    """Raise `InputError` if a part of a record has a user's class with more than other values of its base's fields.
-
-    Records store the values of their parts alone: code and further fields would be ignored.
-    """
-    if not isinstance(part, Subclassable):
-        return
-    known = next(filter(is_packaged, type(part).__mro__))
-    if members := changed_members(type(part), known):
+    """Raise `InputError` if a part of a record has a user's class with code or further fields, which records lose."""
+    known = next(filter(is_packaged, type(part).__mro__), None) if isinstance(part, Subclassable) else None
+    if known and (members := changed_members(type(part), known)):
         allowed = f"{known.__name__}, or a class of other values for its fields"
         label = f"the class {type(part).__name__} with its {members[0]!r}"
         raise InputError(f"{name}: {label} is not allowed; allowed: {allowed}")
 
 
 def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) -> DataclassT:
-    """Return `kind(**values)`, or raise `InputError` with one line that names the first invalid value.
-
-    `field` is the origin of the values, for the message.
-    """
+    """Return `kind(**values)`; raise `InputError`, which begins with the `field`, for the first invalid value."""
     check_values(values, field)
     _apply_decorator(kind)
     try:
@@ -184,10 +152,7 @@ def build_dataclass(kind: type[DataclassT], values: dict[str, Any], field: str) 
 
 @dataclass_transform(field_specifiers=(field, Field))
 def parameter_dataclass(label: str | None = None, **options: Any) -> Callable[[type[DataclassT]], type[DataclassT]]:
-    """Decorate as pydantic's `dataclass` does; an invalid value in Python is an `InputError` of one line.
-
-    The line begins with `label`, by default the name of the class.
-    """
+    """Decorate as pydantic's `dataclass`; an invalid value is an `InputError` that begins with `label` or the class."""
 
     def decorate(kind: type[DataclassT]) -> type[DataclassT]:
         made: Any = dataclass(**options)(kind)
@@ -207,10 +172,7 @@ def parameter_dataclass(label: str | None = None, **options: Any) -> Callable[[t
 
 
 def check_values(value: Any, name: str) -> None:
-    """Raise `InputError` if `value` contains a huge integer, or a text with NUL.
-
-    TOML has 64 bits for integers; longer ones fit into no array and no float. No name of a file contains NUL.
-    """
+    """Raise `InputError` for an integer that fits into no array, or a text with NUL, which no file name has."""
     if isinstance(value, dict):
         for key, inner in value.items():
             check_values(inner, f"{name}.{key}".strip("."))
@@ -218,9 +180,8 @@ def check_values(value: Any, name: str) -> None:
         for inner in value:
             check_values(inner, name)
     elif isinstance(value, int) and value.bit_length() > MAX_INTEGER_BITS:
-        raise InputError(
-            f"{name}: a number of {value.bit_length()} bits is not allowed; allowed: at most {MAX_INTEGER_BITS}"
-        )
+        bits = f"{value.bit_length()} bits is not allowed; allowed: at most {MAX_INTEGER_BITS}"
+        raise InputError(f"{name}: a number of {bits}")
     elif isinstance(value, str) and "\0" in value:
         raise invalid_value(name, value, "a text without NUL")
 
@@ -255,15 +216,10 @@ def _field_names(kind: Any, path: Sequence[object]) -> list[str]:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the content of a text in TOML.
-
-    Raises:
-        ValueError, RecursionError: it is not TOML, or is nested too deep: a key of many parts takes memory as the
-            square of their number.
-    """
+    """Return the content of a text in TOML; raise `ValueError` or `RecursionError` unless it is, and not too deep."""
     import tomllib
 
-    if _DEEP_KEY.search(text):
+    if _DEEP_KEY.search(text):  # it would take memory as the square of the number of its parts
         raise ValueError(f"a key of more than {MAX_KEY_PARTS} parts")
     return tomllib.loads(text)
 
@@ -304,18 +260,11 @@ def split_parameters(text: str) -> tuple[str, dict[str, Any]]:
     head, _, tail = text.rpartition(":")
     if not head or "=" not in tail:
         return text, {}
-    return head, parse_assignments(_split_commas(tail), "driver")
-
-
-def _split_commas(text: str) -> list[str]:
-    """Split at commas outside brackets: `gaps=[1,2,3],window=38` has two parts."""
-    parts, depth, start = [], 0, 0
-    for index, letter in enumerate(text):
-        depth += (letter in "[(") - (letter in "])")
-        if letter == "," and depth == 0:
-            parts.append(text[start:index])
-            start = index + 1
-    return [*parts, text[start:]]
+    depths = accumulate((letter in "[(") - (letter in "])") for letter in tail)
+    # Commas in brackets do not separate: `gaps=[1,2,3],window=38`.
+    commas = [index for index, depth in enumerate(depths) if tail[index] == "," and not depth]
+    parts = [tail[before + 1 : end] for before, end in pairwise([-1, *commas, len(tail)])]
+    return head, parse_assignments(parts, "driver")
 
 
 def merge_changes(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

@@ -23,10 +23,7 @@ def plugin_names(group: PluginGroup) -> list[str]:
 
 
 def load_plugins(group: PluginGroup, *names: str) -> dict[str, Any]:
-    """Return the objects of a group by the names of their entry points: of all, or of these `names`.
-
-    One that cannot be imported is left out, with a warning: it must not break the other commands.
-    """
+    """Return the objects of a group by name, all or `names`; a broken one is left out, with a warning."""
     loaded: dict[str, Any] = {}
     for point in sorted(entry_points(group=group)):
         if not names or point.name in names:

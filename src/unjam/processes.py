@@ -22,20 +22,14 @@ from unjam.files import open_in_place, remove
 from unjam.folders import PROTECTED_FOLDERS_VARIABLE, protect_folder, protected_folders
 from unjam.sandbox import confine_process, limit_resources
 
-PARENT_VARIABLE = "UNJAM_PARENT"
-"""environment variable with the id of the process with which a child ends"""
-TRACI_VARIABLES = "LIBSUMO_AS_TRACI", "LIBTRACI_AS_TRACI"
-"""variables that replace traci by another library, which reports it on standard output"""
-LOCK_FILE = ".lock"
-"""the file that locks a folder for its writer"""
-HEARTBEAT_INTERVAL, MAX_MISSED_HEARTBEATS = 10.0, 6
-"""time between two heartbeats of a folder's owner [s], and how many it may miss"""
+PARENT_VARIABLE = "UNJAM_PARENT"  # environment variable with the id of the process with which a child ends
+TRACI_VARIABLES = "LIBSUMO_AS_TRACI", "LIBTRACI_AS_TRACI"  # replace traci by a library that prints this
+LOCK_FILE = ".lock"  # the file that locks a folder for its writer
+HEARTBEAT_INTERVAL, MAX_MISSED_HEARTBEATS = 10.0, 6  # of a folder's owner [s], and how many it may miss
 PRIVATE_FOLDER_PREFIX, PRIVATE_LOCK_FILE = "unjam-", ".temporary"
 """beginning of the names of private temporary folders, and the file that locks one for its process"""
-PR_SET_PDEATHSIG = 1
-"""Linux's option of prctl"""
-MAX_CHILD_MEMORY, MAX_CHILD_TIME = 8 * 2**30, 600
-"""limits of reading an untrusted file [bytes, s]"""
+PR_SET_PDEATHSIG = 1  # Linux's option of prctl
+MAX_CHILD_MEMORY, MAX_CHILD_TIME = 8 * 2**30, 600  # limits of reading an untrusted file [bytes, s]
 _is_command_line = False
 
 
@@ -47,10 +41,7 @@ def bind_to_parent(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def mark_as_command_line() -> None:
-    """Mark this process as the command line: its standard output is for results alone.
-
-    Only in such a process can unjam change settings of all threads.
-    """
+    """Mark this process as the command line, whose standard output is for results alone."""
     global _is_command_line
     _is_command_line = True
     for name in TRACI_VARIABLES:
@@ -64,10 +55,7 @@ def redirect_user_output() -> AbstractContextManager[object]:
 
 @contextmanager
 def ending_forks() -> Iterator[None]:
-    """End a fork of this process, made by code of users within the block, where it would leave the block.
-
-    It would go on with the episode of this process, or end SUMO and remove files that this process needs.
-    """
+    """End a fork that users' code makes within the block, where it would go on with the episode of this process."""
     process, code = os.getpid(), 0
     try:
         yield
@@ -83,10 +71,7 @@ def ending_forks() -> Iterator[None]:
 
 
 def exit_with_parent(signum: int) -> None:
-    """Let Linux send this process a signal when its parent ends, if the parent used `bind_to_parent`.
-
-    The signal arrives even if the process is busy.
-    """
+    """Let Linux signal this process, even a busy one, when its parent ends, if the parent used `bind_to_parent`."""
     parent = os.environ.pop(PARENT_VARIABLE, "")
     if not parent or sys.platform != "linux":
         return
@@ -123,11 +108,8 @@ def continue_in_limited_child(description: str, *writable: Path) -> None:
     """Continue in a child with limited resources, which reads untrusted files; this process waits for it.
 
     If the kernel supports it, the child can write only into the folders `writable`, and has no network. On Windows
-    nothing changes.
-
-    Raises:
-        SystemExit: in this process, with the child's exit code.
-        InputError: in this process: the child took too much memory or time, or crashed.
+    nothing changes. This process exits with the child's code, or raises `InputError` if the child took too much memory
+    or time, or crashed.
     """
     if not hasattr(os, "fork"):
         return
@@ -179,13 +161,10 @@ def has_display() -> bool:
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Lock an existing folder for this process; the lock ends with the process at the latest.
+    """Lock an existing folder for this process; `InputError` if another one has, or if an entry is a link.
 
     If machines share a folder but not its locks, the age of the lock shows that an owner elsewhere is alive. On
     Windows there is no lock. Within the block neither this process nor its children follow links inside the folder.
-
-    Raises:
-        InputError: another process has locked it, or one of its entries is a link.
     """
     with protect_folder(folder), lock_file(folder / LOCK_FILE, f"run: {str(folder)!r}"):
         yield
@@ -201,7 +180,7 @@ def lock_file(path: Path, target: str) -> Iterator[None]:
             descriptor = _open_locked(path, target)
         if descriptor is not None:
             stack.callback(os.close, descriptor)
-            _check_other_machine(path, descriptor, target)
+            _check_other_machine(descriptor, target)
             os.pwrite(descriptor, f"{platform.node()} {os.getpid()}\n".ljust(300).encode(), 0)
             stop = threading.Event()
             heart = threading.Thread(target=_send_heartbeats, args=(descriptor, stop), daemon=True)
@@ -218,24 +197,25 @@ def _send_heartbeats(descriptor: int, stop: threading.Event) -> None:
             os.utime(descriptor)
 
 
-def _check_other_machine(path: Path, descriptor: int, target: str) -> None:
+def _check_other_machine(descriptor: int, target: str) -> None:
     """Raise `InputError` if a process of another machine has locked the file and is alive."""
-    owner, age, max_age = _read_owner(descriptor)
-    if owner and owner[0] != platform.node() and abs(age) < max_age:
-        message = f"{target} is being written on {owner[0]}"
-        raise InputError(f"{message}; allowed: one at a time, or {max_age:g} s after its end")
+    owner = _recent_owner(descriptor)
+    if owner and owner[0] != platform.node():
+        allowed = f"one at a time, or {MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL:g} s after its end"
+        raise InputError(f"{target} is being written on {owner[0]}; allowed: {allowed}")
 
 
-def _read_owner(descriptor: int) -> tuple[list[str], float, float]:
-    """Return machine and process that have locked a file, the age of their last heartbeat, and its limit [s]."""
-    owner = os.pread(descriptor, 300, 0).decode(errors="replace").split()
-    return owner, time.time() - os.fstat(descriptor).st_mtime, MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL
+def _recent_owner(descriptor: int) -> list[str]:
+    """Return machine and process that have locked a file; empty if they have sent no recent heartbeat."""
+    age = time.time() - os.fstat(descriptor).st_mtime
+    is_recent = abs(age) < MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL
+    return os.pread(descriptor, 300, 0).decode(errors="replace").split() if is_recent else []
 
 
 def _check_this_machine(descriptor: int, target: str) -> None:
     """Raise `InputError` if a living process of this machine has named itself in a file that cannot be locked."""
-    owner, age, max_age = _read_owner(descriptor)
-    if len(owner) == 2 and owner[0] == platform.node() and owner[1].isdecimal() and abs(age) < max_age:
+    owner = _recent_owner(descriptor)
+    if len(owner) == 2 and owner[0] == platform.node() and owner[1].isdecimal():
         with suppress(ProcessLookupError, OverflowError):
             with suppress(PermissionError):  # it is of another user
                 os.kill(int(owner[1]), 0)
@@ -252,22 +232,18 @@ class PrivateFolder(AbstractContextManager[str]):
     """A temporary folder, removed at the end of its process, or by a later one if that is killed."""
 
     def __init__(self) -> None:
-        """Make and lock it."""
         self.name = tempfile.mkdtemp(prefix=PRIVATE_FOLDER_PREFIX)
         lock = _open_locked(Path(self.name, PRIVATE_LOCK_FILE))
         if lock is not None:
             os.write(lock, _folder_identity(Path(self.name)))
-        self._finalizer = finalize(self, _remove_private_folder, Path(self.name), lock, os.getpid())
+        self.cleanup = finalize(self, _remove_private_folder, Path(self.name), lock, os.getpid())
+        """removes it; may be called twice, and has no effect in a fork of its process"""
 
     def __enter__(self) -> str:
         return self.name
 
     def __exit__(self, *error: object) -> None:
         self.cleanup()
-
-    def cleanup(self) -> None:
-        """Remove it; may be called twice, and has no effect in a fork of its process."""
-        self._finalizer()
 
 
 def _remove_private_folder(folder: Path, lock: int | None, process: int) -> None:
@@ -285,13 +261,8 @@ def remove_stale_private_folders() -> None:
         with suppress(OSError, AttributeError, InputError):  # Windows has no users; it is locked
             status, lock = folder.lstat(), folder / PRIVATE_LOCK_FILE
             is_old = time.time() - status.st_mtime >= MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL
-            is_own_folder = status.st_uid == os.getuid() and stat.S_ISDIR(status.st_mode)
-            if (
-                is_old
-                and is_own_folder
-                and lock.is_file()
-                and (descriptor := _open_locked(lock, needs_lock=True)) is not None
-            ):
+            is_own = status.st_uid == os.getuid() and stat.S_ISDIR(status.st_mode) and lock.is_file()
+            if is_old and is_own and (descriptor := _open_locked(lock, needs_lock=True)) is not None:
                 with suppress(DiskError):
                     if os.pread(descriptor, 100, 0) == _folder_identity(folder):  # else another program made it
                         remove(folder)
@@ -312,7 +283,7 @@ def check_not_locked(folder: Path) -> None:
         if not is_file or (descriptor := _open_locked(path, target, is_shared=True)) is None:
             return
         try:
-            _check_other_machine(path, descriptor, target)
+            _check_other_machine(descriptor, target)
         finally:
             os.close(descriptor)
 
@@ -327,12 +298,7 @@ def is_locked(folder: Path) -> bool:
 
 
 def _open_locked(path: Path, target: str = "", is_shared: bool = False, needs_lock: bool = False) -> int | None:
-    """Return an open and locked file, with `is_shared` for reading alone; None without locks on this platform.
-
-    On a file system without locks return the open file, or with `needs_lock` None.
-
-    Raise `InputError` if another process has locked it, or without locks, if one that is alive has named itself in it.
-    """
+    """Return an open and locked file; None on a platform, and with `needs_lock` on a file system, without locks."""
     try:
         import fcntl
     except ImportError:

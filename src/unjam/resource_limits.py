@@ -1,7 +1,4 @@
-"""Python functions that read untrusted files in a resource-limited subprocess, the command line.
-
-These are `unjam.verify_controller` and `unjam.write_report`.
-"""
+"""Python functions that read untrusted files in a resource-limited subprocess, the command line."""
 
 import json
 import subprocess
@@ -18,10 +15,8 @@ from unjam.trust import TRUST_CODE_OPTION
 def verify_controller(path: Path | str, trust_code: bool = False, signer: Path | str | None = None) -> list[PartCheck]:
     """Return the check of each part of a `.unjam` file or a run folder; only trusted code runs.
 
-    Each is `checked`, `absent`, or `stated` by the maker alone; no part that is there is left unchecked.
-
-    As in `unjam verify`, a subprocess with little memory and time reads it. If the kernel supports it, that process can
-    neither write nor use the network.
+    Each is `checked`, `absent`, or `stated` by the maker alone; no part that is there is left unchecked. As in `unjam
+    verify`, a subprocess with little memory and time reads it, if possible without writing and network.
 
     Args:
         path: the file, or the folder.
@@ -40,11 +35,8 @@ def verify_controller(path: Path | str, trust_code: bool = False, signer: Path |
 def write_report(folders: Sequence[Path | str], target: Path | str) -> Path:
     """Write the report of one folder of results, or a comparison of several; return its path.
 
-    As in `unjam report`, a subprocess reads the folders, which can write only into the folder of `target`.
-
-    Raises:
-        InputError: a folder holds no results, or another process writes it.
-        DiskError: the page cannot be written, or its folder is missing.
+    As in `unjam report`, a subprocess reads the folders, which can write only into the folder of `target`. Raise
+    `InputError` if a folder holds no results or is being written, `DiskError` if the page cannot be written.
     """
     _run_json_command("report", "--out", str(target), "--", *map(str, folders))
     return Path(target)

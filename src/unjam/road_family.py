@@ -11,11 +11,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 FamilyPart = Literal["training", "combination", "axis"]
-FAMILY_PREFIX = "family/"
-"""beginning of the names of the family's roads as scenarios"""
+FAMILY_PREFIX = "family/"  # beginning of the names of the family's roads as scenarios
 
-SHORT_WARM_UP, LONG_WARM_UP = 750, 6000
-"""human-only simulation steps before the CAVs are switched on: a wave begins, or is fully developed"""
+SHORT_WARM_UP, LONG_WARM_UP = 750, 6000  # human-only simulation steps: a wave begins, or is fully developed
 AGGRESSIVE_IDM = {"time_headway": 0.9, "max_acceleration": 1.3, "comfortable_deceleration": 2.0}
 """human drivers that follow closer and accelerate harder than the paper's"""
 NGSIM_IDM = {
@@ -23,8 +21,7 @@ NGSIM_IDM = {
     **{"max_acceleration": 1.243, "comfortable_deceleration": 1.424},
 }
 """the common IDM of the 325 drivers of the NGSIM pairs, results/field.json"""
-ACTUATOR_LATENCY, LONG_ACTUATOR_LATENCY = {"lag": 0.3, "delay": 0.2}, {"lag": 0.5, "delay": 0.5}
-"""usual and long latency of an actuator [s]"""
+ACTUATOR_LATENCY, LONG_ACTUATOR_LATENCY = {"lag": 0.3, "delay": 0.2}, {"lag": 0.5, "delay": 0.5}  # [s]
 SENSOR_ERRORS = {"gap_error": 0.5, "speed_error": 0.3}
 NOISY_SENSORS: dict[str, Any] = {"sensors": {**SENSOR_ERRORS, "dropout": 0.1}, "safety": SENSOR_ERRORS}
 """sensors with errors that lose a tenth of the readings; the safety filter allows for the errors"""
@@ -95,12 +92,8 @@ FAMILY: dict[str, FamilyRoad] = {
         "on-ramp", {"penetration_rate": 0.1, "inflow": 2200.0, "ramps.0.inflow": 350.0, **ASTAZERO_DRIVERS}, "axis"
     ),
 }
-"""all roads by name"""
-FAMILY_SCENARIOS = {f"{FAMILY_PREFIX}{name}": road for name, road in FAMILY.items()}
-"""all roads by their names as scenarios"""
+FAMILY_SCENARIOS = {f"{FAMILY_PREFIX}{name}": road for name, road in FAMILY.items()}  # by scenario
 GROUP_BY_SCENARIO = {"ring": "rings", "figure-eight": "figure-eights", "on-ramp": "motorways", "on-ramp-1": "motorways"}
 """group of roads of each scenario, for which one expert exists"""
-SHARED_RINGS_GROUP, ALL_ROADS_GROUP = "shared-rings", "all-roads"
-"""names of the rings with several CAVs, and of the whole family"""
+SHARED_RINGS_GROUP, ALL_ROADS_GROUP = "shared-rings", "all-roads"  # rings with several CAVs; all roads
 ROAD_GROUPS = (*dict.fromkeys(GROUP_BY_SCENARIO.values()), SHARED_RINGS_GROUP, ALL_ROADS_GROUP)
-"""names of all groups"""

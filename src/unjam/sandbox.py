@@ -1,8 +1,7 @@
 """Restrict a process that reads untrusted files: little memory and time, no writing, no network.
 
 The kernel enforces it, for children too, and permanently: Landlock protects the disk, and a filter of system calls
-(seccomp) blocks sockets. Run as a program, this file runs another program in this way; it needs only Python's standard
-library.
+(seccomp) blocks sockets. Run as a program, this file runs another one in this way, with the standard library alone.
 """
 
 import ctypes
@@ -16,21 +15,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446
-"""Landlock's system calls, the same on all processors"""
+CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446  # Landlock's system calls, the same on all processors
 WRITE_FILE, TRUNCATE = 1 << 1, 1 << 14
-REMOVE_AND_CREATE = 0b1_1111_1111 << 4
-"""rights to remove and create folders, files, devices, sockets, pipes and links"""
-REFER = 1 << 13
-"""moving to another folder"""
-NO_NEW_PRIVILEGES, SET_SECCOMP, SECCOMP_FILTER_MODE = 38, 22, 2
-"""options of `prctl`"""
+REMOVE_AND_CREATE = 0b1_1111_1111 << 4  # folders, files, devices, sockets, pipes and links
+REFER = 1 << 13  # moving to another folder
+NO_NEW_PRIVILEGES, SET_SECCOMP, SECCOMP_FILTER_MODE = 38, 22, 2  # options of `prctl`
 SOCKET_SYSCALLS = {"x86_64": (0xC000003E, 41), "aarch64": (0xC00000B7, 198), "riscv64": (0xC00000F3, 198)}
 """number of the processor in the kernel and number of the system call `socket`, by name of the processor"""
-IO_URING_SETUP = 425
-"""a system call that can open sockets too"""
-X32_SYSCALL_BIT = 0x40000000
-"""marks other numbers of the same system calls (x32)"""
+IO_URING_SETUP = 425  # a system call that can open sockets too
+X32_SYSCALL_BIT = 0x40000000  # marks other numbers of the same system calls (x32)
 EPERM = 1
 _limit_lock = threading.Lock()
 
@@ -69,10 +62,7 @@ def limit_memory_growth(memory: int) -> Iterator[None]:
 
 
 def confine_process(*writable: Path) -> None:
-    """Permanently deny sockets to this thread and its children, and writing except into these folders.
-
-    Each of both applies if the kernel supports it.
-    """
+    """Permanently deny sockets to this thread and its children, and writing except into these folders, if possible."""
     restrict_writing(*writable)
     if sys.platform == "linux":
         _block_sockets(ctypes.CDLL(None))

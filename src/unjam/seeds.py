@@ -5,21 +5,16 @@ seeds of the other families begin with their own number.
 """
 
 import warnings
+from functools import partial
 
 from unjam.parameters import check_integer
 
-TRAINING_SEED_LIMIT = 1_000_000
-"""seeds of trainings, and of `unjam drive --seed`, are smaller"""
-TEST_SEED = 1_000_039
-"""first number of test seeds (earlier 1,000,003, with which presets and pacers had been selected)"""
-VALIDATION_SEED = 1_000_033
-"""first number of validation seeds, which select a controller within a training"""
-TUNING_SEED = 1_000_037
-"""first number of tuning seeds, for parameters of an expert or of the human drivers on a user's road"""
-SELECTION_SEED = 1_000_081
-"""first number of selection seeds, which select a controller for a user's road"""
-RESERVED_SEEDS = range(TRAINING_SEED_LIMIT, TRAINING_SEED_LIMIT + 1000)
-"""first numbers of seeds that are reserved for such purposes"""
+TRAINING_SEED_LIMIT = 1_000_000  # seeds of trainings, and of `unjam drive --seed`, are smaller
+TEST_SEED = 1_000_039  # first number (earlier 1,000,003, with which presets and pacers had been selected)
+VALIDATION_SEED = 1_000_033  # first number of validation seeds, which select a controller within a training
+TUNING_SEED = 1_000_037  # first number for an expert, or for the human drivers on a user's road
+SELECTION_SEED = 1_000_081  # first number of selection seeds, which select a controller for a user's road
+RESERVED_SEEDS = range(TRAINING_SEED_LIMIT, TRAINING_SEED_LIMIT + 1000)  # first numbers for such purposes
 
 
 def warn_of_reserved_seed(*seeds: int | None) -> None:
@@ -27,6 +22,11 @@ def warn_of_reserved_seed(*seeds: int | None) -> None:
     if (found := next((seed for seed in seeds if seed in RESERVED_SEEDS), None)) is not None:
         text = f"reset: seed={found} is reserved for tests; allowed in trainings: other seeds"
         warnings.warn(f"{text}, such as those below {TRAINING_SEED_LIMIT:,}", stacklevel=3)
+
+
+def _numbered_seeds(family: int, count: int, first: int = 0) -> list[tuple[int, ...]]:
+    count, first = check_integer("count", count, 0), check_integer("first", first, 0)
+    return [(family, index) for index in range(first, first + count)]
 
 
 def held_out_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
@@ -37,16 +37,4 @@ def held_out_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
     return _numbered_seeds(TEST_SEED, count, first)
 
 
-def selection_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
-    """Return selection seeds, from number `first` on."""
-    return _numbered_seeds(SELECTION_SEED, count, first)
-
-
-def tuning_seeds(count: int, first: int = 0) -> list[tuple[int, ...]]:
-    """Return tuning seeds, from number `first` on."""
-    return _numbered_seeds(TUNING_SEED, count, first)
-
-
-def _numbered_seeds(family: int, count: int, first: int) -> list[tuple[int, ...]]:
-    count, first = check_integer("count", count, 0), check_integer("first", first, 0)
-    return [(family, index) for index in range(first, first + count)]
+selection_seeds, tuning_seeds = (partial(_numbered_seeds, family) for family in (SELECTION_SEED, TUNING_SEED))

@@ -1,9 +1,8 @@
 """Convert records to JSON and arrays, and back: the format of files and of messages to workers.
 
 A tree is made of dataclasses, named tuples, dicts, tuples and lists; its leaves are arrays, paths and plain values.
-`pack` converts it, and `unpack` restores it by the declared types of its records. Where the declared type is the base
-of several classes, the name of the class is stored as `kind`. Nothing is ever executed, and what does not fit the
-declared types is refused.
+`unpack` restores it by the declared types of its records; where that is the base of several classes, the name of the
+class is stored as `kind`. Nothing is ever executed, and what does not fit the declared types is refused.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -16,14 +15,10 @@ from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 import numpy as np
 
 ValueT = TypeVar("ValueT")
-Arrays = dict[str, np.ndarray]
-"""arrays by path in the tree, such as `trajectories.0.states.speed`"""
-ARRAY_KEY = "array"
-"""key of the JSON object that represents an array; its value is the path"""
-KIND_KEY = "kind"
-"""key of the name of a class"""
-ClassesByBase = Mapping[type, Mapping[str, type]]
-"""the classes that may stand for a base class, by their names"""
+Arrays = dict[str, np.ndarray]  # arrays by path in the tree, such as `trajectories.0.states.speed`
+ARRAY_KEY = "array"  # key of the JSON object that represents an array; its value is the path
+KIND_KEY = "kind"  # key of the name of a class
+ClassesByBase = Mapping[type, Mapping[str, type]]  # the classes that may stand for a base class, by their names
 
 
 def select_prefix(prefix: str, values: Mapping[str, ValueT]) -> dict[str, ValueT]:
@@ -54,19 +49,14 @@ def pack(tree: Any, path: str = "", classes: ClassesByBase = {}) -> tuple[Any, A
 
 
 def unpack(kind: Any, packed: Any, arrays: Arrays, classes: ClassesByBase = {}) -> Any:  # noqa: B006
-    """Return the tree of type `kind` that `pack` converted; a missing part has its default.
-
-    Raises:
-        ValueError: it has another type: a name, a type or an array is missing, unknown or wrong.
-    """
+    """Return the tree of type `kind` that `pack` converted; `ValueError` if a name, a type or an array is wrong."""
     if isinstance(packed, dict) and packed.keys() == {ARRAY_KEY} and isinstance(packed[ARRAY_KEY], str):
-        if packed[ARRAY_KEY] not in arrays or not (kind is Any or _is_array(kind)):
+        if packed[ARRAY_KEY] not in arrays or not (kind is Any or np.ndarray in (kind, get_origin(kind))):
             raise ValueError(f"array {packed[ARRAY_KEY]!r} is missing, or has no place")
         return arrays[packed[ARRAY_KEY]]
     if kind is Any:
-        if not isinstance(packed, dict):
-            return packed
-        return {name: unpack(Any, part, arrays) for name, part in packed.items()}
+        is_table = isinstance(packed, dict)
+        return {name: unpack(Any, part, arrays) for name, part in packed.items()} if is_table else packed
     if kind in classes:
         _check_type(dict, packed, kind)
         name, packed = packed.get(KIND_KEY), {key: part for key, part in packed.items() if key != KIND_KEY}
@@ -79,10 +69,10 @@ def unpack(kind: Any, packed: Any, arrays: Arrays, classes: ClassesByBase = {}) 
             return None
         (kind,) = (member for member in inner if member is not NoneType)
         return unpack(kind, packed, arrays, classes)
-    types = _field_types(kind)
-    if types is not None:
+    if (parts := _record_parts(kind)) is not None:
+        types, required = parts
         _check_type(dict, packed, kind)
-        unknown, missing = packed.keys() - types.keys(), _required_parts(kind) - packed.keys()
+        unknown, missing = packed.keys() - types.keys(), required - packed.keys()
         if unknown or missing:
             raise ValueError(f"{kind.__name__}: {min(unknown | missing)!r} is {'unknown' if unknown else 'missing'}")
         return kind(**{name: unpack(types[name], part, arrays, classes) for name, part in packed.items()})
@@ -143,27 +133,15 @@ def named_parts(value: Any) -> dict[str, Any] | None:
 
 
 @cache
-def _field_types(kind: Any) -> dict[str, Any] | None:
-    """Return the declared types of a record's parts; None: not a record."""
+def _record_parts(kind: Any) -> tuple[dict[str, Any], set[str]] | None:
+    """Return the declared types of a record's parts, and the names of those without a default; None: not a record."""
     if is_dataclass(kind):
-        hints = get_type_hints(kind)
-        return {field.name: hints[field.name] for field in fields(kind) if field.init}
+        hints, parts = get_type_hints(kind), [field for field in fields(kind) if field.init]
+        required = {field.name for field in parts if (field.default, field.default_factory) == (MISSING, MISSING)}
+        return {field.name: hints[field.name] for field in parts}, required
     if isinstance(kind, type) and hasattr(kind, "_fields"):
-        return get_type_hints(kind)
+        return get_type_hints(kind), kind._fields - kind._field_defaults.keys()
     return None
-
-
-@cache
-def _required_parts(kind: Any) -> frozenset[str]:
-    """Return the parts of a record that have no default."""
-    if not is_dataclass(kind):
-        return frozenset(kind._fields) - kind._field_defaults.keys()
-    defaults = ((field.name, (field.default, field.default_factory)) for field in fields(kind) if field.init)
-    return frozenset(name for name, default in defaults if default == (MISSING, MISSING))
-
-
-def _is_array(kind: Any) -> bool:
-    return get_origin(kind) is np.ndarray or kind is np.ndarray
 
 
 def _check_type(kind: type, value: Any, declared: Any) -> None:

@@ -14,21 +14,17 @@ from unjam.errors import InputError, UnjamError, one_line
 from unjam.files import atomic_write, make_folder, sha256_of
 from unjam.user_code import UserCode, read_code
 
-TRUSTED_VARIABLE = "UNJAM_TRUSTED"
-"""environment variable with the keys of trusted code, in addition to the remembered ones"""
+TRUSTED_VARIABLE = "UNJAM_TRUSTED"  # keys of trusted code, in addition to the remembered ones
 TRUST_ALL = "all"
 TRUST_CODE_OPTION = "--trust-code"
-EXPECTED_CODE_VARIABLE = "UNJAM_EXPECTED_CODE"
-"""environment variable with the files and hashes of code at the check of the configuration of a child"""
-MAX_NAMED_FILES = 1000
-"""maximum number of files that a text can name, whatever its separators mean"""
+EXPECTED_CODE_VARIABLE = "UNJAM_EXPECTED_CODE"  # files and hashes of code at the check of a child's configuration
+MAX_NAMED_FILES = 1000  # that a text can name, whatever its separators mean
 _lock = threading.Lock()
 _saved_values: list[str | None] = []
 """value of the variable before the first of the running blocks of `trusting_code`, for each of them"""
 _checked_files: dict[str, str]
 """resolved paths by the absolute names that a configuration was checked with: a link can change meanwhile"""
-_expected_hashes: dict[str, str]
-"""hashes by resolved path; empty: there was no file"""
+_expected_hashes: dict[str, str]  # hashes by resolved path; empty: there was no file
 _checked_files, _expected_hashes = json.loads(os.environ.get(EXPECTED_CODE_VARIABLE, "[{}, {}]"))
 
 
@@ -67,10 +63,7 @@ def check_trusted(context: str, code: UserCode) -> None:
 
 
 def check_trusted_values(context: str, values: Any) -> None:
-    """Check all files that texts in `values` can name, as `check_trusted`; other code is refused there until the end.
-
-    That is code of other files, if links change, and code of files that do not exist yet.
-    """
+    """Check all files that texts in `values` can name, as `check_trusted`; other or new code there is then refused."""
     if isinstance(values, str) and not is_all_code_trusted():
         for name, path in _code_files(context, values):
             code = read_code(path) if os.path.isfile(path) else None
@@ -110,10 +103,7 @@ def expecting_code() -> Iterator[None]:
 
 
 def remember_trusted(code: Path, sha256: str = "") -> None:
-    """Remember that this user runs this code at this place; if that cannot be stored, for children alone.
-
-    Without a hash it is the current code.
-    """
+    """Remember that this user runs this code, or else the current one, here; if that fails, for children alone."""
     try:
         key = _trust_key(code, sha256 or read_code(code).sha256)
     except OSError:  # loading it will report the error
@@ -129,10 +119,7 @@ def remember_trusted(code: Path, sha256: str = "") -> None:
 
 
 def _code_files(context: str, text: str) -> Iterator[tuple[str, Path]]:
-    """Yield name and path of all files that a text can name as `path.py:name`, whatever else it contains.
-
-    Names are absolute, and keep links and `..`, which can lead through folders that do not exist.
-    """
+    """Yield name and path of each file that a text can name as `path.py:name`; the name is absolute and keeps links."""
     if ".py:" not in text or "\0" in text:
         return
     starts = [0, *(index + 1 for index, letter in enumerate(text) if letter == "+")]
@@ -156,5 +143,4 @@ def _trusted_keys() -> list[str]:
 
 
 def _trust_folder() -> Path:
-    """Return the folder of remembered keys: below `$UNJAM_STATE`, or the user's folder for the state of programs."""
     return Path(os.environ.get("UNJAM_STATE") or platformdirs.user_state_dir("unjam"), "trusted")

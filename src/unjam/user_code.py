@@ -1,8 +1,7 @@
 """Users' Python files: read once with the modules that they import from their folder, hashed, and run as read.
 
-The bytes that were hashed are compiled and run. Bytecode in the folder is neither read nor written, and replacing a
-file after reading has no effect. Modules of several folders can have the same names: in `sys.modules` their names
-begin with one that belongs to the file, and only they find each other by `import`.
+Bytecode in the folder is neither read nor written, and replacing a file after reading has no effect. Modules of
+several folders can have the same names: in `sys.modules` these begin with one that belongs to the file.
 """
 
 import ast
@@ -23,9 +22,9 @@ from typing import Any
 from unjam.errors import InputError
 from unjam.files import sha256_of
 
-USER_MODULE_PREFIX = "unjam_user_"
-"""beginning of the names of users' modules in `sys.modules`"""
+USER_MODULE_PREFIX = "unjam_user_"  # beginning of the names of users' modules in `sys.modules`
 INIT_FILE = "__init__.py"
+_compile_source = lru_cache(1024)(InspectLoader.source_to_code)
 
 
 @dataclass(frozen=True)
@@ -52,13 +51,9 @@ class UserCode:
 
 
 def read_code(path: Path) -> UserCode:
-    """Read a Python file and the modules of its folder that its import statements name.
+    """Read a Python file and the modules of its folder that its import statements name, unless a package is installed.
 
-    Installed packages take precedence over modules of the folder with the same name.
-
-    Raises:
-        InputError: it imports a compiled module of its folder.
-        OSError: a file cannot be read.
+    Raise `InputError` for a compiled module of the folder, `OSError` if a file cannot be read.
     """
     modules = {"": (path, path.read_bytes())}
     unread = [""]
@@ -130,11 +125,6 @@ def _imported_names(source: bytes, package: str) -> tuple[str, ...]:
             base = ".".join([*parts, *([node.module] if node.module else [])])
             names |= dict.fromkeys([base, *(f"{base}.{alias.name}" for alias in node.names)])
     return tuple(names)
-
-
-@lru_cache(1024)
-def _compile_source(source: bytes, path: str) -> CodeType:
-    return InspectLoader.source_to_code(source, path)
 
 
 def _is_package(path: Path) -> bool:

@@ -196,7 +196,8 @@ def test_human_drivers_have_no_notes_about_cavs() -> None:
 def test_columns_have_the_order_of_all_tables() -> None:
     names = "runs/ring-002", "pi", "unjam:best", "human", "runs/ring-001", "acc:time_headway=1"
     expected = ["human", "pi", "acc:time_headway=1", "runs/ring-002", "unjam:best", "runs/ring-001"]
-    result = drive_results(**{name: rows_of([1.0]) for name in names})
+    rows: dict[str, Any] = {name: rows_of([1.0]) for name in names}
+    result = drive_results(**rows)
     assert [column.name for column in report_columns([result])] == expected
     folders = [replace(result, folder=Path(f"runs/{name}")) for name in "ab"]
     assert [column.name for column in report_columns(folders)][:4] == [

@@ -268,12 +268,12 @@ def test_a_controller_of_a_users_road_is_certified_and_its_code_needs_trust(
 def test_files_that_belong_to_no_controller_are_not_overwritten(
     option: str, suffix: str, run: Path, tmp_path: Path
 ) -> None:
-    mine = tmp_path / f"mine{suffix}"
+    mine, options = tmp_path / f"mine{suffix}", dict[str, Any]({option: True})
     mine.write_text("mine")
     with pytest.raises(InputError, match=rf"out: .*mine\{suffix} exists and belongs to no mine.unjam"):
-        export_controller(run, tmp_path / "mine.unjam", **{option: True})
+        export_controller(run, tmp_path / "mine.unjam", **options)
     assert mine.read_text() == "mine"
     mine.unlink()
     for _ in range(2):  # its own files are replaced
-        export_controller(run, tmp_path / "mine.unjam", **{option: True})
+        export_controller(run, tmp_path / "mine.unjam", **options)
         assert mine.is_file()

@@ -201,7 +201,11 @@ def test_small_budget_reports_the_missing_seeds() -> None:
 
 
 def test_infeasible_and_failed_controllers_end_after_the_first_round() -> None:
-    for change in ({"min_time_gap": 0.1}, {"status": "failed", "reason": "lost", "error": "EpisodeError"}):
+    changes: list[dict[str, Any]] = [
+        {"min_time_gap": 0.1},
+        {"status": "failed", "reason": "lost", "error": "EpisodeError"},
+    ]
+    for change in changes:
         drive = MadeUp({PI: shift_travel_time(-9.0, **change), IDM_MORE: shift_travel_time(-9.0)})
         first, second = run_judge(drive, [PI, IDM_MORE]).controller_results
         assert first.verdict == NOT_RECOMMENDED

@@ -15,47 +15,23 @@ import typer
 from typer import Option
 from typer.core import TyperGroup
 
-from unjam import __version__
+from unjam import __version__, errors
 from unjam.child_processes import isolate_children, isolate_matplotlib
 from unjam.cli.options import with_trust_option
-from unjam.errors import (
-    DISK_ERRNOS,
-    InputError,
-    UnjamError,
-    disk_error,
-    invalid_value,
-    missing_package_error,
-    printable,
-    unknown_name,
-)
+from unjam.errors import InputError, UnjamError, invalid_value, missing_package_error, printable, unknown_name
 from unjam.plugins import load_plugins, plugin_names
 from unjam.processes import exit_with_parent, mark_as_command_line
 
 INTERRUPTED_EXIT_CODE = 130
 COMMANDS = {
-    "scenarios": "unjam.cli.catalog",
-    "drivers": "unjam.cli.catalog",
-    "new": "unjam.cli.new",
-    "drive": "unjam.cli.drive",
-    "assess": "unjam.cli.drive",
-    "benchmark": "unjam.cli.benchmark",
-    "calibrate": "unjam.cli.calibration",
-    "train": "unjam.cli.train",
-    "evaluate": "unjam.cli.runs",
-    "model": "unjam.cli.runs",
-    "fit-drivers": "unjam.cli.calibration",
-    "report": "unjam.cli.runs",
-    "tune": "unjam.cli.calibration",
-    "search": "unjam.cli.train",
-    "export": "unjam.cli.controllers",
-    "certify": "unjam.cli.controllers",
-    "keys": "unjam.cli.controllers",
-    "sign": "unjam.cli.controllers",
-    "verify": "unjam.cli.controllers",
-    "watch": "unjam.cli.drive",
-    "bench": "unjam.cli.diagnostics",
-    "doctor": "unjam.cli.diagnostics",
-    "runs": "unjam.cli.runs",
+    **{"scenarios": "unjam.cli.catalog", "drivers": "unjam.cli.catalog", "new": "unjam.cli.new"},
+    **{"drive": "unjam.cli.drive", "assess": "unjam.cli.drive", "benchmark": "unjam.cli.benchmark"},
+    **{"calibrate": "unjam.cli.calibration", "train": "unjam.cli.train", "evaluate": "unjam.cli.runs"},
+    **{"model": "unjam.cli.runs", "fit-drivers": "unjam.cli.calibration", "report": "unjam.cli.runs"},
+    **{"tune": "unjam.cli.calibration", "search": "unjam.cli.train", "export": "unjam.cli.controllers"},
+    **{"certify": "unjam.cli.controllers", "keys": "unjam.cli.controllers", "sign": "unjam.cli.controllers"},
+    **{"verify": "unjam.cli.controllers", "watch": "unjam.cli.drive", "bench": "unjam.cli.diagnostics"},
+    **{"doctor": "unjam.cli.diagnostics", "runs": "unjam.cli.runs"},
 }
 """module of each command, which defines NAME_command"""
 CODE_RUNNING_COMMANDS = {
@@ -126,7 +102,7 @@ class _LineFormatter(logging.Formatter):
 
 
 def _format_warning(message: Warning | str, category: type[Warning], *place: Any) -> str:
-    """Return a warning without control characters; where in the code it arose is of no use to users."""
+    """Return a warning without control characters, and without the place in the code."""
     return printable(f"{category.__name__}: {' '.join(str(message).split())}\n")
 
 
@@ -169,8 +145,8 @@ def _run_app() -> int:
         missing = missing_package_error(error)
         return _print_error(str(missing), missing.exit_code)
     except OSError as error:
-        if error.errno in DISK_ERRNOS:
-            return _print_error(str(disk_error(error, error.filename or "output")), 74)
+        if error.errno in errors.DISK_ERRNOS:
+            return _print_error(str(errors.disk_error(error, error.filename or "output")), 74)
         if error.filename is None and not _has_working_folder():
             return _print_error("working folder: it was removed; allowed: an existing folder", InputError.exit_code)
         return _print_error(f"{error.filename or 'system'}: {error.strerror or error}", InputError.exit_code)
@@ -187,8 +163,11 @@ def _run_app() -> int:
     except Exception as error:
         if isinstance(error, RuntimeError) and "start new thread" in str(error):
             return _print_error(TOO_LITTLE_MEMORY, InputError.exit_code)
-        if hasattr(error, "format_message"):  # typer's errors about the command line
-            return _print_error(f"{error.format_message()}{_given_value(error)}", 2)  # pyright: ignore[reportAttributeAccessIssue]
+        if hasattr(error, "format_message"):  # typer's errors about the command line, without the value of the option
+            options = getattr(getattr(error, "param", None), "opts", [])
+            values = [value for word, value in pairwise(sys.argv) if word in options and value]
+            given = f"; given: {values[0]!r}" if values else ""
+            return _print_error(f"{error.format_message()}{given}", 2)  # pyright: ignore[reportAttributeAccessIssue]
         raise
 
 
@@ -197,13 +176,6 @@ def _has_working_folder() -> bool:
         return os.path.isdir(os.getcwd())
     except FileNotFoundError:
         return False
-
-
-def _given_value(error: Exception) -> str:
-    """Return the value of the option that typer rejects, which its message leaves out."""
-    options = getattr(getattr(error, "param", None), "opts", [])
-    values = (value for word, value in pairwise(sys.argv) if word in options and value)
-    return next((f"; given: {value!r}" for value in values), "")
 
 
 def _print_error(message: str, code: int) -> int:

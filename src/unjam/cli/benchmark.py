@@ -12,8 +12,7 @@ from unjam.controller import DEFAULT_DRIVER
 from unjam.errors import InputError, format_count, invalid_value
 from unjam.files import atomic_write, make_folder
 
-LEADERBOARD_WIDTH = 80
-"""width of a leaderboard [characters]"""
+LEADERBOARD_WIDTH = 80  # [characters]
 
 
 def benchmark_command(

@@ -100,10 +100,8 @@ def tune_command(
     if max_string_gain is None:
         max_string_gain = MAX_STRING_GAIN if any(road.is_closed for road in roads.values()) else 0.0
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), WorkerPool(workers) as pool:
-        result = tune(
-            *(roads, expert, space, steps, folder, pool, reward, seed, backend, on_message, screen),
-            max_string_gain=max_string_gain,
-        )
+        options = reward, seed, backend, on_message, screen, max_string_gain
+        result = tune(roads, expert, space, steps, folder, pool, *options)
     best, default = result.best, result.default
     if json:
         counts = {"environment_steps": result.environment_steps, "batch_steps": result.batch_steps}
@@ -155,9 +153,8 @@ def calibrate_command(
     space = parse_factor_space(vary or [])
     corridor = load_corridor(scenario, detectors, begin, end)
     if corridor.excluded_count:
-        err_console.print(
-            f"{corridor.excluded_count} intervals of the detectors are excluded: they are not between begin and end"
-        )
+        reason = "intervals of the detectors are excluded: they are not between begin and end"
+        err_console.print(f"{corridor.excluded_count} {reason}")
     folder = opt.new_folder(out, f"calibrate-{Path(scenario).stem}")
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), DetectorPool(workers) as pool:
         on_message = (lambda line: None) if json else err_console.print

@@ -14,7 +14,7 @@ from typer import Argument, Option
 
 from unjam.cli.options import JsonOption
 from unjam.cli.output import console, new_table, print_json
-from unjam.controller import PACKAGED_PREFIX, packaged_file, packaged_names
+from unjam.controller import PACKAGED_PREFIX, packaged_names
 from unjam.controller.file import read_controller
 from unjam.drivers.observation import FEATURES
 from unjam.drivers.registry import DRIVERS
@@ -27,10 +27,8 @@ from unjam.scenarios.road import format_drawn_values
 from unjam.worlds.backend import WorldOptions
 from unjam.worlds.sumo.backend import SumoBackend
 
-FAMILY_GROUP = FAMILY_PREFIX.rstrip("/")
-"""argument that lists the roads of the family"""
-PICTURE_SECONDS = 60.0
-"""simulated time after which an open road is drawn [s]; at the start it is almost empty"""
+FAMILY_GROUP = FAMILY_PREFIX.rstrip("/")  # argument that lists the roads of the family
+PICTURE_SECONDS = 60.0  # simulated time after which an open road is drawn [s]; at the start it is almost empty
 
 
 def scenarios_command(
@@ -125,17 +123,18 @@ def drivers_command(
     if name is not None and name not in names:
         raise unknown_name("driver", name, names)
     names = names if name is None else [name]
-    descriptions = {key: _describe_driver(key, name is None) for key in names}
+    descriptions = {
+        key: inspect.getdoc(DRIVERS[key]) or "" if key in DRIVERS else _packaged_summary(key, name is None)
+        for key in names
+    }
     parameters = {key: parameter_entries(DRIVERS[key]()) if key in DRIVERS else [] for key in names}
+    briefs = {key: text.partition("\n")[0] for key, text in descriptions.items()}
     if json:
-        entries = {
-            key: {"description": descriptions[key].partition("\n")[0], "parameters": parameters[key]} for key in names
-        }
-        print_json(entries)
+        print_json({key: {"description": briefs[key], "parameters": parameters[key]} for key in names})
     elif name is None:
         table = new_table(("driver", "description"))
-        for key, text in descriptions.items():
-            table.add_row(key, text.partition("\n")[0])
+        for row in briefs.items():
+            table.add_row(*row)
         console.print(table)
         console.print("Parameters: unjam drivers NAME. Your own driver: --driver path.py:name, a function or a class.")
     else:
@@ -145,19 +144,9 @@ def drivers_command(
             console.print(_parameter_table(rows, f"parameter (--driver {name}:parameter=value)"))
 
 
-def _describe_driver(name: str, is_brief: bool) -> str:
-    kind = DRIVERS.get(name)
-    if kind is None:
-        return _packaged_summary(name.removeprefix(PACKAGED_PREFIX), is_brief)
-    return inspect.getdoc(kind) or ""
-
-
 def _packaged_summary(name: str, is_brief: bool) -> str:
-    """Return a description of a packaged controller and its measured performance, from its manifest.
-
-    A brief one is without the parameters of its expert.
-    """
-    controller = read_controller(packaged_file(name))
+    """Return a packaged controller with its measured performance; a brief one has no parameters of its expert."""
+    controller = read_controller(name)
     manifest = controller.manifest
     described = manifest.get("expert", "")
     expert = described.partition(":")[0] if is_brief else described
@@ -167,12 +156,10 @@ def _packaged_summary(name: str, is_brief: bool) -> str:
         return f"{expert}, tuned: {score} {best} on tuning seeds, default parameters {default}"
     if summary := manifest.get("summary"):
         return summary if is_brief else f"{summary}\n\n{controller.driver.describe()}"
-    metrics, scenario = manifest["metrics"], manifest["run"]["scenario"]
-    speed, expert_speed = (metrics[label]["mean_speed"]["mean"] for label in ("trained", described))
-    return (
-        f"{expert} + residual, trained on {scenario}: mean speed {speed:.2f} m/s on "
-        f"{metrics['trained']['episodes']} test seeds, expert {expert_speed:.2f} m/s"
-    )
+    metrics, label = manifest["metrics"], f"{expert} + residual, trained on {manifest['run']['scenario']}"
+    speed, expert_speed = (metrics[name]["mean_speed"]["mean"] for name in ("trained", described))
+    seeds = f"{metrics['trained']['episodes']} test seeds"
+    return f"{label}: mean speed {speed:.2f} m/s on {seeds}, expert {expert_speed:.2f} m/s"
 
 
 def parameter_entries(instance: Any) -> list[dict[str, Any]]:
@@ -181,11 +168,9 @@ def parameter_entries(instance: Any) -> list[dict[str, Any]]:
         return []
     texts: dict[str, str] = {}
     for base in reversed(type(instance).__mro__):
-        if is_dataclass(base):
-            texts |= _field_docstrings(base)
-    return [
-        {"name": name, "default": value, "description": texts.get(name, "")} for name, value in asdict(instance).items()
-    ]
+        texts |= _field_docstrings(base) if is_dataclass(base) else {}
+    values = asdict(instance).items()
+    return [{"name": name, "default": value, "description": texts.get(name, "")} for name, value in values]
 
 
 def _field_docstrings(kind: type) -> dict[str, str]:

@@ -126,7 +126,6 @@ def verify_command(
     - unjam verify runs/mine --trust-code            (its expert is a Python file that you trust)
     """
     continue_in_limited_child(f"controller: {str(file)!r}")
-
     controller = read_controller(file)
     checks = check_parts(controller, signer)
     if json:

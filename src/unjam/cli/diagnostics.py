@@ -24,11 +24,8 @@ from unjam.worlds.sumo.networks import cache_folder, sumo_program
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 REFERENCE_SUMO_VERSION = "1.28.0"
-"""version of SUMO with which all results of the documentation were measured"""
-SUPPORTED_SUMO_VERSION = REFERENCE_SUMO_VERSION.rpartition(".")[0]
-"""minor version of SUMO that is supported"""
-TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"
-"""index of torch builds without GPU support, a tenth of the size"""
+"""version of SUMO with which all results of the documentation were measured; its minor version is supported"""
+TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"  # builds without GPU support, a tenth of the size
 
 
 def doctor_command(json: JsonOption = False) -> None:
@@ -61,18 +58,15 @@ class HealthCheck:
 
     name: str
     is_ok: bool
-    detail: str
-    """what was found, such as a version"""
+    detail: str  # what was found, such as a version
     remedy: str = ""
-    """what to do if the check failed"""
-    is_required: bool = True
-    """whether unjam cannot run without this part"""
+    is_required: bool = True  # for unjam to run at all
 
 
 def check_health() -> list[HealthCheck]:
-    """Run all checks and return their results; the last one, an episode in a worker process, is the slowest."""
+    """Run all checks and return their results."""
     python, sumo = platform.python_version(), f"pip install eclipse-sumo=={REFERENCE_SUMO_VERSION}"
-    display = has_display()
+    display, episode_remedy = has_display(), "see the message; unjam drive ring --driver pi shows more"
     no_display = "for unjam watch without a display: --video FILE, or xvfb-run unjam watch ..."
     torch = f" --extra-index-url {TORCH_CPU_INDEX}"
     return [
@@ -89,9 +83,7 @@ def check_health() -> list[HealthCheck]:
         _sandbox_check(),
         HealthCheck("display", display, "available" if display else "none", no_display, is_required=False),
         replace(_extra_check("imageio-ffmpeg", ".mp4"), name="mp4 video (imageio-ffmpeg)"),
-        _try_check(
-            "an episode in a worker", _run_test_episode, "see the message; unjam drive ring --driver pi shows more"
-        ),
+        _try_check("an episode in a worker", _run_test_episode, episode_remedy),
     ]
 
 
@@ -112,15 +104,13 @@ def _extra_check(name: str, users: str, options: str = "") -> HealthCheck:
 
 def _sumo_check(name: str, is_required: bool = True) -> HealthCheck:
     remedy = f"pip install {name}=={REFERENCE_SUMO_VERSION}: results depend on the version of SUMO"
-    return _package_check(name, remedy, is_required, SUPPORTED_SUMO_VERSION)
+    return _package_check(name, remedy, is_required, REFERENCE_SUMO_VERSION.rpartition(".")[0])
 
 
 def _reference_sumo_check() -> HealthCheck:
-    remedy = (
-        f"the results of the documentation were measured with SUMO {REFERENCE_SUMO_VERSION}; numbers depend on it: "
-        f"pip install libsumo=={REFERENCE_SUMO_VERSION} eclipse-sumo=={REFERENCE_SUMO_VERSION}"
-    )
-    check = _package_check("libsumo", remedy, is_required=False)
+    install = f"pip install libsumo=={REFERENCE_SUMO_VERSION} eclipse-sumo=={REFERENCE_SUMO_VERSION}"
+    reason = f"the results of the documentation were measured with SUMO {REFERENCE_SUMO_VERSION}"
+    check = _package_check("libsumo", f"{reason}; numbers depend on it: {install}", is_required=False)
     return replace(check, name="SUMO of the results", is_ok=check.detail == REFERENCE_SUMO_VERSION)
 
 

@@ -9,18 +9,8 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from unjam.cli import options as opt
 from unjam.cli import output
-from unjam.cli.options import (
-    DEFAULT_WORKERS,
-    AllMetricsOption,
-    HumansOption,
-    JsonOption,
-    WorkersOption,
-    check_page_path,
-    network_changes,
-    new_folder,
-    with_trust_option,
-)
 from unjam.cli.output import console, err_console, print_json
 from unjam.controller import make_driver
 from unjam.drivers.registry import DRIVERS
@@ -47,14 +37,14 @@ def evaluate_command(
         ),
     ] = None,
     episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Test episodes per driver.")] = 20,
-    humans: HumansOption = None,
+    humans: opt.HumansOption = None,
     out: Annotated[
         Path | None,
         Option(help="Folder for the results.", show_default="the run's own; of a part, a new one under runs/"),
     ] = None,
-    workers: WorkersOption = DEFAULT_WORKERS,
-    show_all: AllMetricsOption = False,
-    json: JsonOption = False,
+    workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
+    show_all: opt.AllMetricsOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """Compare a trained controller with every expert and the human baseline on fixed test seeds.
 
@@ -72,9 +62,9 @@ def evaluate_command(
     config = read_config(run)
     check_run_files(run, config, "evaluate")
     if driver or humans is not None or episodes < config.evaluation.episodes:
-        out = new_folder(out, f"evaluate-{run.resolve().name}")
+        out = opt.new_folder(out, f"evaluate-{run.resolve().name}")
     evaluation = replace(config.evaluation, baselines=tuple(driver or DRIVERS), episodes=episodes)
-    options = {**config.scenario_options, **network_changes(humans=humans)}
+    options = {**config.scenario_options, **opt.network_changes(humans=humans)}
     config = replace(config, scenario_options=options, evaluation=evaluation)
     if config.tasks:
         raise InputError(f"run: {str(run)!r} has several roads; allowed: the folder of one of them")
@@ -108,7 +98,7 @@ def evaluate_command(
 
 
 def model_command(
-    run: Annotated[Path, Argument(help="Folder of a training run with a learned model.")], json: JsonOption = False
+    run: Annotated[Path, Argument(help="Folder of a training run with a learned model.")], json: opt.JsonOption = False
 ) -> None:
     """Show the errors of a run's learned model relative to the environment.
 
@@ -160,7 +150,7 @@ def report_command(
         Path | None,
         Option("--out", help="HTML file to write.", show_default="report.html in the folder, or comparison.html here"),
     ] = None,
-    json: JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """Write the report of one folder of results, or a comparison of several, as one HTML page that works offline.
 
@@ -175,7 +165,7 @@ def report_command(
         if not folder.is_dir():
             raise InputError(f"report: {str(folder)!r} is not a folder; allowed: one with results")
     target = out or (folders[0] / "report.html" if len(folders) == 1 else Path("comparison.html"))
-    check_page_path(target)
+    opt.check_page_path(target)
     continue_in_limited_child(f"report: {', '.join(map(str, folders))}", target.absolute().parent, Path(get_cachedir()))
     from unjam.reports.html import write_report_page
 
@@ -183,7 +173,7 @@ def report_command(
         check_not_locked(folder)
     page = write_report_page(folders, target)
     if json:
-        print_json({"report": str(page), "folders": [str(folder) for folder in folders]})
+        print_json({"report": str(page), "folders": list(map(str, folders))})
     else:
         console.print(str(page))
 
@@ -196,12 +186,12 @@ runs_command = typer.Typer(name="runs", rich_markup_mode="markdown", add_complet
 
 
 @runs_command.callback(invoke_without_command=True)
-@with_trust_option
+@opt.with_trust_option
 def list_runs_command(
     context: typer.Context,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
     scenario: Annotated[str, Option(help="List only runs on this scenario.")] = "",
-    json: JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """List the training runs in a folder: their progress, and their return relative to the expert.
 
@@ -218,7 +208,6 @@ def list_runs_command(
             allowed = f"after it, as in unjam runs {context.invoked_subcommand} --folder studies"
             raise InputError(f"runs: options are not allowed before the command; allowed: {allowed}")
         return
-
     runs = list_runs(folder, scenario) if folder != DEFAULT_RUNS_FOLDER or folder.is_dir() else []
     if json:
         print_json([run.document() for run in runs])
@@ -242,9 +231,9 @@ def _gain_text(gain: Any) -> str:
 
 
 @runs_command.command("compare")
-@with_trust_option
+@opt.with_trust_option
 def compare_command(
-    names: RunNamesArgument, folder: RunsFolderOption = DEFAULT_RUNS_FOLDER, json: JsonOption = False
+    names: RunNamesArgument, folder: RunsFolderOption = DEFAULT_RUNS_FOLDER, json: opt.JsonOption = False
 ) -> None:
     """Compare the returns of runs, and list the settings in which they differ.
 
@@ -270,17 +259,16 @@ def compare_command(
     console.print(table)
     if not settings:
         console.print("the settings of these runs are the same")
-    output.print_next_command(
-        "compare them on one page", "report", *(run.folder for run in runs), "--out", "compared.html"
-    )
+    folders = (run.folder for run in runs)
+    output.print_next_command("compare them on one page", "report", *folders, "--out", "compared.html")
 
 
 @runs_command.command("progress")
-@with_trust_option
+@opt.with_trust_option
 def progress_command(
     name: Annotated[str, Argument(help="Name of a run, as listed, or its folder.")],
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
-    json: JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """Print the progress of a run as CSV, a row per iteration; names of nested values contain dots.
 
@@ -300,12 +288,12 @@ def progress_command(
 
 
 @runs_command.command("remove")
-@with_trust_option
+@opt.with_trust_option
 def remove_command(
     names: RunNamesArgument,
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
     yes: Annotated[bool, Option("--yes", "-y", help="Remove without asking for confirmation.")] = False,
-    json: JsonOption = False,
+    json: opt.JsonOption = False,
 ) -> None:
     """Remove runs and their folders permanently, after confirmation.
 

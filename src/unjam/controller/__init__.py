@@ -25,8 +25,7 @@ from unjam.files import PACKAGED_PREFIX, sha256_of
 
 __all__ = ["controller_bytes", "load_controller", "make_driver", "make_expert", "packaged_file", "packaged_names"]
 
-DEFAULT_DRIVER = "unjam:best"
-"""driver of commands without `--driver`: the controller for all roads"""
+DEFAULT_DRIVER = "unjam:best"  # driver of commands without `--driver`: the controller for all roads
 
 
 def make_driver(name: str, time_step: float) -> Driver:
@@ -60,10 +59,7 @@ def make_driver(name: str, time_step: float) -> Driver:
 
 
 def make_expert(name: str | DriverLike, time_step: float) -> Driver:
-    """Return a driver to which a residual can be added, from a name of `make_driver`, or an object of this process.
-
-    Raise `InputError` as `make_driver`, and for `human`.
-    """
+    """Return a driver to which a residual can be added; raise `InputError` as `make_driver`, and for `human`."""
     driver = make_driver(name, time_step) if isinstance(name, str) else as_driver(name, time_step)
     if driver.is_native:
         raise invalid_value("expert", name, "drivers outside of the simulator; 'idm' drives like a human driver")

@@ -21,43 +21,32 @@ from unjam.worlds.world import CarFollowingWorld
 
 ISO_MEAN_SECONDS, LEADER_STOP_SECONDS = 2.0, 20.0
 """averaging time of accelerations in ISO 15622; simulated time after the start of a leader's emergency stop [s]"""
-ATTACK_SECONDS, ATTACK_STEP_SECONDS = 40.0, 1.0
-"""duration of an adversarial maneuver of a leader, and of each of its accelerations [s]"""
-ATTACK_POPULATION, ATTACK_GENERATIONS, ATTACK_ELITES = 128, 16, 12
-"""cross-entropy method: maneuvers in a generation, generations, and elites that determine the next generation"""
-MAX_LEADER_ACCELERATION = 3.0
-"""largest acceleration of an adversarial leader [m/s2]"""
-STATE_NAMES, MAX_SPEED = ("speed", "leader speed", "gap"), 100.0
-"""quantities of a state that are checked, and the largest allowed speed [m/s]"""
-MIN_MOVING_SPEED = 1.0
-"""speed above which time gaps are evaluated [m/s]"""
+ATTACK_SECONDS, ATTACK_STEP_SECONDS = 40.0, 1.0  # of an adversarial maneuver, and of each of its accelerations
+ATTACK_POPULATION, ATTACK_GENERATIONS, ATTACK_ELITES = 128, 16, 12  # of the cross-entropy method
+MAX_LEADER_ACCELERATION = 3.0  # of an adversarial leader [m/s2]
+MAX_SPEED = 100.0  # of a state [m/s]
+MIN_MOVING_SPEED = 1.0  # speed above which time gaps are evaluated [m/s]
 
 
 @dataclass(frozen=True)
 class WorstCases:
     """Results of simulations that try to cause contact with the leader, with the safety filter [m, s, m/s2]."""
 
-    leader_stops: int
-    """number of visited states from which the leader stopped with its maximum braking"""
-    steps: int
-    """simulated steps of single vehicles"""
+    leader_stops: int  # number of visited states from which the leader stopped with its maximum braking
+    steps: int  # simulated steps of single vehicles
     contacts: int
     min_gap: float
-    min_time_gap: float
-    """above 1 m/s, behind a leader that brakes with at most `SafetyFilter.time_gap_braking`"""
+    min_time_gap: float  # above 1 m/s, behind a leader that brakes with at most `SafetyFilter.time_gap_braking`
     max_braking: float
-    attack: tuple[float, ...]
-    """the leader's accelerations with the smallest gap, one per second"""
+    attack: tuple[float, ...]  # the leader's accelerations with the smallest gap, one per second
 
 
 @dataclass(frozen=True)
 class Comfort:
     """Ride comfort in the recorded episode."""
 
-    rms_acceleration: float
-    """root mean square [m/s2]; below 0.315 it is not uncomfortable by ISO 2631-1"""
-    max_braking: float
-    """mean over 2 s, as in ISO 15622 [m/s2]"""
+    rms_acceleration: float  # root mean square [m/s2]; below 0.315 it is not uncomfortable by ISO 2631-1
+    max_braking: float  # mean over 2 s, as in ISO 15622 [m/s2]
     meets_iso_15622: bool
     """braking at most 3.5 m/s2 above 20 m/s, 5 m/s2 below 5 m/s, linear between; acceleration at most 2 and 4"""
 
@@ -90,10 +79,7 @@ class Certificate:
 
 
 def make_certificate(controller: Controller) -> dict[str, Any]:
-    """Return the certificate of a controller as JSON, from simulations that start in the states of its sample.
-
-    Raise `InputError` if it has no filter, no sample or no scenario.
-    """
+    """Return the certificate of a controller as JSON; raise `InputError` without a filter, a sample or a scenario."""
     driver = controller.driver
     if not isinstance(driver, FilteredDriver) or not driver.safety.active or SAMPLE_PART not in controller.parts:
         allowed = "output of `unjam export` for a road with a filter"
@@ -129,11 +115,7 @@ FollowingSimulator = Callable[[FollowingState, Floats], FollowingState]
 
 
 def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: IDMParameters) -> Certificate:
-    """Return the certificate of a controller with its filter; it is deterministic.
-
-    `visited_states` are the observations of a CAV on its road, arrays of shape (T,); `humans` drive behind it. Raise
-    `InputError` if a part of the controller assumes another control step than its filter.
-    """
+    """Return the certificate of a controller with its filter, from simulations that begin in states of shape (T,)."""
     loop = float(visited_states.loop_length[0])
     fields = frozenset(name for name, values in visited_states._asdict().items() if values is not None)
     road = RoadInterface("the road of its filter", not np.isnan(loop), True, fields, driver.time_step)
@@ -141,46 +123,34 @@ def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: I
         raise InputError(f"certify: the driver is not allowed on {road.title}: {reason}")
 
     def simulate(initial_states: FollowingState, leader_accelerations: Floats) -> FollowingState:
-        world = CarFollowingWorld(
-            initial_states, leader_accelerations, driver.limits, driver.time_step, loop, driver.actuator
-        )
-        return drive_world(world, driver)
+        vehicle = driver.limits, driver.time_step, loop, driver.actuator
+        return drive_world(CarFollowingWorld(initial_states, leader_accelerations, *vehicle), driver)
 
-    states = FollowingState(*visited_states[:3])
-    _check_sample(states, driver.time_step)
+    states, fewest = FollowingState(*visited_states[:3]), 1 + _steps_of_mean(driver.time_step)
+    if driver.time_step > LEADER_STOP_SECONDS:
+        raise invalid_value("certify: control step", driver.time_step, f"at most {LEADER_STOP_SECONDS:g} s")
+    if len(states.speed) < fewest:
+        count = format_count(len(states.speed), "state")
+        raise InputError(f"certify: a sample of {count} is not allowed; allowed: {fewest} or more")
+    limits = {"speed": MAX_SPEED, "leader speed": MAX_SPEED, "gap": MAX_OBSERVED_GAP}
+    for (name, largest), values in zip(limits.items(), states, strict=True):
+        if not ((values >= 0.0) & (values <= largest)).all():  # refuses NaN, too
+            raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")
     ranges = [(float(values.min()), float(values.max())) for values in states]
     speeds = operating_speeds(float(states.speed.mean()), humans)
     return Certificate(
-        _worst_cases(simulate, states, driver, np.random.default_rng(0)),
+        _worst_cases(simulate, states, driver),
         _comfort(states.speed, driver.time_step),
         measure_string_stability(driver, speeds, humans, loop),
         OperatingDomain(*ranges),
     )
 
 
-def _check_sample(states: FollowingState, time_step: float) -> None:
-    """Raise `InputError` unless simulations can start in the states of a sample, and a CAV can observe them."""
-    if time_step > LEADER_STOP_SECONDS:
-        raise invalid_value("certify: control step", time_step, f"at most {LEADER_STOP_SECONDS:g} s")
-    fewest = 1 + _steps_of_mean(time_step)
-    if len(states.speed) < fewest:
-        raise InputError(
-            f"certify: a sample of {format_count(len(states.speed), 'state')} is not allowed; allowed: {fewest} or more"
-        )
-    for name, values, largest in zip(STATE_NAMES, states, (MAX_SPEED, MAX_SPEED, MAX_OBSERVED_GAP), strict=True):
-        if not ((values >= 0.0) & (values <= largest)).all():  # refuses NaN, too
-            raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")
-
-
 def _steps_of_mean(time_step: float) -> int:
-    """Return the number of control steps over which accelerations are averaged."""
     return max(1, round(ISO_MEAN_SECONDS / time_step))
 
 
-def _worst_cases(
-    simulate: FollowingSimulator, states: FollowingState, driver: FilteredDriver, generator: np.random.Generator
-) -> WorstCases:
-    """Simulate stops of leaders from every visited state, and search for worse maneuvers."""
+def _worst_cases(simulate: FollowingSimulator, states: FollowingState, driver: FilteredDriver) -> WorstCases:
     safety, step = driver.safety, driver.time_step
     actuation = driver.actuator, driver.actuator.initial_state(states.speed, step)
     is_safe = safety.max_acceleration(states, step, actuation) > -safety.braking  # it promises nothing elsewhere
@@ -191,7 +161,7 @@ def _worst_cases(
     stop = np.full((round(LEADER_STOP_SECONDS / step), rows), -safety.leader_braking)
     hard_stop = simulate(states, stop)
     gentle_stop = simulate(states, stop * (safety.time_gap_braking / safety.leader_braking))
-    attacked, attack, attack_steps = _search_attacks(simulate, states, driver, generator)
+    attacked, attack, attack_steps = _search_attacks(simulate, states, driver)
     records, is_moving = (hard_stop, gentle_stop, attacked), gentle_stop.speed > MIN_MOVING_SPEED
     return WorstCases(
         leader_stops=rows,
@@ -218,14 +188,11 @@ def _comfort(speeds: Floats, step: float) -> Comfort:
 
 
 def _search_attacks(
-    simulate: FollowingSimulator, states: FollowingState, driver: FilteredDriver, generator: np.random.Generator
+    simulate: FollowingSimulator, states: FollowingState, driver: FilteredDriver
 ) -> tuple[FollowingState, Floats, int]:
-    """Search maneuvers of a leader with the smallest gap, by the cross-entropy method.
-
-    Return the generation with the smallest gap, its worst maneuver, and the simulated steps of single vehicles.
-    """
+    """Return the generation with the smallest gap, its worst maneuver, and the simulated steps of single vehicles."""
     pieces, repeats = round(ATTACK_SECONDS / ATTACK_STEP_SECONDS), max(1, round(ATTACK_STEP_SECONDS / driver.time_step))
-    low, high = -driver.safety.leader_braking, MAX_LEADER_ACCELERATION
+    low, high, generator = -driver.safety.leader_braking, MAX_LEADER_ACCELERATION, np.random.default_rng(0)
     mean, spread = np.zeros(pieces), np.full(pieces, (high - low) / 2.0)
     chosen = generator.integers(len(states.speed), size=ATTACK_POPULATION)
     start = FollowingState(*(values[chosen] for values in states))

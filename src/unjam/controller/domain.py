@@ -16,34 +16,27 @@ from unjam.parameters import build_dataclass, flatten_keys
 from unjam.worlds.record import Episode
 
 IRRELEVANT_PARAMETERS = {
-    *("horizon", "emission_class", "remember_warmup", "population"),
-    *("recordings", "begin", "window", "platoon"),
+    *("horizon", "emission_class", "remember_warmup", "population", "recordings", "begin", "window", "platoon")
 }
 """scenario parameters that do not make it another scenario"""
-KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")
-"""parameters that distinguish scenarios of a kind in a short description"""
-TABLE_LISTS = ("ramps",)
-"""parameters that are lists of tables"""
-MAX_LISTED_PARAMETERS = 3
-"""maximum number of parameters in a note"""
-SB3_SUFFIX = ".zip"
-"""end of the names of models of Stable-Baselines3"""
-OUTSIDE_DOMAIN_THRESHOLD = 0.05
-"""share of control steps outside of the certified domain from which a note reports it"""
+KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")  # for descriptions
+MAX_LISTED_PARAMETERS = 3  # in a note
+SB3_SUFFIX = ".zip"  # end of the names of models of Stable-Baselines3
+OUTSIDE_DOMAIN_THRESHOLD = 0.05  # share of control steps from which a note reports it
 
 
 def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[str, Episode]) -> list[str]:
-    """Return a note for each controller that was made for another scenario, or left its certified domain.
-
-    `road` is the recipe of the scenario; `episodes` has episodes of some of the drivers, by name.
-    """
+    """Return a note for each controller made for another road (a recipe), or outside its domain in its episodes."""
     notes = []
     for name in names:
         if name.endswith(SB3_SUFFIX):
             step = road["simulation_step"] * road["steps_per_control_step"]
             notes.append(control_step_note(name, {step}))
-        controller = _find_controller(name)
-        if controller is None:
+        try:
+            if controller_path(name) is None:
+                continue
+            controller = read_controller(name)
+        except InputError:
             continue
         if mismatch := road_mismatch(controller.manifest, road):
             notes.append(f"{name} {mismatch}")
@@ -60,26 +53,15 @@ def control_step_note(name: str, steps: Iterable[float]) -> str:
     return f"{name} does not contain its control step: here it acts every {found} s, unless policy_driver sets another"
 
 
-def _find_controller(driver_name: str) -> Controller | None:
-    """Return the controller with a driver's name; None if the driver is none, or it cannot be read."""
-    try:
-        return read_controller(driver_name) if controller_path(driver_name) else None
-    except InputError:
-        return None
-
-
 def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
-    """Return the differences of a scenario from that of a controller's training; empty if none is known.
-
-    `road` is the recipe of the scenario, as in manifests. A range within the trained one is no difference.
-    """
+    """Return how the recipe of a scenario differs from that of a controller's training; a range within does not."""
     trained = manifest.get("scenario")
     if not isinstance(trained, dict):
         return ""
     made = "tuned" if "tuning" in manifest else "trained"
     if trained.get("kind") != road["kind"]:
         return f"was {made} on the {_value_text(trained.get('kind'))} road, not on the {road['kind']} road"
-    before, now = _flatten_recipe(trained), _flatten_recipe(road)
+    before, now = map(_flatten_recipe, (trained, road))
     known = [name for name in now if name in before and name not in IRRELEVANT_PARAMETERS]
     differ = [name for name in known if not _is_within(before[name], now[name])]
     if not differ:
@@ -91,9 +73,10 @@ def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
 
 
 def _flatten_recipe(recipe: dict[str, Any]) -> dict[str, Any]:
-    """Return a recipe with dotted keys, and the number of entries of each list of tables."""
-    tables = {name: recipe[name] for name in TABLE_LISTS if isinstance(recipe.get(name), list | tuple)}
-    return flatten_keys(recipe | {name: {"count": len(each), **dict(enumerate(each))} for name, each in tables.items()})
+    """Return a recipe with dotted keys, and the number of its ramps."""
+    if isinstance(ramps := recipe.get("ramps"), list | tuple):
+        recipe = {**recipe, "ramps": {"count": len(ramps), **dict(enumerate(ramps))}}
+    return flatten_keys(recipe)
 
 
 def road_description(manifest: dict[str, Any]) -> str:

@@ -39,12 +39,9 @@ ARCHIVE_PARTS = (MANIFEST_PART, WEIGHTS_PART, SAMPLE_PART, GRAPH_PART, CERTIFICA
 certified ones a certificate, signed ones a signature"""
 MAX_PART_BYTES, MAX_JSON_BYTES = 64 * 2**20, {MANIFEST_PART: 2**20, CERTIFICATE_PART: 2**20, SIGNATURE_PART: 10_000}
 """maximum sizes: of one part, and of parts in JSON, which take many times their size in memory"""
-LOCAL_HEADER_BYTES, INDEX_ENTRY_BYTES, ARCHIVE_END_BYTES = 30, 46, 22
-"""sizes of the headers of a zip archive without extra fields and comments"""
-MAX_SAMPLE_STEPS = 1000
-"""maximum number of control steps in a recorded sample"""
-ACTION_NAME = "acceleration"
-"""name of the recorded answers in a sample and of the output of a graph"""
+LOCAL_HEADER_BYTES, INDEX_ENTRY_BYTES, ARCHIVE_END_BYTES = 30, 46, 22  # of a zip archive without extra fields
+MAX_SAMPLE_STEPS = 1000  # control steps
+ACTION_NAME = "acceleration"  # name of the recorded answers in a sample and of the output of a graph
 
 
 @dataclass(frozen=True)
@@ -53,17 +50,12 @@ class Controller:
 
     driver: Driver
     manifest: dict[str, Any]
-    parts: dict[str, bytes]
-    """content of the archive, by name"""
-    signed_by: str | None = None
-    """fingerprint of the key that signed it; None without a signature"""
+    parts: dict[str, bytes]  # content of the archive, by name
+    signed_by: str | None = None  # fingerprint of the key that signed it; None without a signature
 
 
 def controller_bytes(driver: Driver, metadata: dict[str, Any], parts: dict[str, bytes] | None = None) -> bytes:
-    """Return the content of a `.unjam` file.
-
-    `metadata` has the `PROVENANCE_ENTRIES` of the manifest; its `action_limit` [m/s2] is that of the road.
-    """
+    """Return the content of a `.unjam` file; `metadata` has `PROVENANCE_ENTRIES`, also the `action_limit` [m/s2]."""
     recipe, arrays = driver_recipe(driver)
     manifest = {"format": MANIFEST_FORMAT, "unjam": __version__, "driver": recipe}
     manifest |= driver_interface(driver, metadata.get("action_limit")) | metadata
@@ -76,10 +68,7 @@ def _pack_with_hashes(manifest: dict[str, Any], parts: dict[str, bytes]) -> byte
 
 
 def add_certificate(file: Path, controller: Controller, certificate: dict[str, Any]) -> None:
-    """Write the file of a controller again, with its certificate.
-
-    Raise `InputError` if it is signed, or if the file has changed since it was read.
-    """
+    """Write a controller again with its certificate; raise `InputError` if it is signed, or has changed meanwhile."""
     check_unsigned(controller)
     _check_unchanged(file, controller)
     parts = {**controller.parts, CERTIFICATE_PART: to_json(certificate, indent=1).encode()}
@@ -95,10 +84,7 @@ def check_unsigned(controller: Controller) -> None:
 
 
 def add_signature(file: Path, controller: Controller, key: "Ed25519PrivateKey") -> None:
-    """Write the file of a controller again, with the signature of `key` as its only one.
-
-    Raise `InputError` if the file has changed since it was read.
-    """
+    """Write a controller again with the signature of `key` only; raise `InputError` if it has changed meanwhile."""
     from unjam.controller.signature import signature_of
 
     _check_unchanged(file, controller)
@@ -117,18 +103,15 @@ def _ordered_parts(parts: dict[str, bytes]) -> dict[str, bytes]:
 
 
 def load_controller(path: Path | str) -> Driver:
-    """Return the driver of a `.unjam` file, of a run folder with one, or of a packaged controller.
-
-    Raise `InputError` if it does not exist, is damaged or not a controller, or if a file outside of a run folder refers
-    to Python code.
-    """
+    """Return the driver of a `.unjam` file, a run folder or a packaged controller; `InputError` if it is not valid."""
     return read_controller(path).driver
 
 
 def read_controller(path: Path | str) -> Controller:
-    """Return the checked content of a `.unjam` file; raise `InputError` as `load_controller`.
+    """Return the checked content of a `.unjam` file, of one in a run folder, or of a packaged controller.
 
-    Python code that it refers to runs only if the file lies in a run folder, and the code is trusted.
+    Raise `InputError` if it does not exist, is damaged or not a controller, or refers to Python code that is not
+    trusted or lies outside of a run folder.
     """
     path, file = Path(path), controller_file(path)
     if not os.path.isfile(file):
@@ -136,13 +119,16 @@ def read_controller(path: Path | str) -> Controller:
     try:
         parts = unpack_parts(file)
         manifest = read_manifest(file.name, parts[MANIFEST_PART])
-        _check_hashes(file.name, manifest["sha256"], parts)
+        if manifest["sha256"].keys() != parts.keys() - {MANIFEST_PART, SIGNATURE_PART}:
+            raise InputError(f"controller {file.name}: damaged: its parts are not those that it names")
+        for part, expected in manifest["sha256"].items():
+            if sha256_of(parts[part]) != expected:
+                raise InputError(f"controller {file.name}: damaged: {part} does not have the hash that it names")
         signed_by = _check_signature(file, parts) if SIGNATURE_PART in parts else None
         _check_code(file.name, manifest["driver"], path.is_dir())
         arrays = load(parts[WEIGHTS_PART])
         driver = driver_from_recipe(manifest["driver"], arrays)
-        unknown = arrays.keys() - driver_recipe(driver)[1].keys()
-        if unknown:
+        if unknown := arrays.keys() - driver_recipe(driver)[1].keys():
             raise InputError(f"controller {file.name}: weights {min(unknown)!r} belong to no network")
         return Controller(driver, manifest, parts, signed_by)
     except UNREADABLE_ERRORS as error:
@@ -165,18 +151,8 @@ def packaged_names() -> list[str]:
 def packaged_file(name: str) -> Path:
     """Return the file of a packaged controller; raise `InputError` for another name."""
     if name not in packaged_names():
-        known = [f"{PACKAGED_PREFIX}{name}" for name in packaged_names()]
-        raise unknown_name("driver", f"{PACKAGED_PREFIX}{name}", known)
+        raise unknown_name("driver", f"{PACKAGED_PREFIX}{name}", map(f"{PACKAGED_PREFIX}{{}}".format, packaged_names()))
     return PACKAGED_FOLDER / f"{name}{SUFFIX}"
-
-
-def _check_hashes(name: str, hashes: dict[str, str], parts: dict[str, bytes]) -> None:
-    """Raise `InputError` unless the manifest has the hashes of exactly the other parts, except the signature."""
-    if hashes.keys() != parts.keys() - {MANIFEST_PART, SIGNATURE_PART}:
-        raise InputError(f"controller {name}: damaged: its parts are not those that it names")
-    for part, expected in hashes.items():
-        if sha256_of(parts[part]) != expected:
-            raise InputError(f"controller {name}: damaged: {part} does not have the hash that it names")
 
 
 def _check_signature(file: Path, parts: dict[str, bytes]) -> str:
@@ -217,10 +193,9 @@ def pack_parts(parts: dict[str, bytes]) -> bytes:
 
 
 def unpack_parts(file: Path) -> dict[str, bytes]:
-    """Return the parts of an archive, in memory: nothing is written.
+    """Return the parts of an archive, in memory; raise `InputError` for an unallowed part or bytes outside the parts.
 
-    Raise `InputError` for an unknown, duplicate, compressed, encrypted or too large part, a link or bytes outside the
-    parts, and `zipfile.BadZipFile`, `OSError`, `EOFError` or `RuntimeError` if it is not an archive, or damaged.
+    Raise `zipfile.BadZipFile`, `OSError`, `EOFError` or `RuntimeError` if it is not an archive, or damaged.
     """
     size, largest = file.stat().st_size, len(ARCHIVE_PARTS) * MAX_PART_BYTES
     if size > largest:
@@ -234,17 +209,14 @@ def unpack_parts(file: Path) -> dict[str, bytes]:
                 raise InputError(f"controller {file.name}: part {entry.filename!r} {reason}")
             parts[entry.filename] = archive.read(entry)
         # Neither hashes nor a signature cover other bytes, which may be a second file of another kind.
-        if size != ARCHIVE_END_BYTES + sum(map(_packed_size, archive.infolist())):
+        headers = LOCAL_HEADER_BYTES + INDEX_ENTRY_BYTES  # in front of a part and in the index, each with its name
+        packed = (headers + 2 * len(each.filename.encode()) + each.compress_size for each in archive.infolist())
+        if size != ARCHIVE_END_BYTES + sum(packed):
             raise InputError(f"controller {file.name}: has bytes outside its parts; allowed: none, as unjam writes it")
     for name in (MANIFEST_PART, WEIGHTS_PART):
         if name not in parts:
             raise InputError(f"controller {file.name}: not a controller: it has no {name}")
     return parts
-
-
-def _packed_size(entry: zipfile.ZipInfo) -> int:
-    """Return the bytes that a part takes in an archive: its headers with its name, in front and in the index."""
-    return LOCAL_HEADER_BYTES + INDEX_ENTRY_BYTES + 2 * len(entry.filename.encode()) + entry.compress_size
 
 
 def _entry_error(entry: zipfile.ZipInfo) -> str:
@@ -267,11 +239,7 @@ def sample_bytes(driver: Driver, states: LocalState, action_limit: float) -> byt
 
 
 def read_sample(part: bytes) -> tuple[LocalState, Floats]:
-    """Return the states of a sample and the recorded accelerations [m/s2], all of shape (T,).
-
-    Raise `InputError` for a missing, unknown or wrong array, an acceleration that is not finite, no control step, or
-    more than `MAX_SAMPLE_STEPS`.
-    """
+    """Return the states of a sample and its accelerations [m/s2], shape (T,); `InputError` for a wrong array."""
     arrays: dict[str, Any] = load(part)
     required, known = {*COMMON_FIELDS, ACTION_NAME}, {*LocalState._fields, ACTION_NAME}
     if unfit := (required - arrays.keys()) | (arrays.keys() - known):
@@ -290,9 +258,6 @@ def read_sample(part: bytes) -> tuple[LocalState, Floats]:
 
 
 def replay_states(driver: Driver, states: LocalState, action_limit: float) -> Floats:
-    """Return the answers of a driver to consecutive `states` of one CAV, beginning with its initial memory.
-
-    States and answers have the shape (T,); answers are within `action_limit` [m/s2].
-    """
+    """Return a driver's answers within a limit [m/s2] to consecutive states of one CAV, shape (T,)."""
     world = RecordedWorld(states.select(np.s_[:, None]), Limits.symmetric(action_limit))
     return drive_world(world, driver).ravel()

@@ -13,8 +13,7 @@ from unjam.tree import leaves
 ONNX_OPSET = 20
 ONNX_IR_VERSIONS = range(10, 14)
 """version of the ONNX operators, and versions of the ONNX format for graphs of this opset"""
-BATCH_TOLERANCE = 1e-9
-"""allowed difference between equal rows [m/s2]: rounding of matrix products depends on their size"""
+BATCH_TOLERANCE = 1e-9  # between equal rows [m/s2]: rounding of matrix products depends on their size
 
 
 def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
@@ -38,11 +37,10 @@ def check_graph(part: bytes, driver: Driver) -> None:
 
 
 def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) -> Floats:
-    """Return the accelerations of a checked graph for consecutive `states` [m/s2].
+    """Return the accelerations of a checked graph for consecutive `states` [m/s2], all of shape (T,).
 
-    It begins with the initial memory of its `driver`; all arrays have the shape (T,). It runs for `rows` CAVs with the
-    same observation at once. Raise `InputError` if onnxruntime refuses it, or CAVs with the same observation get
-    different answers, `MissingPartError` if onnxruntime is not installed.
+    It runs for `rows` CAVs with the same observation at once. Raise `InputError` if onnxruntime refuses it or they get
+    different answers, `MissingPartError` without onnxruntime.
     """
     (inputs, _), answers, is_equal = graph_names(driver), np.zeros(len(states.speed)), True
     fields, memory = driver.requirements().input_fields, [rows for _, rows in leaves(driver.initial_memory(rows))]

@@ -16,8 +16,7 @@ from unjam.files import parse_json
 from unjam.parameters import STRICT, build_dataclass, parameter_dataclass
 from unjam.tree import leaves
 
-MANIFEST_FORMAT = 5
-"""version of the schema, the only one that is read"""
+MANIFEST_FORMAT = 5  # version of the schema, the only one that is read
 JsonObject = dict[str, Any]
 _StrictPositive = Annotated[StrictFloat, Field(gt=0)]
 
@@ -53,19 +52,15 @@ PROVENANCE_ENTRIES = tuple(each.name for each in signature(Manifest).parameters.
 
 
 def read_manifest(name: str, part: bytes) -> JsonObject:
-    """Return the manifest of the controller `name`, with entries of the right names and types.
-
-    Raise `InputError` for another format or a missing, unknown or wrong entry, `ValueError` if it is not strict JSON.
-    """
+    """Return the manifest of a controller; `InputError` for a wrong format or entry, `ValueError` if it is not JSON."""
     manifest = parse_json(part)
     if not isinstance(manifest, dict):
         raise InputError(f"controller {name}: manifest: {short_text(manifest)} is not allowed; allowed: a table")
     found = manifest.get("format")
     if type(found) is int and found != MANIFEST_FORMAT:
-        raise InputError(
-            f"controller {name}: format {found}, written by unjam {short_text(manifest.get('unjam'))}, is not "
-            f"allowed; allowed: format {MANIFEST_FORMAT}, which unjam {__version__} writes: export or train it again"
-        )
+        allowed = f"format {MANIFEST_FORMAT}, which unjam {__version__} writes: export or train it again"
+        maker = f"unjam {short_text(manifest.get('unjam'))}"
+        raise InputError(f"controller {name}: format {found}, written by {maker}, is not allowed; allowed: {allowed}")
     build_dataclass(Manifest, manifest, f"controller {name}: manifest")
     road = manifest.get("scenario", {})
     step, steps, limit = (road.get(key) for key in ("simulation_step", "steps_per_control_step", "action_limit"))

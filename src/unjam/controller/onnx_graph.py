@@ -100,28 +100,18 @@ def onnx_graph(driver: Driver, action_limit: float) -> bytes:
 
 
 def describe_graph(part: bytes, driver: Driver, action_limit: float, time_step: float) -> bytes:
-    """Return a graph of `onnx_graph` with texts for its users: units of inputs and outputs, and a description.
-
-    The description is that of `unjam.adapters.onnx_driver`, as TOML in the metadata `unjam`; `time_step` is the control
-    step [s].
-    """
+    """Return a graph with units, and a description of `unjam.adapters.onnx_driver` for a control step [s] in TOML."""
     interface, needs = driver_interface(driver, action_limit), driver.requirements()
-    action, memory = interface["action"], interface["memory"]
+    action, memory = interface["action"], {each["name"]: each["initial"] for each in interface["memory"]}
     is_needed = {"loop_length": needs.needs_loop, "route_position": needs.needs_coordinate}
+    names = [each["name"] for each in interface["observation"]]
     description = {
-        "inputs": [
-            {"quantity": each["name"]} | ({} if is_needed.get(each["name"], True) else {"optional": True})
-            for each in interface["observation"]
-        ],
+        "inputs": [{"quantity": name} | ({} if is_needed.get(name, True) else {"optional": True}) for name in names],
         "output": {"tensor": action["name"], "limits": [float(action["low"]), float(action["high"])]},
         "time_step": time_step,
         "memory": [
-            {
-                "input": f"memory.{each['name']}",
-                "output": f"next.{each['name']}",
-                "initial": nan if each["initial"] is None else each["initial"],
-            }
-            for each in memory
+            {"input": f"memory.{name}", "output": f"next.{name}", "initial": nan if initial is None else initial}
+            for name, initial in memory.items()
         ],
     }
     model = parse_model(part)
@@ -135,10 +125,7 @@ def describe_graph(part: bytes, driver: Driver, action_limit: float, time_step: 
 
 
 def _simplify(model: Any) -> None:
-    """Fold constants, and remove what the graph does not need, including paths of files of this machine.
-
-    The exporter's own optimizer breaks a graph in which one clip follows another.
-    """
+    """Fold constants, and remove paths of files; the exporter's optimizer breaks graphs with nested clips."""
     from onnx_ir.passes import common
     from onnxscript import optimizer
 

@@ -1,8 +1,7 @@
-"""Signatures of controllers: Ed25519 keys, the signature in a controller file, and its verification.
+"""Ed25519 signatures of controllers; this module loads `cryptography`, so it is only imported for keys and signatures.
 
 The signed message is a text: a header, a line with the public key, and the SHA-256 and name of each other part,
-sorted by name and including the manifest. This module loads `cryptography`, so it is only imported for keys and
-signatures.
+sorted by name and including the manifest.
 """
 
 import json
@@ -16,22 +15,13 @@ from unjam.files import check_parent_folder, remove, sha256_of, to_json, write_n
 
 try:
     from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+    from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
-    from cryptography.hazmat.primitives.serialization import (
-        Encoding,
-        NoEncryption,
-        PrivateFormat,
-        PublicFormat,
-        load_pem_private_key,
-        load_pem_public_key,
-    )
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 except ImportError as error:
     raise missing_package_error(error, "cryptography") from None
 
-PRIVATE_KEY_DESCRIPTION = "an Ed25519 private key in PEM without a password, as `unjam keys` writes it"
-PUBLIC_KEY_DESCRIPTION = "an Ed25519 public key in PEM, as `unjam keys` writes it"
-MAX_KEY_BYTES = 10_000
-"""maximum size of a key file"""
+MAX_KEY_BYTES = 10_000  # of a key file
 FIELD_PRIME = 2**255 - 19
 GROUP_ORDER = 2**252 + 27742317777372353535851937790883648493
 _ORDER_8 = 0x05FC536D880238B13933C6D305ACDFD5F098EFF289F4C345B027B2C28F95E826
@@ -39,8 +29,7 @@ SMALL_ORDER_POINTS = {0, 1, FIELD_PRIME - 1, _ORDER_8, FIELD_PRIME - _ORDER_8}
 """y coordinates of the eight points of an order that divides 8: with such a key one signature fits any message.
 Source: RFC 8032, section 5.1; Chalkias et al. 2020, Taming the many EdDSAs"""
 WEAK_KEY_TEXT = "a weak Ed25519 key, for which signatures can be forged,"
-SIGNATURE_HEADER = "unjam controller, signature 1"
-"""first line of the signed message, which distinguishes it from anything else signed with the same key"""
+SIGNATURE_HEADER = "unjam controller, signature 1"  # unlike anything else signed with the same key
 KeyT = TypeVar("KeyT", Ed25519PrivateKey, Ed25519PublicKey)
 
 
@@ -54,10 +43,7 @@ class KeyPair:
 
 
 def make_keys(name: Path) -> KeyPair:
-    """Write a new pair of keys into the same folder: `NAME.key`, readable by its owner only, and `NAME.pub`.
-
-    Raise `InputError` if one of both files exists, `DiskError` if they cannot be written; then neither exists.
-    """
+    """Write new `NAME.key`, readable by its owner only, and `NAME.pub`, both or neither; `InputError` if one exists."""
     if not name.name:
         raise invalid_value("name", str(name), "the common start of the names of two new files")
     private, public = (name.with_name(name.name + ending) for ending in (".key", ".pub"))
@@ -80,15 +66,16 @@ def make_keys(name: Path) -> KeyPair:
 
 def read_private_key(file: Path) -> Ed25519PrivateKey:
     """Return the key in a file; raise `InputError` unless it is an Ed25519 private key in PEM."""
-    return _read_key("key", file, PRIVATE_KEY_DESCRIPTION, Ed25519PrivateKey)
+    return _read_key("key", file, "private key in PEM without a password", Ed25519PrivateKey)
 
 
 def read_public_key(file: Path) -> str:
     """Return the fingerprint of the key in a file; raise `InputError` unless it is an Ed25519 public key in PEM."""
-    return fingerprint_of(_read_key("signer", file, PUBLIC_KEY_DESCRIPTION, Ed25519PublicKey))
+    return fingerprint_of(_read_key("signer", file, "public key in PEM", Ed25519PublicKey))
 
 
-def _read_key(field: str, file: Path, allowed: str, key_class: type[KeyT]) -> KeyT:
+def _read_key(field: str, file: Path, kind: str, key_class: type[KeyT]) -> KeyT:
+    allowed = f"an Ed25519 {kind}, as `unjam keys` writes it"
     if not os.path.exists(file):
         raise InputError(f"{field}: {str(file)!r} does not exist; allowed: {allowed}")
     if not os.path.isfile(file) or os.path.getsize(file) > MAX_KEY_BYTES:  # a pipe or a device could block
@@ -99,7 +86,8 @@ def _read_key(field: str, file: Path, allowed: str, key_class: type[KeyT]) -> Ke
         raise InputError(f"{field}: {str(file)!r} cannot be read: {error.strerror}; allowed: {allowed}") from None
     try:
         is_private = key_class is Ed25519PrivateKey
-        key: Any = load_pem_private_key(content, None) if is_private else load_pem_public_key(content)
+        load_private, load_public = serialization.load_pem_private_key, serialization.load_pem_public_key
+        key: Any = load_private(content, None) if is_private else load_public(content)
     except TypeError:  # it needs a password
         raise InputError(f"{field}: {str(file)!r} is encrypted; allowed: {allowed}") from None
     except (ValueError, UnsupportedAlgorithm):
@@ -131,10 +119,7 @@ def signature_of(parts: dict[str, bytes], key: Ed25519PrivateKey) -> bytes:
 
 
 def signer_of(name: str, parts: dict[str, bytes], part: bytes) -> str:
-    """Return the fingerprint of the key that signed `parts` of the controller `name`, by its signature `part`.
-
-    Raise `InputError` if it is not a signature, does not fit, is of a weak key, or is a second encoding of another one.
-    """
+    """Return the fingerprint of the key that signed `parts`, by the signature `part`; else `InputError`."""
     format_error = InputError(f"controller {name}: its signature is not one that unjam writes")
     forged = forged_error(name)
     try:

@@ -12,20 +12,13 @@ from unjam.physics.idm import IDMParameters, equilibrium_gap, idm_acceleration
 from unjam.worlds.drive import drive_world
 from unjam.worlds.world import CarFollowingWorld
 
-OSCILLATION_FREQUENCIES = np.geomspace(0.001, 1.0, 25)
-"""frequencies at which leaders oscillate [Hz]: from waves of a quarter of an hour to sways of a second"""
-OSCILLATION_AMPLITUDE = 0.05
-"""amplitude of a leader's speed as a share of its mean; small, so that the response is nearly linear"""
-SETTLING_SECONDS = 300.0
-"""time behind a leader with constant speed, before the oscillations start"""
-GAIN_TOLERANCE = 0.02
-"""a vehicle counts as string stable with gains up to one plus this tolerance"""
-OPERATING_SPEED_RATIOS = (0.5, 1.0, 1.5)
-"""speeds at which vehicles are tested, as shares of the mean speed of CAVs on their road"""
-MIN_OPERATING_SPEED = 1.0
-"""smallest speed of a test [m/s]"""
-MAX_FOLLOWERS = 60
-"""maximum number of human drivers behind a CAV"""
+OSCILLATION_FREQUENCIES = np.geomspace(0.001, 1.0, 25)  # of leaders [Hz]: from waves of 17 minutes to sways of a second
+OSCILLATION_AMPLITUDE = 0.05  # as a share of the mean speed; small, so that the response is nearly linear
+SETTLING_SECONDS = 300.0  # time behind a leader with constant speed, before the oscillations start
+GAIN_TOLERANCE = 0.02  # a vehicle counts as string stable with gains up to one plus this tolerance
+OPERATING_SPEED_RATIOS = (0.5, 1.0, 1.5)  # shares of the mean speed of CAVs on their road
+MIN_OPERATING_SPEED = 1.0  # [m/s]
+MAX_FOLLOWERS = 60  # human drivers behind a CAV
 
 
 @dataclass(frozen=True)
@@ -34,16 +27,11 @@ class StringStability:
 
     speed: float
     frequencies: tuple[float, ...]
-    gains: tuple[float, ...]
-    """amplitude of the CAV divided by that of the leader, at each frequency"""
-    human_gains: tuple[float, ...]
-    """gain of a human driver at each frequency, by the linearized IDM"""
-    peak_frequency: float
-    """frequency of the CAV's largest gain"""
-    amplified_band: tuple[float, ...]
-    """smallest and largest frequency that the CAV amplifies beyond the tolerance; empty if there is none"""
-    max_stable_followers: int
-    """maximum number of human drivers behind the CAV without amplification by all of them together"""
+    gains: tuple[float, ...]  # amplitude of the CAV divided by that of the leader, at each frequency
+    human_gains: tuple[float, ...]  # gain of a human driver at each frequency, by the linearized IDM
+    peak_frequency: float  # frequency of the CAV's largest gain
+    amplified_band: tuple[float, ...]  # smallest and largest frequency beyond the tolerance; empty if there is none
+    max_stable_followers: int  # human drivers behind the CAV without amplification by all together
 
 
 def operating_speeds(mean_speed: float, humans: IDMParameters) -> list[float]:
@@ -55,12 +43,23 @@ def operating_speeds(mean_speed: float, humans: IDMParameters) -> list[float]:
 def measure_string_stability(
     driver: FilteredDriver, speeds: Sequence[float], humans: IDMParameters, loop_length: float = np.nan
 ) -> tuple[StringStability, ...]:
-    """Return the response of a vehicle at each speed [m/s], in simulations that are deterministic.
-
-    `humans` drive behind it; `loop_length` is that of its closed road [m].
-    """
-    gains = string_gains(driver, speeds, humans, loop_length)
-    return tuple(_string_stability(*each, humans) for each in zip(speeds, gains, strict=True))
+    """Return the response of a vehicle at each speed [m/s], with `humans` behind it on a road of this length [m]."""
+    frequencies, found = OSCILLATION_FREQUENCIES, list[StringStability]()
+    for speed, gains in zip(speeds, string_gains(driver, speeds, humans, loop_length), strict=True):
+        amplified = frequencies[gains > 1.0 + GAIN_TOLERANCE]
+        human_gains = human_gain(frequencies, speed, humans)
+        stable = [n for n in range(MAX_FOLLOWERS + 1) if (gains * human_gains**n).max() <= 1.0 + GAIN_TOLERANCE]
+        response = StringStability(
+            speed,
+            tuple(frequencies.tolist()),
+            tuple(gains.tolist()),
+            tuple(human_gains.tolist()),
+            float(frequencies[int(np.argmax(gains))]),
+            (float(amplified[0]), float(amplified[-1])) if len(amplified) else (),
+            max(stable, default=0),
+        )
+        found.append(response)
+    return tuple(found)
 
 
 def string_gains(
@@ -68,8 +67,7 @@ def string_gains(
 ) -> Floats:
     """Return the gain at each speed [m/s] and each of the `OSCILLATION_FREQUENCIES`, shape (speeds, frequencies).
 
-    All leaders are simulated at once, each with one CAV behind it. The filter, the limits and the actuator of the
-    driver act, and the CAV starts with the gap of human drivers.
+    The filter, the limits and the actuator of the driver act, and the CAV starts with the gap of human drivers.
     """
     if not speeds:
         return np.zeros((0, len(OSCILLATION_FREQUENCIES)))
@@ -108,27 +106,8 @@ def human_gain(frequencies: Floats, speed: float, humans: IDMParameters) -> Floa
     return np.abs((f_dv * s + f_s) / (s**2 + (f_dv - f_v) * s + f_s))
 
 
-def _string_stability(speed: float, gains: Floats, humans: IDMParameters) -> StringStability:
-    frequencies = OSCILLATION_FREQUENCIES
-    amplified = frequencies[gains > 1.0 + GAIN_TOLERANCE]
-    human_gains = human_gain(frequencies, speed, humans)
-    stable = [n for n in range(MAX_FOLLOWERS + 1) if (gains * human_gains**n).max() <= 1.0 + GAIN_TOLERANCE]
-    return StringStability(
-        speed,
-        tuple(frequencies.tolist()),
-        tuple(gains.tolist()),
-        tuple(human_gains.tolist()),
-        float(frequencies[int(np.argmax(gains))]),
-        (float(amplified[0]), float(amplified[-1])) if len(amplified) else (),
-        max(stable, default=0),
-    )
-
-
 def _amplitude(values: Floats, times: Floats, frequency: float) -> float:
-    """Return the amplitude at a frequency [Hz] over its last whole periods, at most half of the measured time.
-
-    Of the lowest frequency, there is only one period.
-    """
+    """Return the amplitude at a frequency [Hz] over its last whole periods, at most half of the time, or one period."""
     period = 1.0 / frequency
     duration = max(1, int((times[-1] - SETTLING_SECONDS) / 2.0 / period)) * period
     measured = times > times[-1] - duration

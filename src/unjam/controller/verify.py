@@ -1,12 +1,8 @@
-"""Verification of a controller: whether it is undamaged, and whether its parts agree (`unjam verify`).
-
-A controller may exist in several forms: its driver, a recorded sample (observations of a CAV in an episode, and the
-controller's answers), an ONNX graph and a certificate. The report has one line for each part: how it was checked, that
-it is absent, that it is a statement of the maker, or that it could not be checked here.
-"""
+"""Verification of a controller: whether it is undamaged, and whether its forms agree (`unjam verify`)."""
 
 import json
 import secrets
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -26,16 +22,11 @@ from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError, MissingPartError, format_count
 from unjam.files import parse_json, reject_damaged, sha256_of, to_json
 
-REPLAY_TOLERANCE = 1e-9
-"""allowed difference between recorded accelerations and those on this machine [m/s2]"""
-CERTIFICATE_TOLERANCE = 1e-6
-"""allowed difference between the numbers of a certificate and those on this machine"""
-GRAPH_TOLERANCE = 1e-6
-"""allowed difference between graph and driver [m/s2]"""
-MAX_GRAPH_ROWS = 50
-"""maximum number of CAVs in one run of a graph"""
-RANDOM_STATE_COUNT = 200
-"""random states for the comparison of graph and driver, in addition to the maker's sample"""
+REPLAY_TOLERANCE = 1e-9  # allowed difference between recorded accelerations and those on this machine [m/s2]
+CERTIFICATE_TOLERANCE = 1e-6  # allowed difference between the numbers of a certificate and those on this machine
+GRAPH_TOLERANCE = 1e-6  # allowed difference between graph and driver [m/s2]
+MAX_GRAPH_ROWS = 50  # CAVs in one run of a graph
+RANDOM_STATE_COUNT = 200  # to compare graph and driver, in addition to the maker's sample
 
 CheckStatus = Literal["checked", "absent", "stated", "not checked"]
 
@@ -55,9 +46,8 @@ class PartCheck:
 def verify_controller_file(path: Path | str, signer: Path | str | None = None) -> list[PartCheck]:
     """Return the results for each part of a `.unjam` file or a run folder; only trusted code runs.
 
-    `signer` is the file of the public key of the required signature; None allows any key, and no signature. Raise
-    `InputError` for the first error, in one line, also for code that is not trusted, and `MissingPartError` if a part
-    could not be checked, because a package is not installed.
+    `signer` is the file of the public key of the required signature. Raise `InputError` for the first error, also code
+    that is not trusted, `MissingPartError` if a package is missing.
     """
     checks = check_parts(read_controller(path), signer)
     require_complete(checks)
@@ -71,34 +61,23 @@ def require_complete(checks: list[PartCheck]) -> None:
 
 
 def check_parts(controller: Controller, signer: Path | str | None = None) -> list[PartCheck]:
-    """Return the results for each part of a controller; arguments and errors as `verify_controller_file`.
-
-    A part that cannot be checked on this machine is not an error here: its status reports it.
-    """
+    """Return the results as `verify_controller_file`; the status of a part reports what cannot be checked here."""
     with reject_damaged("verify"):
         signature = _check_signer(controller.signed_by, signer)
         tested = {archive.GRAPH_PART, archive.CERTIFICATE_PART} & controller.parts.keys()
         if tested and archive.SAMPLE_PART not in controller.parts:
             raise InputError(f"controller: has {min(tested)}, but no recorded sample to test it on")
+        hidden = archive.MANIFEST_PART, archive.SIGNATURE_PART
+        sizes = [f"{name} {len(part):,} bytes" for name, part in controller.parts.items() if name not in hidden]
         return [
-            _describe_archive(controller),
+            PartCheck("parts", "checked", f"{', '.join(sizes)}: each has the SHA-256 that the manifest names"),
             signature,
-            _check_recipe(controller),
-            _describe_code(controller),
-            _describe_weights(controller),
-            _check_interface(controller),
+            *_check_driver(controller),
             *_describe_provenance(controller),
             _check_sample(controller),
             _check_graph(controller),
             _check_certificate(controller),
         ]
-
-
-def _describe_archive(controller: Controller) -> PartCheck:
-    """Describe the parts of the archive; their hashes were compared while it was read."""
-    hidden = archive.MANIFEST_PART, archive.SIGNATURE_PART
-    sizes = ", ".join(f"{name} {len(part):,} bytes" for name, part in controller.parts.items() if name not in hidden)
-    return PartCheck("parts", "checked", f"{sizes}: each has the SHA-256 that the manifest names")
 
 
 def _check_signer(actual: str | None, signer: Path | str | None) -> PartCheck:
@@ -118,38 +97,29 @@ def _check_signer(actual: str | None, signer: Path | str | None) -> PartCheck:
     return PartCheck("signature", "checked", f"{result}, by {str(signer)!r}, the key {actual}")
 
 
-def _check_recipe(controller: Controller) -> PartCheck:
-    stated, actual = controller.manifest["driver"], _json_roundtrip(driver_recipe(controller.driver)[0])
+def _check_driver(controller: Controller) -> Iterator[PartCheck]:
+    """Yield the results for the driver, its code, its weights, and the manifest's description of it."""
+    driver, manifest = controller.driver, controller.manifest
+    recipe, arrays = driver_recipe(driver)
+    stated, actual = manifest["driver"], _json_roundtrip(recipe)
     _require_same("manifest", first_difference(stated, actual, allows_missing=True, name="driver"))
     defaults = "; missing parameters have the defaults of this version" if first_difference(stated, actual) else ""
-    detail = f"{controller.driver.describe()}: built from its recipe, of which nothing was ignored{defaults}"
-    return PartCheck("driver", "checked", detail)
-
-
-def _describe_code(controller: Controller) -> PartCheck:
-    """Describe the Python code of a controller; hash and trust were checked before it was read."""
-    files = sorted({each["path"] for each in user_code_recipes(controller.manifest["driver"])})
-    if not files:
-        return PartCheck("code", "absent", "the controller is data: none of it is Python code")
-    detail = "trusted here, with the SHA-256 that the manifest names; its imports and its actions are not checked"
-    return PartCheck("code", "checked", f"{', '.join(short_text(path) for path in files)}: {detail}")
-
-
-def _describe_weights(controller: Controller) -> PartCheck:
-    """Describe the weights; their shapes and values were checked while the driver was built."""
-    part, arrays = controller.parts[archive.WEIGHTS_PART], driver_recipe(controller.driver)[1]
-    if not arrays:
-        return PartCheck("weights", "absent", f"the driver has no network; SHA-256 {sha256_of(part)}")
-    arrays_text = format_count(len(arrays), "array")
-    detail = f"{arrays_text}, finite, of the required shapes, none superfluous; SHA-256 {sha256_of(part)}"
-    return PartCheck("weights", "checked", detail)
-
-
-def _check_interface(controller: Controller) -> PartCheck:
-    actual = _json_roundtrip(driver_interface(controller.driver, controller.manifest.get("action_limit")))
-    stated = {name: controller.manifest[name] for name in actual}
-    _require_same("manifest", first_difference(stated, actual))
-    return PartCheck("manifest", "checked", f"{', '.join(actual)}: as the driver describes itself")
+    detail = f"{driver.describe()}: built from its recipe, of which nothing was ignored{defaults}"
+    yield PartCheck("driver", "checked", detail)
+    if files := sorted({each["path"] for each in user_code_recipes(stated)}):
+        detail = "trusted here, with the SHA-256 that the manifest names; its imports and its actions are not checked"
+        yield PartCheck("code", "checked", f"{', '.join(short_text(path) for path in files)}: {detail}")
+    else:
+        yield PartCheck("code", "absent", "the controller is data: none of it is Python code")
+    sha256 = sha256_of(controller.parts[archive.WEIGHTS_PART])
+    if arrays:
+        detail = f"{format_count(len(arrays), 'array')}, finite, of the required shapes, none superfluous"
+        yield PartCheck("weights", "checked", f"{detail}; SHA-256 {sha256}")
+    else:
+        yield PartCheck("weights", "absent", f"the driver has no network; SHA-256 {sha256}")
+    interface = _json_roundtrip(driver_interface(driver, manifest.get("action_limit")))
+    _require_same("manifest", first_difference({name: manifest[name] for name in interface}, interface))
+    yield PartCheck("manifest", "checked", f"{', '.join(interface)}: as the driver describes itself")
 
 
 def _describe_provenance(controller: Controller) -> list[PartCheck]:

@@ -1,9 +1,7 @@
-"""One formula for three kinds of numbers: NumPy arrays, torch tensors, and plain Python floats.
+"""One formula for three kinds of numbers: NumPy arrays in workers, torch tensors in learned models, Python floats.
 
-Every formula of unjam is written once, with the functions of this module. It runs on NumPy arrays in
-workers, on torch tensors in the learned model, and on plain floats where a single vehicle is driven:
-between two steps of SUMO the processor's caches are cold, and a NumPy call on one number then costs some
-3 us against 0.1 us for a float. (`array_api_compat` supports arrays only, and each of its calls costs 2 us.)
+Floats are for single vehicles: between two steps of SUMO the processor's caches are cold, and a NumPy call on one
+number then takes some 3 us against 0.1 us. (`array_api_compat` supports arrays only, and each call takes 2 us.)
 """
 
 import math
@@ -22,20 +20,13 @@ Floats = NDArray[np.float64]
 _FLOAT_NAMESPACE = SimpleNamespace(
     minimum=min,
     maximum=max,
-    floor=math.floor,
-    isnan=math.isnan,
-    cos=math.cos,
-    exp=math.exp,
-    sin=math.sin,
     where=lambda condition, then, otherwise: then if condition else otherwise,
+    **{name: getattr(math, name) for name in ("floor", "isnan", "cos", "exp", "sin")},
 )
 
 
 def namespace(array: Array) -> Any:
-    """Return the module with `where` and the functions of `_FLOAT_NAMESPACE` for this kind of number.
-
-    It is `numpy`, `torch`, or a namespace with these functions for plain floats.
-    """
+    """Return `numpy`, `torch` or a namespace for floats, with `where` and the functions of `_FLOAT_NAMESPACE`."""
     if type(array) is float:
         return _FLOAT_NAMESPACE
     if isinstance(array, (np.ndarray, np.generic)):
@@ -84,10 +75,7 @@ def as_indices(values: Array) -> Array:
 
 
 def copy_array(values: Array) -> Array:
-    """Return a copy with the same order in memory, through which gradients flow.
-
-    Sums over vehicles take a tenth of the time in the order of the batches.
-    """
+    """Return a copy with the same order in memory, in which sums are fast, through which gradients flow."""
     return values.copy("K") if isinstance(values, np.ndarray) else values.clone()
 
 
@@ -99,14 +87,10 @@ def replace_entries(values: Array, index: Any, source: Array, source_index: Any)
 
 
 def replace_columns(values: Any, columns: Any, source: Any, source_columns: Any) -> Any:
-    """Return an array with columns of `source` in place of some of its own, along the last axis.
-
-    In tuples and lists of arrays, too; what is no array stays as it is.
-    """
+    """Return arrays, also in tuples and lists, with columns of `source` in place of some along the last axis."""
     if isinstance(values, tuple | list):
-        parts = [
-            replace_columns(own, columns, other, source_columns) for own, other in zip(values, source, strict=True)
-        ]
+        pairs = zip(values, source, strict=True)
+        parts = [replace_columns(own, columns, other, source_columns) for own, other in pairs]
         return type(values)(*parts) if hasattr(values, "_fields") else type(values)(parts)
     if not hasattr(values, "shape"):
         return values
@@ -114,10 +98,7 @@ def replace_columns(values: Any, columns: Any, source: Any, source_columns: Any)
 
 
 def replace_padded_rows(values: Any, rows: Any, source: Any, source_rows: Any, padding: Any) -> Any:
-    """Return a NumPy array (..., n, m) with rows of `source` (..., k, l) in place of some of its own.
-
-    The shorter one gets columns of `padding` at the end.
-    """
+    """Return an array (..., n, m) with rows of `source` (..., k, l) in place of some; the shorter gets `padding`."""
     width = max(values.shape[-1], source.shape[-1])
     found, other = (
         np.pad(each, [(0, 0)] * (each.ndim - 1) + [(0, width - each.shape[-1])], constant_values=padding)

@@ -8,23 +8,18 @@ from typing import NamedTuple
 
 from unjam.physics.arrays import Array, clamp_min
 
-GRAVITY, AIR_DENSITY = 9.81, 1.2
-"""[m/s2], [kg/m3]"""
+GRAVITY, AIR_DENSITY = 9.81, 1.2  # [m/s2], [kg/m3]
 JOULES_PER_KWH = 3.6e6
 
 
 class Car(NamedTuple):
     """What the fuel of a car depends on."""
 
-    mass: float = 1500.0
-    """with driver [kg]"""
+    mass: float = 1500.0  # with driver [kg]
     rolling_resistance: float = 0.015
-    drag_area: float = 0.65
-    """drag coefficient times frontal area [m2]"""
-    base_power: float = 3000.0
-    """power of engine and accessories at idle [W]: 0.9 l/h"""
-    consumption: float = 300.0
-    """fuel of an engine per energy [ml/kWh]"""
+    drag_area: float = 0.65  # drag coefficient times frontal area [m2]
+    base_power: float = 3000.0  # power of engine and accessories at idle [W]: 0.9 l/h
+    consumption: float = 300.0  # fuel of an engine per energy [ml/kWh]
 
 
 MID_SIZE_CAR = Car()

@@ -53,8 +53,7 @@ class IDMArrays(NamedTuple):
 
 PAPER_IDM = IDMParameters()
 IDM_PARAMETER_NAMES = IDMArrays._fields
-BISECTION_STEPS = 60
-"""bisections for an equilibrium speed that is exact to the last bit"""
+BISECTION_STEPS = 60  # bisections for an equilibrium speed that is exact to the last bit
 
 
 def stack_idm_parameters(drivers: Sequence[IDMParameters]) -> IDMArrays:
@@ -63,19 +62,13 @@ def stack_idm_parameters(drivers: Sequence[IDMParameters]) -> IDMArrays:
 
 
 def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters | IDMArrays = PAPER_IDM) -> Array:
-    """Return the desired bumper-to-bumper gap s* [m] (Eq. 6), of the shape of `speed` and `approach_rate` [m/s].
-
-    The approach rate is the own speed minus the leader's; the parameters are those of one driver, or of each row's.
-    """
+    """Return the desired gap s* [m] (Eq. 6), bumper to bumper; the approach rate is relative to the leader [m/s]."""
     p = parameters
     return p.minimum_gap + clamp_min(speed * p.time_headway + speed * approach_rate / p.interaction_scale, 0.0)
 
 
 def fast_power(base: Array, exponent: Array) -> Array:
-    """Return `base` to the power of `exponent`; the fourth power by squaring twice, equal except for rounding.
-
-    For large float32 tensors this takes a fiftieth of the time of a general power.
-    """
+    """Return `base` to the power of `exponent`; the fourth power is 50 times faster than `pow`, up to rounding."""
     if type(exponent) is float and exponent == 4.0:
         square = base * base
         return square * square
@@ -103,18 +96,12 @@ def idm_acceleration(
 def desired_speed_from_acceleration(
     acceleration: Array, speed: Array, parameters: IDMParameters | IDMArrays = PAPER_IDM
 ) -> Array:
-    """Return the desired speed v0 at which a driver without a leader has this acceleration [m/s].
-
-    Closed form of Eq. 5 without its interaction term; `acceleration` is below the maximum, `speed` in m/s, any shape.
-    """
+    """Return the desired speed [m/s] of a driver without a leader with this acceleration (Eq. 5)."""
     return speed / (1.0 - acceleration / parameters.max_acceleration) ** (1.0 / parameters.exponent)
 
 
 def equilibrium_gap(speed: float, parameters: IDMParameters = PAPER_IDM) -> float:
-    """Return the gap at which a platoon at constant `speed` neither accelerates nor brakes [m].
-
-    Closed form of Eq. 5 with a* = 0 and no speed difference; `speed` in [0, v0) m/s.
-    """
+    """Return the gap of a platoon at constant `speed`, in [0, v0) m/s, without acceleration [m] (Eq. 5)."""
     p = parameters
     if not 0 <= speed < p.desired_speed:
         raise ValueError(f"speed {speed} m/s has no equilibrium gap: it must be in [0, {p.desired_speed})")
@@ -122,10 +109,7 @@ def equilibrium_gap(speed: float, parameters: IDMParameters = PAPER_IDM) -> floa
 
 
 def equilibrium_speed(gap: float, parameters: IDMParameters = PAPER_IDM) -> float:
-    """Return the constant speed of drivers when all gaps are `gap` meters [m/s].
-
-    The inverse of `equilibrium_gap`; 0 where the gap is not above the standstill gap.
-    """
+    """Return the inverse of `equilibrium_gap` [m/s]; 0 where the gap is not above the standstill gap."""
     if gap <= parameters.minimum_gap:
         return 0.0
     low, high = 0.0, parameters.desired_speed

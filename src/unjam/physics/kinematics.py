@@ -23,10 +23,7 @@ def distance_driven(speed: Array, new_speed: Array, time_step: float, steps: int
 
 
 def gap_on_loop(position: Array, leader_position: Array, loop_length: Array, leader_length: float) -> Array:
-    """Return the bumper-to-bumper gap to the leader on a closed road.
-
-    Positions are those of front bumpers along the road; they may exceed the length of the loop.
-    """
+    """Return the bumper-to-bumper gap on a closed road from positions of front bumpers, which may exceed its length."""
     return (leader_position - position) % loop_length - leader_length
 
 
@@ -34,8 +31,7 @@ def stopping_distance(speed: Array, braking: Array, time_step: float) -> Array:
     """Return the distance that a vehicle drives if it brakes with `braking` from the next step on [m].
 
     With v_j = max(0, v - j b h) after j steps of length h it is h (v_1 + v_2 + ...). The first
-    n = floor(v / (b h)) terms are not zero, so the sum is h (n v - b h n (n + 1) / 2). It increases with v, and
-    exceeds v^2 / (2 b) - v h / 2 by 0 to b h^2 / 8.
+    n = floor(v / (b h)) terms are not zero, so the sum is h (n v - b h n (n + 1) / 2).
     """
     change = braking * time_step
     steps = namespace(speed).floor(speed / change)
@@ -45,8 +41,7 @@ def stopping_distance(speed: Array, braking: Array, time_step: float) -> Array:
 def max_speed_to_stop(distance: Array, braking: float, time_step: float) -> Array:
     """Return the highest speed after this step from which a vehicle still stops within `distance` [m/s].
 
-    It drives one step at the result v and then brakes: v h + `stopping_distance`(v) = `distance`, which is
-    piecewise linear in v; n is the number of whole steps of braking. Zero where the distance is not positive.
+    The result v solves v h + `stopping_distance`(v) = `distance`, piecewise linear in v; zero if it is not positive.
     """
     change = braking * time_step
     room = clamp_min(distance, 0.0) / time_step

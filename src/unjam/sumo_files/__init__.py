@@ -1,9 +1,4 @@
-"""Read and check users' SUMO files before SUMO starts, because SUMO crashes on some broken files.
-
-The files are untrusted. `reader_program.py` reads them in a separate process that `unjam.sandbox` limits, and returns
-one JSON document. Options and elements that make SUMO write files or open ports are not passed to SUMO: see
-`write_harmless_copy`.
-"""
+"""Read users' SUMO files in a limited process before SUMO starts, which crashes on some, and could write or listen."""
 
 import json
 import re
@@ -14,11 +9,10 @@ from typing import Any, Literal, NamedTuple
 from unjam import sandbox
 from unjam.child_processes import child_environment, python_command
 from unjam.errors import InputError, invalid_value, spelling_hint
-from unjam.sumo_files.reader import ALLOWED_VARIABLES, UNKNOWN_VARIABLE, file_stamp
+from unjam.sumo_files.reader import ALLOWED_VARIABLES, UNKNOWN_VARIABLE, FileStamp, file_stamp
 
 READER_PROGRAM = Path(__file__).with_name("reader_program.py")
-MAX_READER_MEMORY, MAX_READER_TIME = 4 * 2**30, 120
-"""maximum memory [bytes] and time [s] of the reader process"""
+MAX_READER_MEMORY, MAX_READER_TIME = 4 * 2**30, 120  # maximum memory [bytes] and time [s] of the reader process
 
 LaneShape = tuple[str, float, float, list[tuple[float, float]]]
 """id of the edge, length [m], speed limit [m/s], and points (x, y) of the center line [m]"""
@@ -47,14 +41,11 @@ configuration-file configuration c game game.mode breakpoints edgedata-files dat
 selection-file demo disable-textures window-size window-pos tracker-interval gui-testing gui-testing-debug
 suppress-warnings no-duration-log
 """
-PASSED_OPTIONS = set(_PASSED.split())
-"""options that only define how to simulate; they are passed to SUMO"""
-PASSED_OPTION_PREFIXES = tuple(_PASSED_PREFIXES.split())
-"""prefixes of the names of further options that are passed to SUMO"""
+PASSED_OPTIONS = set(_PASSED.split())  # options that only define how to simulate; they are passed to SUMO
+PASSED_OPTION_PREFIXES = tuple(_PASSED_PREFIXES.split())  # of further options that are passed
 IGNORED_OPTIONS = {*_IGNORED.split(), *"vtgdHWXVQGSDTBmN?"}
 """options that unjam sets itself, or that do not affect traffic; that they are left out is not reported"""
-REPLACED_OPTIONS = ("seed", "random", "max-depart-delay", "threads")
-"""options that affect traffic and get other values from unjam"""
+REPLACED_OPTIONS = ("seed", "random", "max-depart-delay", "threads")  # they affect traffic, and unjam sets them
 OUTPUT_OPTIONS = re.compile(
     r"output|^(write-|save-|netstate|ndump|dump-|summary$|tripinfo$|personinfo$|vehroutes|personroutes$)"
     r"|^(log|log-file|message-log|error-log|precision\.geo|person-fcd|remote-port|num-clients|l|C)$"
@@ -71,8 +62,7 @@ REFUSED_OPTIONS = {
     "phemlight-path": "./PHEMlight/, SUMO's default",
 }
 """options that affect traffic but cannot be passed to SUMO, with the allowed values"""
-HARMFUL_OPTION_PARTS = ("file", "output", "threads", ".wkt", ".py")
-"""parts of the names of harmful options among those with PASSED_OPTION_PREFIXES"""
+HARMFUL_OPTION_PARTS = ("file", "output", "threads", ".wkt", ".py")  # among PASSED_OPTION_PREFIXES
 
 
 class SumoFiles(NamedTuple):
@@ -82,42 +72,28 @@ class SumoFiles(NamedTuple):
     network: Path
     additional_files: tuple[Path, ...]
     route_files: tuple[Path, ...]
-    weight_files: tuple[Path, ...]
-    """files with travel times of edges, for vehicles that choose their route"""
-    sources: tuple[Path, ...]
-    """all files that were read: the configuration, the files that it names, and those that these include"""
-    begin: float
-    """begin of the simulation [s]"""
-    end: float | None
-    """end of the simulation [s]; None: when the last vehicle has arrived"""
-    first_departure: float | None
-    """earliest departure of a vehicle [s]; None: unknown"""
-    calibrated_until: float
-    """latest time at which calibrators may add vehicles [s]; zero: there are none"""
-    step: float
-    """simulation step [s]"""
-    options: dict[str, str]
-    """values of the options that are passed to SUMO, by name"""
-    dropped_items: tuple[str, ...]
-    """options and elements that are left out because they only write files or open ports"""
-    replaced_options: tuple[str, ...]
-    """options that affect traffic and get other values from unjam"""
+    weight_files: tuple[Path, ...]  # files with travel times of edges, for vehicles that choose their route
+    sources: tuple[Path, ...]  # all files that were read, included ones too
+    begin: float  # of the simulation [s]
+    end: float | None  # end of the simulation [s]; None: when the last vehicle has arrived
+    first_departure: float | None  # earliest departure of a vehicle [s]; None: unknown
+    calibrated_until: float  # latest time at which calibrators may add vehicles [s]; zero: there are none
+    step: float  # of the simulation [s]
+    options: dict[str, str]  # values of the options that are passed to SUMO, by name
+    dropped_items: tuple[str, ...]  # options and elements that only write files or open ports
+    replaced_options: tuple[str, ...]  # among `REPLACED_OPTIONS`
     copy_sources: dict[Path, tuple[Path, ...]]
     """sources of the harmless copy of a file, by file; SUMO reads files without a copy directly"""
-    types: dict[str, dict[str, str]]
-    """attributes of all vehicle types, by id"""
+    types: dict[str, dict[str, str]]  # attributes of all vehicle types, by id
     type_parameters: dict[str, dict[str, str]]
     """nested `<param>` elements of the types: values by key, by the type's id"""
-    used_types: frozenset[str]
-    """ids of the types that vehicles have"""
-    has_bicycle_lanes: bool
-    """whether the network has lanes for bicycles only"""
+    used_types: frozenset[str]  # ids
+    has_bicycle_lanes: bool  # for bicycles only
 
 
-_read_files: dict[Path, tuple[dict[Path, tuple[int, int]], SumoFiles]] = {}
+_read_files: dict[Path, tuple[dict[Path, FileStamp], SumoFiles]] = {}
 """stamps of all files, and their content, by path of the configuration"""
-_answers: dict[str, dict[str, Any]] = {}
-"""answer of the reader process by path of the configuration, for other processes"""
+_answers: dict[str, dict[str, Any]] = {}  # of the reader process, by path of the configuration
 
 
 def read_sumo_files(path: Path) -> SumoFiles:
@@ -138,10 +114,7 @@ def answer_of(path: str) -> dict[str, Any] | None:
 
 
 def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
-    """Store and return the content of a .sumocfg file, from an answer of the reader process.
-
-    Raise `InputError` as `classify_option` does.
-    """
+    """Store and return the content of a .sumocfg file, from an answer of the reader process."""
     path, fields = Path(file), dict(answer)
     stamps = {Path(source): (time, size) for source, (time, size) in fields.pop("stamps").items()}
     fields |= {name: tuple(map(Path, fields[name])) for name in ("additional_files", "route_files", "weight_files")}
@@ -163,10 +136,7 @@ def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
 
 
 def classify_option(file: str, name: str, value: str) -> Literal["passed", "ignored", "replaced", "dropped"]:
-    """Return how unjam treats an option of a configuration.
-
-    Raise `InputError` if SUMO has no such option, or it changes the traffic and cannot be passed on.
-    """
+    """Return how unjam treats an option; `InputError` if SUMO has none, or it affects traffic and cannot be passed."""
     if is_passed_option(name):
         return "passed"
     if name in IGNORED_OPTIONS:
@@ -189,11 +159,7 @@ def read_lanes(path: Path) -> list[LaneShape]:
 
 
 def write_harmless_copy(path: Path, copy: Path, types: Path | None = None) -> None:
-    """Write a copy of a SUMO file without elements that make SUMO write a file, listen, or read another file.
-
-    Vehicle types get the attributes that a JSON file `types` has for them, by id. Raise `InputError` if the file is
-    broken or too large.
-    """
+    """Write a copy of a SUMO file without harmful elements, with new attributes of vehicle types from a JSON file."""
     _run_reader("copy", path, copy, *([types] if types else []))
 
 
@@ -203,9 +169,7 @@ def _run_reader(command: Literal["configuration", "lanes", "copy"], path: Path, 
     program = python_command("-I", "-S", sandbox.__file__, *limits, str(READER_PROGRAM), command)
     arguments = [*program, str(path), *map(str, extra_paths)]
     try:
-        process = subprocess.run(
-            arguments, capture_output=True, timeout=MAX_READER_TIME, env=child_environment(), check=False
-        )
+        process = subprocess.run(arguments, capture_output=True, timeout=MAX_READER_TIME, env=child_environment())
         answer = json.loads(process.stdout)
     except (subprocess.TimeoutExpired, ValueError):
         limit = f"{MAX_READER_MEMORY / 2**30:g} GiB, {MAX_READER_TIME:g} s"
@@ -217,6 +181,5 @@ def _run_reader(command: Literal["configuration", "lanes", "copy"], path: Path, 
 
 def is_passed_option(name: str) -> bool:
     """Return whether SUMO receives an option: it only defines how to simulate."""
-    return name in PASSED_OPTIONS or (
-        name.startswith(PASSED_OPTION_PREFIXES) and not any(word in name for word in HARMFUL_OPTION_PARTS)
-    )
+    is_harmful = any(word in name for word in HARMFUL_OPTION_PARTS)
+    return name in PASSED_OPTIONS or (name.startswith(PASSED_OPTION_PREFIXES) and not is_harmful)

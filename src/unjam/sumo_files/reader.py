@@ -12,18 +12,14 @@ from typing import IO, Any
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
-XML_CHUNK_BYTES, MAX_UNPACKED_BYTES = 1 << 18, 1 << 22
-"""maximum number of bytes that are read, and that are unpacked, at a time"""
-MAX_ELEMENT_BYTES = 1 << 22
-"""maximum number of bytes of one element with its attributes"""
-MAX_INCLUDED_FILES = 1000
-"""maximum number of files that one file includes, because files could include each other endlessly"""
+XML_CHUNK_BYTES, MAX_UNPACKED_BYTES = 1 << 18, 1 << 22  # read, and unpacked, at a time
+MAX_ELEMENT_BYTES = 1 << 22  # of one element with its attributes
+MAX_INCLUDED_FILES = 1000  # by one file; files could include each other endlessly
 OUTPUT_ELEMENTS = {"edgeData", "laneData", "vTypeProbe", "timedEvent", "instantInductionLoop"}
 """elements that only write files"""
 DETECTOR_SUFFIXES = ("Detector", "inductionLoop", "routeProbe", "detector")
 """suffixes of elements that are detectors of traffic lights and calibrators: they are kept, but write no file"""
-EXTERNAL_ELEMENTS = ("calibrator", "variableSpeedSign")
-"""elements with an attribute `file` that names the file of their content"""
+EXTERNAL_ELEMENTS = ("calibrator", "variableSpeedSign")  # their attribute `file` names a file with their content
 _ELEMENTS = """
 routes route-alternatives additional add data meandata detectors tlLogics taz tazs types stops connections edges
 include param vType vTypeDistribution type route routeDistribution vehicle trip flow stop interval edge lane
@@ -41,37 +37,26 @@ edgedata
 SUMO_ELEMENTS = set(_ELEMENTS.split())
 """elements of SUMO's demand, additional files and weights of edges, and the outermost elements of such files"""
 FOLLOWING_MODEL_PREFIX = "carFollowing-"
-NETWORK_ELEMENT = "net"
-"""outermost element of a network, of which all elements are read; included files are no networks"""
-NULL_FILE = "NUL"
-"""name of a file that SUMO never creates"""
-FILE_ATTRIBUTES = ("file", "output", "dest", "href")
-"""attributes that name files, in addition to those that end in `File`"""
+NETWORK_ELEMENT = "net"  # outermost element of a network, of which all elements are read
+NULL_FILE = "NUL"  # name of a file that SUMO never creates
+FILE_ATTRIBUTES = ("file", "output", "dest", "href")  # in addition to those that end in `File`
 FILE_PARAMETER_PARTS = ("file", "output", "log", "ssm", "tripinfo")
 """parts of the keys of harmful parameters: they name a file, write one, or remove trips from the records with delays"""
 SUBSTITUTED_VARIABLES = ("HOME", "SUMO_HOME", "PWD", "TMPDIR", "LOCALTIME", "UTC", "PID")
 """variables that values of options may name; the last three are SUMO's own"""
 ALLOWED_VARIABLES = ", ".join(f"${{{name}}}" for name in SUBSTITUTED_VARIABLES)
-UNKNOWN_VARIABLE = re.compile(r"\$\{.*?\}")
-"""a variable that is left after the substitution"""
-LANE_NAME = re.compile(r"_\d+$")
-"""end of the id of a lane; a parameter of a traffic light with such a key names the detector of a lane"""
-CAV_TYPE_TEMPLATE = "cav_of_{}"
-"""id of the vehicle type of CAVs that replace vehicles of another type"""
+UNKNOWN_VARIABLE = re.compile(r"\$\{.*?\}")  # a variable that is left after the substitution
+LANE_NAME = re.compile(r"_\d+$")  # end of the id of a lane, and of keys of detectors of traffic lights
+CAV_TYPE_TEMPLATE = "cav_of_{}"  # id of the vehicle type of CAVs that replace vehicles of another type
 TYPE_LIST, TYPE_LIST_DEFINITIONS = "vTypes", ("vTypeDistribution", "personTrip")
 """attribute by which rerouters, calibrators and detectors select vehicles, and elements in which it creates vehicles"""
 TYPE_ELEMENTS = "vType", "vTypeDistribution"
-CHECKED_ELEMENTS = {*OUTPUT_ELEMENTS, *TYPE_ELEMENTS, "include", "param"}
-"""elements that are checked whatever attributes they have"""
-PLAIN_ENCODINGS = (None, "utf-8", "us-ascii", "ascii", "iso-8859-1")
-"""encodings in which SUMO's parser finds the same elements as this one"""
-XML_ERRORS = (expat.ExpatError, OSError, EOFError, zlib.error, LookupError, ValueError)
-"""errors that reading a broken file can raise"""
+CHECKED_ELEMENTS = {*OUTPUT_ELEMENTS, *TYPE_ELEMENTS, "include", "param"}  # whatever attributes they have
+PLAIN_ENCODINGS = (None, "utf-8", "us-ascii", "ascii", "iso-8859-1")  # SUMO's parser finds the same elements
+XML_ERRORS = (expat.ExpatError, OSError, EOFError, zlib.error, LookupError, ValueError)  # of broken files
 
-FileStamp = tuple[int, int]
-"""time of the last change [ns] and size [bytes]"""
-XmlAttributes = dict[str, str]
-"""attributes of an element, by name"""
+FileStamp = tuple[int, int]  # time of the last change [ns] and size [bytes]
+XmlAttributes = dict[str, str]  # attributes of an element, by name
 XmlHandlers = dict[str, Callable[[XmlAttributes], None]]
 """functions that receive the attributes of an element, by its name; the end of an element has the name `/name`"""
 
@@ -93,10 +78,9 @@ def file_stamp(file: Path) -> FileStamp:
 
 
 class XmlReader:
-    """Reads an XML file of SUMO and the files that it includes, and writes its harmless parts to `out`.
+    """Reads an XML file of SUMO and the files that it includes in one pass, and writes its harmless parts to `out`.
 
-    Names are those in the file, with their prefixes, as SUMO reads them. Vehicle types get the attributes that
-    `type_changes` has for their ids. A large file is read in one pass that stores nothing of it.
+    Vehicle types get the attributes that `type_changes` has for their ids.
     """
 
     def __init__(
@@ -104,20 +88,14 @@ class XmlReader:
     ) -> None:
         self._handlers, self._type_changes = handlers, type_changes or {}
         self._write = out.write if out else None
-        self._dropped_depth = 0
-        """depth of open elements within a dropped one, itself included"""
-        self._open_type = ""
-        """the outermost open type or distribution of types; empty: none"""
-        self._renamed_tags: dict[str, str] = {}
-        """names under which elements are written, if they differ"""
-        self._harmless_names: set[str] = set()
-        """attributes that name no file, as far as known"""
+        self._dropped_depth = 0  # depth of open elements within a dropped one, itself included
+        self._open_type = ""  # the outermost open type or distribution of types; empty: none
+        self._renamed_tags: dict[str, str] = {}  # names under which elements are written, if they differ
+        self._harmless_names: set[str] = set()  # attributes that name no file, as far as known
         self._parsers: list[Any] = []
-        self._open_files: list[Path] = []
-        """the file that is being read, after those that include it"""
+        self._open_files: list[Path] = []  # the file that is being read, after those that include it
         self.root = self.version = ""
-        self.sources: dict[Path, FileStamp] = {}
-        """the files that were read, with their stamps before reading"""
+        self.sources: dict[Path, FileStamp] = {}  # the files that were read, with their stamps before reading
         self._include_count = 0
         self.dropped_items: set[str] = set()
         self.needs_copy = False
@@ -188,7 +166,6 @@ class XmlReader:
         self._on_start(tag, attributes)
 
     def _on_inner(self, tag: str, attributes: XmlAttributes) -> None:
-        """Leave out elements that SUMO does not have, with their content."""
         if self._dropped_depth or is_sumo_element(tag):
             self._on_start(tag, attributes)
         else:
@@ -196,7 +173,6 @@ class XmlReader:
             self._drop_content()
 
     def _process_element(self, tag: str, attributes: XmlAttributes) -> None:
-        """Write the harmless parts of an element that may name a file; read the file that it includes."""
         if tag == "include":
             self._include(attributes.get("href", ""))
         harmless = None if tag == "include" else self._filter_attributes(tag, attributes)
@@ -303,10 +279,7 @@ def is_harmless_parameter(key: str) -> bool:
 
 
 def parse_xml(path: Path, parser: Any, chunks: Iterable[bytes]) -> None:
-    """Parse a file; raise `BrokenFileError` if it is not XML, or has a document type or a huge element.
-
-    A document type can name other files, or grow without end. SUMO's own files have none, but SUMO would follow it.
-    """
+    """Parse a file; `BrokenFileError` for no XML, a huge element, or a document type, which can grow endlessly."""
 
     def refuse_doctype(*definition: object) -> None:
         raise BrokenFileError(f"{path.name}: a document type (<!DOCTYPE ...>) is not allowed")

@@ -1,13 +1,9 @@
-"""The program that reads users' SUMO files, in a separate process that `unjam.sandbox` limits.
-
-It prints one JSON document, needs only Python's standard library, and starts in 50 ms.
-"""
+"""The program that reads users' SUMO files in a limited process: it prints one JSON document, and starts in 50 ms."""
 
 import json
 import os
 import re
 import sys
-from collections.abc import Callable
 from functools import partial
 from math import inf, isfinite, nan
 from pathlib import Path
@@ -22,32 +18,16 @@ if __name__ == "__main__":  # packages without their own code, which would impor
         sys.modules[name] = ModuleType(name)
         sys.modules[name].__path__ = [str(folder)]
 
-from unjam.sumo_files.reader import (  # noqa: E402
-    ALLOWED_VARIABLES,
-    NETWORK_ELEMENT,
-    SUBSTITUTED_VARIABLES,
-    UNKNOWN_VARIABLE,
-    BrokenFileError,
-    XmlAttributes,
-    XmlHandlers,
-    XmlReader,
-    check_file_exists,
-    file_stamp,
-    parse_xml,
-)
+from unjam.sumo_files import reader as xml  # noqa: E402
+from unjam.sumo_files.reader import BrokenFileError, XmlAttributes, XmlReader  # noqa: E402
 
-DEFAULT_VEHICLE_TYPE = "DEFAULT_VEHTYPE"
-"""vehicle type that SUMO uses for vehicles without a type"""
-MODE_TYPES = {"car": DEFAULT_VEHICLE_TYPE, "bicycle": "DEFAULT_BIKETYPE"}
-"""vehicle type that SUMO uses for the trip of a person, by mode"""
+DEFAULT_VEHICLE_TYPE = "DEFAULT_VEHTYPE"  # vehicle type that SUMO uses for vehicles without a type
+MODE_TYPES = {"car": DEFAULT_VEHICLE_TYPE, "bicycle": "DEFAULT_BIKETYPE"}  # of the trip of a person
 OTHER_DEFAULT_TYPES = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi", "DEFAULT_RAILTYPE": "rail"}
 """vehicle classes of SUMO's other predefined types"""
-DEMAND_ELEMENTS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}
-"""elements that create vehicles, with the attribute of their first departure"""
-TIME_UNITS = (1.0, 60.0, 3600.0, 86400.0)
-"""seconds, minutes, hours and days [s]: SUMO's times can be 1:30:00"""
-FILE_OPTIONS = ("net-file", "additional-files", "route-files", "weight-files")
-"""options that name files, which SUMO reads after they were checked"""
+DEMAND_ELEMENTS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}  # create vehicles from then on
+TIME_UNITS = (1.0, 60.0, 3600.0, 86400.0)  # seconds, minutes, hours and days [s]: SUMO's times can be 1:30:00
+FILE_OPTIONS = ("net-file", "additional-files", "route-files", "weight-files")  # files that SUMO reads
 SYNONYMS = {
     synonym: name
     for name, synonyms in {
@@ -62,27 +42,23 @@ SYNONYMS = {
     for synonym in synonyms.split()
 }
 """name of an option by each of its synonyms in SUMO"""
-CAR_FOLLOWING_MODELS = (
-    *("Krauss", "KraussOrig1", "KraussPS", "KraussX", "IDM", "IDMM", "EIDM", "SmartSK"),
-    *("Daniel1", "PWagner2009", "BKerner", "Wiedemann", "W99", "ACC", "CACC", "CC", "Rail"),
-)
-"""car-following models that older files define in a nested element"""
+_MODELS = """
+Krauss KraussOrig1 KraussPS KraussX IDM IDMM EIDM SmartSK Daniel1 PWagner2009 BKerner Wiedemann W99 ACC CACC CC Rail
+"""
 READ_ELEMENTS = (
     *(*DEMAND_ELEMENTS, "lane", "param", "person", "personFlow", "personTrip", "calibrator"),
     *("vType", "/vType", "vTypeDistribution", "/vTypeDistribution"),
-    *(f"carFollowing-{name}" for name in CAR_FOLLOWING_MODELS),
+    *(f"{xml.FOLLOWING_MODEL_PREFIX}{name}" for name in _MODELS.split()),  # nested in types of older files
 )
 """elements with content that `_Demand` needs, and the ends of some"""
-MAX_VEHICLE_TYPES = 100_000
-"""maximum number of vehicle types, of which unjam makes others for CAVs"""
-TRUE_VALUES = ("true", "t", "yes", "on", "1", "x")
-"""texts that SUMO accepts as true"""
+MAX_VEHICLE_TYPES = 100_000  # of which unjam makes others for CAVs
+TRUE_VALUES = ("true", "t", "yes", "on", "1", "x")  # texts that SUMO accepts as true
 
 
 def _read_configuration(path: Path) -> dict[str, Any]:
     """Return the content of a .sumocfg file and of the files that it names as JSON, the fields of `SumoFiles`."""
-    check_file_exists(path)
-    stamps = {path: file_stamp(path)}
+    xml.check_file_exists(path)
+    stamps = {path: xml.file_stamp(path)}
     options = _read_options(path)
     if options.get("mesosim", "").lower() in TRUE_VALUES:
         raise BrokenFileError(f"{path.name}: mesosim: true is not allowed; allowed: false, as it obeys no commands")
@@ -95,12 +71,16 @@ def _read_configuration(path: Path) -> dict[str, Any]:
     (network,), demand = networks, _Demand()
     files = [network, *additional, *routes, *weights]
     for file in files:
-        check_file_exists(file)
+        xml.check_file_exists(file)
     readers = {file: XmlReader(demand.handlers()) for file in files}
     for file, reader in readers.items():
         reader.read(file)
         stamps = {**reader.sources, **stamps}
-    _check_network(network, readers[network])
+    if (root := readers[network].root) != xml.NETWORK_ELEMENT:
+        raise BrokenFileError(f"{network.name}: is not a SUMO network: it begins with <{root}>")
+    if not readers[network].version:  # without it SUMO would crash
+        convert = f"convert it: netconvert -s {network.name} -o"
+        raise BrokenFileError(f"{network.name}: the network has no version; {convert}")
     if not demand.used_names:
         elements = "vehicle, trip, flow or personal car"
         raise BrokenFileError(f"{path.name}: its route and additional files have no {elements}")
@@ -147,7 +127,7 @@ def _read_options(path: Path) -> dict[str, str]:
     parser = expat.ParserCreate()
     parser.buffer_text = True
     parser.StartElementHandler, parser.CharacterDataHandler = add_option, refuse_text
-    parse_xml(path, parser, [path.read_bytes()])
+    xml.parse_xml(path, parser, [path.read_bytes()])
     return options
 
 
@@ -159,24 +139,18 @@ def canonical_option(name: str) -> str:
 
 
 def _named_file(path: Path, option: str, name: str) -> Path:
-    """Return a file that an option of a configuration names.
-
-    Variables besides `SUBSTITUTED_VARIABLES` are replaced only in names of existing files: no message then shows them.
-    """
-    file = path.parent / unquote(UNKNOWN_VARIABLE.sub(lambda match: os.environ.get(match[0][2:-1], ""), name))
-    if (variable := UNKNOWN_VARIABLE.search(name)) and not os.path.isfile(file):
-        allowed = f"{ALLOWED_VARIABLES}, and others in names of existing files"
+    """Return a file that an option names; only names of existing files have all variables: no message shows these."""
+    file = path.parent / unquote(xml.UNKNOWN_VARIABLE.sub(lambda match: os.environ.get(match[0][2:-1], ""), name))
+    if (variable := xml.UNKNOWN_VARIABLE.search(name)) and not os.path.isfile(file):
+        allowed = f"{xml.ALLOWED_VARIABLES}, and others in names of existing files"
         raise BrokenFileError(f"{path.name}: {option}: {variable[0]!r} is not allowed; allowed: {allowed}")
     return file
 
 
 def _substitute_variables(text: str) -> str:
-    """Return an option's value with `~` and `SUBSTITUTED_VARIABLES` replaced as SUMO does; unset ones are empty.
-
-    Other variables stay as they are: configurations of others could ask for secrets.
-    """
+    """Replace `~` and some variables as SUMO does; not all, as configurations of others could ask for secrets."""
     home = re.sub("(^|,)~", r"\1${HOME}", text)
-    for name in SUBSTITUTED_VARIABLES:
+    for name in xml.SUBSTITUTED_VARIABLES:
         home = home.replace(f"${{{name}}}", os.environ.get(name, ""))
     return home
 
@@ -216,38 +190,22 @@ def _parse_time(text: str) -> float:
     return value if len(parts) in (1, 3, 4) else nan
 
 
-def _check_network(path: Path, reader: "XmlReader") -> None:
-    """Raise `BrokenFileError` unless it is a network with a version, without which SUMO would crash."""
-    if reader.root != NETWORK_ELEMENT:
-        raise BrokenFileError(f"{path.name}: is not a SUMO network: it begins with <{reader.root}>")
-    if not reader.version:
-        raise BrokenFileError(f"{path.name}: the network has no version; convert it: netconvert -s {path.name} -o")
-
-
 class _Demand:
     """The vehicle types that files define, the vehicles that they create, and whether there are bicycle lanes."""
 
     def __init__(self) -> None:
         self.types: dict[str, XmlAttributes] = {}
-        self.type_parameters: dict[str, XmlAttributes] = {}
-        """values of the parameters of each type, by key"""
-        self.used_names: set[str] = set()
-        """types and distributions that vehicles have"""
-        self.first_departure: float | None = inf
-        """departure of the first vehicle [s]; None: unknown"""
+        self.type_parameters: dict[str, XmlAttributes] = {}  # values of the parameters of each type, by key
+        self.used_names: set[str] = set()  # types and distributions that vehicles have
+        self.first_departure: float | None = inf  # departure of the first vehicle [s]; None: unknown
         self.has_bicycle_lanes = False
-        self.calibrates = False
-        """whether there is a calibrator: SUMO's number of expected vehicles excludes those that it will add"""
-        self.last_end = 0.0
-        """latest end that a flow names, in calibrators and elsewhere [s]"""
-        self._distributions: dict[str, set[str]] = {}
-        """types of each distribution; other files than the defining one can use it"""
-        self._current_type = ""
-        """the type that is being read; empty: none"""
-        self._current_distribution: set[str] = set()
-        """types of the distribution that is being read"""
+        self.calibrates = False  # SUMO's number of expected vehicles excludes those that calibrators will add
+        self.last_end = 0.0  # latest end that a flow names, in calibrators and elsewhere [s]
+        self._distributions: dict[str, set[str]] = {}  # types of each; other files than the defining one can use it
+        self._current_type = ""  # the type that is being read; empty: none
+        self._current_distribution: set[str] = set()  # types of the distribution that is being read
 
-    def handlers(self) -> XmlHandlers:
+    def handlers(self) -> xml.XmlHandlers:
         """Return the functions to call with the attributes of an element, by its name."""
         return {tag: partial(self._on_element, tag) for tag in READ_ELEMENTS}
 
@@ -296,15 +254,8 @@ class _Demand:
         if (end := attributes.get("end")) and isfinite(last := _parse_time(end)):
             self.last_end = max(self.last_end, last)
         if self.first_departure is not None:
-            self._add_departure(attributes.get(depart_attribute, ""))
-
-    def _add_departure(self, text: str) -> None:
-        try:
-            time = float(text or 0)
-        except ValueError:
-            time = _parse_time(text)
-        known = self.first_departure
-        self.first_departure = None if known is None or not isfinite(time) else min(known, time)
+            time = _parse_time(attributes.get(depart_attribute) or "0")
+            self.first_departure = min(self.first_departure, time) if isfinite(time) else None
 
     def used_types(self) -> set[str]:
         """Return the types that vehicles have, and define SUMO's predefined types among them."""
@@ -326,16 +277,10 @@ def _write_copy(path: Path, copy: Path, types: Path | None = None) -> None:
         XmlReader({}, out, changes).read(path)
 
 
-READER_COMMANDS: dict[str, Callable[..., Any]] = {
-    "configuration": _read_configuration,
-    "lanes": _read_lanes,
-    "copy": _write_copy,
-}
-
-
 def _main(command: str, *paths: str) -> None:
+    commands = {"configuration": _read_configuration, "lanes": _read_lanes, "copy": _write_copy}
     try:
-        answer = {"result": READER_COMMANDS[command](*map(Path, paths))}
+        answer = {"result": commands[command](*map(Path, paths))}
     except BrokenFileError as error:
         answer = {"error": str(error)}
     except (MemoryError, RecursionError):

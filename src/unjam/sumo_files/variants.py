@@ -10,19 +10,14 @@ from unjam.files import atomic_write, to_json
 from unjam.processes import PrivateFolder
 from unjam.sumo_files import SumoFiles, write_harmless_copy
 
-TypeChanges = Mapping[str, Mapping[str, str]]
-"""attributes of vehicle types by id"""
+TypeChanges = Mapping[str, Mapping[str, str]]  # attributes of vehicle types by id
 
 
 def write_variant(files: SumoFiles, types: TypeChanges, scale: float, path: Path) -> Path:
     """Write a variant of a network's files into the folder of `path`, the configuration last; return `path`.
 
-    The network file itself stays where it is, and none of the network's files is changed. Options and elements that
-    write, listen or read other files are left out, as in unjam's own episodes. `types` are attributes to set in vehicle
-    types, by id; `scale` is a factor on the number of vehicles, in addition to that of the configuration.
-
-    Raise `InputError` if a file is broken or too large, or the configuration's scale is not a number, and `DiskError`
-    if the disk is full or cannot be written.
+    `types` are attributes to set in vehicle types, by id; `scale` multiplies the configuration's scale. Raise
+    `InputError` if a file is broken or too large, or that scale is not a number.
     """
     folder, before = path.parent, files.options.get("scale", "1")
     try:
@@ -38,12 +33,9 @@ def write_variant(files: SumoFiles, types: TypeChanges, scale: float, path: Path
     with PrivateFolder() as private:
         copy, changes = Path(private) / "copy.xml", Path(private) / "types.json"
         atomic_write(changes, to_json(types))
-        for option, kind, originals in (
-            ("additional-files", "add", files.additional_files),
-            ("route-files", "rou", files.route_files),
-            ("weight-files", "weights", files.weight_files),
-        ):
-            for number, original in enumerate(originals):
+        originals = files.additional_files, files.route_files, files.weight_files
+        for option, kind, paths in zip(names, ("add", "rou", "weights"), originals, strict=True):
+            for number, original in enumerate(paths):
                 names[option].append(f"{number}.{kind}.xml")
                 write_harmless_copy(original, copy, changes)
                 atomic_write(folder / names[option][-1], copy.read_bytes())
