@@ -66,7 +66,7 @@ def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, 
         read = trajectories_of_table(frame, path, options)
     else:
         table = _follower_table(frame, columns[0], path.stem)
-        fastest = float(table["speed"].max())
+        fastest = float(np.nanmax(table["speed"].to_numpy(np.float64)))
         if alphanumeric(columns[0]) == "speed" and fastest > MAX_SPEED_WITHOUT_UNIT:
             allowed = f"<= {MAX_SPEED_WITHOUT_UNIT:g} m/s without a unit; {UNIT_HINT}"
             raise InputError(f"{path.name}: {columns[0]}: {fastest:g} is not allowed; allowed: {allowed}")
