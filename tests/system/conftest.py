@@ -14,7 +14,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 
 ROOT = Path(__file__).parents[2]
 UNJAM = Path(sys.executable).with_name("unjam")
-PLAIN = {"NO_COLOR": "1"}
+PLAIN = {"NO_COLOR": "1", "COLUMNS": "160"}
 
 
 @pytest.fixture(scope="session")

@@ -44,7 +44,7 @@ def test_ignored_demand_is_in_terminal_json_and_report(unjam: Run, tmp_path: Pat
     "words",
     [
         ("drive", "straight.sumocfg", "--penetration-rate", "0.1"),
-        ("drive", "straight.sumocfg", "--penetration-rate", "0.1", "-d", "human", "--set", "horizon=120"),
+        ("drive", "straight.sumocfg", "--penetration-rate", "0.1", "-d", "human", "--set", "horizon=119"),
         ("assess", "straight.sumocfg"),
         ("train", "straight.sumocfg", "--set", "scenario_options.penetration_rate=0.5", "--steps", "100"),
     ],
@@ -82,7 +82,7 @@ def test_overlaps_at_junctions_that_sumo_ignores_do_not_end_the_baseline(unjam: 
         for share in (0.01, 0.5)
     ]
     (few,), (half,) = (each["episodes"] for each in found)
-    assert (few["status"], few["collisions"], few["steps"]) == ("completed", 0.0, 900)
+    assert (few["status"], few["collisions"], few["steps"]) == ("completed", 0.0, 899)
     assert found[0]["early_ends"] == {}
     traffic = ("vehicles", "mean_speed", "travel_time", "outflow_veh_per_h", "fuel_ml_per_km")
     assert [few[name] for name in traffic] == [half[name] for name in traffic]
