@@ -207,7 +207,7 @@ def follow(state: LocalState) -> Any:
 
 def test_functions_and_objects_are_drivers() -> None:
     result = drive("ring", [follow, Follows(0.5), Follows(0.2), Stays, "idm"], 2, scenario_options=ROAD, workers=1)
-    assert list(result.rows) == ["follow", "Follows", "Follows (2)", "Stays", "idm"]
+    assert list(result.rows) == ["idm", "follow", "Follows", "Follows (2)", "Stays"]
     raise_failures(result)
     rows = {label: [row["return"] for row in rows] for label, rows in result.rows.items()}
     assert rows["follow"] == rows["Follows"] != rows["Follows (2)"]

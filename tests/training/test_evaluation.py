@@ -72,7 +72,7 @@ def test_results_and_report_have_the_hash_of_the_controller(
 
 def test_expert_among_the_baselines_is_compared_once(run: tuple[Path, RunConfig]) -> None:
     folder, config = run
-    assert list(drivers_to_compare(with_evaluation(config, ["pi", "human"]), folder)) == ["pi", "human", TRAINED_LABEL]
+    assert list(drivers_to_compare(with_evaluation(config, ["pi", "human"]), folder)) == ["human", "pi", TRAINED_LABEL]
 
 
 def test_packaged_baseline_has_its_short_name(run: tuple[Path, RunConfig]) -> None:
@@ -80,8 +80,8 @@ def test_packaged_baseline_has_its_short_name(run: tuple[Path, RunConfig]) -> No
     name = "unjam:ring-jammed-tuned"
     assert list(drivers_to_compare(with_evaluation(config, ["human", name]), folder)) == [
         "human",
-        name,
         "pi",
+        name,
         TRAINED_LABEL,
     ]
 
