@@ -167,8 +167,8 @@ def measure_road(
 
 def best_feasible_driver(rows: Mapping[str, EpisodeRows]) -> str:
     """Return the best driver of those that are feasible in every episode; `human` if none is."""
-    verdicts = {label: overall_feasibility(own, rows[HUMAN_LABEL]) for label, own in rows.items()}
-    feasible = [label for label, verdict in verdicts.items() if label == HUMAN_LABEL or verdict == FEASIBLE]
+    baseline, others = rows[HUMAN_LABEL], [label for label in rows if label != HUMAN_LABEL]
+    feasible = [HUMAN_LABEL, *(label for label in others if overall_feasibility(rows[label], baseline) == FEASIBLE)]
     return max(feasible, key=lambda label: float(np.mean([gain.performance(row) for row in rows[label]])))
 
 

@@ -387,6 +387,9 @@ def test_all_controls_are_reachable_by_tab_and_have_names(open_page: Opener, dri
         assert page.get_by_role(role, name=name).count() == 1  # pyright: ignore[reportArgumentType]
 
 
+OPEN_ALL = "document.querySelectorAll('details').forEach(each => each.open = true)"
+
+
 def metrics_in(report: Path) -> list[Metric]:
     """Return the metrics that are defined on the road of a report."""
     rows = json.loads((report.parent / "evaluation.json").read_text())["rows"]
@@ -395,7 +398,9 @@ def metrics_in(report: Path) -> list[Metric]:
 
 @pytest.mark.long
 def test_table_has_all_metrics_of_all_drivers(open_page: Opener, training_report: Path) -> None:
-    table = open_page(training_report).page.locator("section:has(h2:text-is('Metrics')) details table")
+    page = open_page(training_report).page
+    page.evaluate(OPEN_ALL)
+    table = page.locator("section:has(h2:text-is('Metrics')) details table")
     assert table.locator("thead th").all_inner_texts() == [
         *("metric", "human", "pi", "trained", "pi − human", "trained − human")
     ]
@@ -456,6 +461,7 @@ def test_every_figure_and_table_can_be_downloaded(
     open_page: Opener, request: pytest.FixtureRequest, report: str, tmp_path: Path
 ) -> None:
     page = open_page(request.getfixturevalue(report)).page
+    page.evaluate(OPEN_ALL)
     assert page.locator(".picture + a.download").count() == page.locator(".picture").count() > 0
     assert page.locator(".scroll + a.download").count() == page.locator(".scroll").count() > 0
     for link in page.locator("a.download").all():

@@ -41,8 +41,8 @@ def trips_of_plain_sumo(file: Path) -> tuple[int, int, float]:
 
 
 def trips_of(episode: Episode) -> tuple[int, int, float]:
-    """The same of an episode; vehicles on the road at the end have not driven on."""
-    seconds = float((~np.isnan(episode.speeds[:-1])).sum() * episode.control_step)
+    """The same of an episode."""
+    seconds = float((~np.isnan(episode.speeds)).sum() * episode.control_step)
     return len(episode.vehicle_ids), episode.arrivals, seconds
 
 
