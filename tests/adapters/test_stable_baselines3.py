@@ -79,7 +79,7 @@ def test_actions_are_added_to_an_expert() -> None:
 def test_a_driver_of_several_cavs_is_measured_beside_drivers_with_names() -> None:
     driver = policy_driver(small(SAC, Space()))
     found = unjam.drive("ring", [driver, "pi"], episodes=1, scenario_options={"horizon": 40, "cavs": 3}, workers=1)
-    assert list(found.rows) == ["SAC", "pi"]
+    assert list(found.rows) == ["pi", "SAC"]
     assert found.rows["SAC"][0]["status"] == "completed"
 
 

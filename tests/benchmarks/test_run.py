@@ -64,7 +64,7 @@ def test_a_second_call_drives_only_the_missing_roads(
     assert document["training_steps_unit"] == "environment steps: control steps in the simulator"
     first = read_result(file).roads[ROADS[0]]
     result = unjam.benchmark("pi", suite, file, workers=1, progress=lines.append)
-    again = "1 of 2 roads in a.json; they are not driven again"
+    again = "1 of 2 roads in a.json; not driven again"
     assert [line.partition(": gain")[0] for line in lines] == [f"1 of 2: {ROADS[0]}", again, f"2 of 2: {ROADS[1]}"]
     assert result.roads[ROADS[0]] == first
     assert not result.missing_roads

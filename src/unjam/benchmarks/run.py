@@ -112,7 +112,7 @@ def benchmark(
         if path is not None and os.path.lexists(path):
             result = _stored_result(path, result)
             progress(
-                f"{len(result.roads)} of {format_count(len(scenarios), 'road')} in {path.name}; they are not driven"
+                f"{len(result.roads)} of {format_count(len(scenarios), 'road')} in {path.name}; not driven again"
             )
         remaining = [name for name in result.missing_roads if name in chosen]
         for number, name in enumerate(remaining, len(result.roads) + 1):

@@ -110,7 +110,7 @@ def _compare(names: list[str], out: Path, json: bool) -> None:
         print_json({label: {"driver": result.driver, **result.summary()} for label, result in results.items()})
         return
     table = new_table(leaderboard.HEADINGS[:1], leaderboard.HEADINGS[1:])
-    table.padding, table.columns[0].overflow = (0, 1, 0, 0), "fold"
+    table.padding, table.columns[0].no_wrap = (0, 1, 0, 0), False  # a name may be long
     for row in leaderboard.leaderboard_rows(results):
         table.add_row(*row)
     console.print(table, width=LEADERBOARD_WIDTH)

@@ -211,7 +211,7 @@ def test_an_interrupt_within_a_call_does_not_mix_up_answers(
             return read_message(pipe)
 
         with monkeypatch.context() as patch:
-            patch.setattr("unjam.worlds.sumo.sandboxed.read_message", interrupt)
+            patch.setattr("unjam.worlds.messages.read_message", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 drive_steps()
         np.testing.assert_equal(drive_steps(), expected)
