@@ -31,7 +31,7 @@ from unjam_paper.open_test_roads import OPEN_TEST_ROADS, OpenTestRoad, write_roa
 from unjam_paper.results_file import read_part
 from unjam_paper.study import Study, Table
 
-TESTED_CONTROLLER, ACC_BASELINE = "unjam:best", "cruise"
+TESTED_CONTROLLER, ACC_DRIVER = "unjam:best", "cruise"
 PENETRATION_RATES = (0.05, 0.1)
 SEED_BATCH, MAX_SEEDS = 4, 16
 """number of seeds that are added at a time, and their maximum"""
@@ -51,7 +51,7 @@ HARM_METRICS = (
     *("cav_max_braking", "cut_in_max_braking"),
 )
 """metrics of the comparison, and those from which the feasibility follows"""
-NO_HARM, HARM, UNDECIDED = "no harm", "harm", "undecided"
+NO_HARM, HARM, HARM_UNDECIDED = "no harm", "harm", "undecided"
 
 
 class HarmVerdict(NamedTuple):
@@ -69,7 +69,7 @@ def evaluate_harm(rows: Sequence[dict[str, Any]], acc_rows: Sequence[dict[str, A
     if time.high < limit and flow.low > MIN_FLOW_CHANGE:
         return HarmVerdict(time, flow, NO_HARM)
     is_harm = time.low > limit or flow.high < MIN_FLOW_CHANGE
-    return HarmVerdict(time, flow, HARM if is_harm else UNDECIDED)
+    return HarmVerdict(time, flow, HARM if is_harm else HARM_UNDECIDED)
 
 
 def has_breakdown(episode: Episode, road: OpenTestRoad) -> bool:
@@ -98,7 +98,7 @@ def _rate_label(driver: str, rate: float) -> str:
 
 
 def _evaluate_rate(rows: Mapping[str, Table], rate: float) -> HarmVerdict:
-    own, acc = (rows.get(_rate_label(driver, rate), []) for driver in (TESTED_CONTROLLER, ACC_BASELINE))
+    own, acc = (rows.get(_rate_label(driver, rate), []) for driver in (TESTED_CONTROLLER, ACC_DRIVER))
     breakdowns = [row["breakdown"] for row in rows.get(HUMAN_LABEL, [])]
     is_frequent = 2 * sum(breakdowns) >= max(len(breakdowns), 1)  # on at least half of the seeds
     return evaluate_harm(own, acc, is_frequent)
@@ -117,8 +117,8 @@ def measure_harm(controller: str, road: OpenTestRoad, workers: int) -> dict[str,
 
 
 def _needs_seeds(rows: Mapping[str, Table], rate: float) -> bool:
-    count = len(rows.get(_rate_label(ACC_BASELINE, rate), ()))
-    return count < MAX_SEEDS and _evaluate_rate(rows, rate).verdict == UNDECIDED
+    count = len(rows.get(_rate_label(ACC_DRIVER, rate), ()))
+    return count < MAX_SEEDS and _evaluate_rate(rows, rate).verdict == HARM_UNDECIDED
 
 
 def _run_seed_batch(
@@ -127,7 +127,7 @@ def _run_seed_batch(
     """Return the rows of seeds from number `first` on by label: the human baseline, and at these rates both drivers."""
     seeds = held_out_seeds(SEED_BATCH, first)
     drivers = {HUMAN_LABEL: (HUMAN_LABEL, rates[0])}
-    drivers |= {_rate_label(name, rate): (name, rate) for rate in rates for name in (ACC_BASELINE, TESTED_CONTROLLER)}
+    drivers |= {_rate_label(name, rate): (name, rate) for rate in rates for name in (ACC_DRIVER, TESTED_CONTROLLER)}
     tasks = list[EpisodeTask]()
     for name, rate in drivers.values():
         changes = {"penetration_rate": rate, "steps_per_control_step": STEPS_PER_CONTROL_STEP, **ACC_SETTINGS}
@@ -151,7 +151,7 @@ def harm_table(folder: Path) -> pd.DataFrame:
     for (name, results), rate in product(read_part(folder, RESULTS_PART).items(), PENETRATION_RATES):
         road = OPEN_TEST_ROADS[name]
         rows = {label: list(map(replace_null, each)) for label, each in results["rows"].items()}
-        acc, own = (rows[_rate_label(driver, rate)] for driver in (ACC_BASELINE, TESTED_CONTROLLER))
+        acc, own = (rows[_rate_label(driver, rate)] for driver in (ACC_DRIVER, TESTED_CONTROLLER))
         verdict, breakdowns = _evaluate_rate(rows, rate), [row["breakdown"] for row in rows[HUMAN_LABEL]]
         demand = " → ".join(f"{share * road.capacity:,.0f}" for share in road.demand)
         row = {"road": name, "demand [veh/h]": demand, "CAVs": f"{100 * rate:g} %"}

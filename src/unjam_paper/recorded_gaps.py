@@ -39,7 +39,7 @@ MEAN_GAPS = (73.0, 60.0, 50.0, 40.0)
 """largest mean gap for which a law is tuned; human drivers keep 30 m [m]"""
 LARGEST_GAP_RATIO = PlanLimits().largest_gap / PlanLimits().largest_mean_gap
 AVERAGING, LIMITED = "smooth-acc", "acc with the limits of smooth-acc"
-FIXED_PARAMETERS: dict[str, dict[str, float]] = {AVERAGING: {}, LIMITED: {"averaging_time": 0.0, "leader_weight": 1.0}}
+FIXED_BY_LAW: dict[str, dict[str, float]] = {AVERAGING: {}, LIMITED: {"averaging_time": 0.0, "leader_weight": 1.0}}
 """the law is the same: without averaging it follows the present speed of its leader, as an ACC does"""
 GAPS_BUDGET = SearchBudget(generations=14, size=24)
 
@@ -52,21 +52,21 @@ def gap_limits(mean_gap: float) -> PlanLimits:
 def search_space(law: str, limits: PlanLimits) -> dict[str, FloatDistribution]:
     """Return the parameters of a law that are searched."""
     space = SEARCH_SPACES[AVERAGING] | {"largest_gap": FloatDistribution(35.0, limits.largest_gap - 1.0)}
-    return {name: each for name, each in space.items() if name not in FIXED_PARAMETERS[law]}
+    return {name: each for name, each in space.items() if name not in FIXED_BY_LAW[law]}
 
 
 def tune_law(folder: str, law: str, mean_gap: float, workers: int) -> Table:
     """Return the best parameters of a law with a mean gap [m] on the training drives, as a list of one row."""
     scenarios, limits = recorded_drives(Path(folder)), gap_limits(mean_gap)
     human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
-    driver = replace(SmoothACC(time_step=TIME_STEP), **FIXED_PARAMETERS[law])
+    driver = replace(SmoothACC(time_step=TIME_STEP), **FIXED_BY_LAW[law])
     space = search_space(law, limits)
     best = search_parameters(scenarios, driver, space, human, SEARCH_SEED, GAPS_BUDGET, limits)[-1]
     return [{"law": law, "mean gap": mean_gap, **best}]
 
 
 def _driver_name(row: dict[str, Any]) -> str:
-    parameters = FIXED_PARAMETERS[row["law"]] | row["parameters"]
+    parameters = FIXED_BY_LAW[row["law"]] | row["parameters"]
     return f"{AVERAGING}:" + ",".join(f"{key}={value:g}" for key, value in parameters.items())
 
 
@@ -84,7 +84,7 @@ def make_gap_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart
     root, folder = str(study_folder.folder), study_folder.folder / GAPS_STUDY
     parts: dict[str, StudyPart] = {
         f"{SEARCH_PART}/{_label(law, gap)}": (tune_law, (root, law, gap))
-        for law, gap in product(FIXED_PARAMETERS, MEAN_GAPS)
+        for law, gap in product(FIXED_BY_LAW, MEAN_GAPS)
     }
     if not (folder / f"{SEARCH_PART}.json").is_file():
         return parts
@@ -103,7 +103,7 @@ def gaps_table(folder: Path) -> pd.DataFrame:
 
 def _gap_row(results: DriveResults, label: str) -> dict[str, str]:
     law, _, gap = label.rpartition(", ")
-    is_tuned = law in FIXED_PARAMETERS
+    is_tuned = law in FIXED_BY_LAW
     acc = f"{LIMITED}, {gap}" if law == AVERAGING else label
     mean_gap, largest = results.values(label, "cav_mean_gap").mean(), results.values(label, "cav_max_gap").max()
     return {

@@ -18,12 +18,12 @@ from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper import do_no_harm, open_test_roads
 from unjam_paper.do_no_harm import (
-    ACC_BASELINE,
+    ACC_DRIVER,
     DO_NO_HARM,
     HARM,
+    HARM_UNDECIDED,
     NO_HARM,
     TESTED_CONTROLLER,
-    UNDECIDED,
     evaluate_harm,
     has_breakdown,
 )
@@ -48,10 +48,10 @@ ACC_ROWS = rows((100.0, 4000.0), (110.0, 4000.0), (120.0, 4000.0))
         (rows((101.0, 4000.0), (111.0, 4000.0), (121.0, 4000.0)), True, NO_HARM),
         (rows((103.0, 4000.0), (113.5, 4000.0), (123.5, 4000.0)), True, HARM),
         (rows((90.0, 3900.0), (99.0, 3900.0), (108.0, 3900.0)), True, HARM),
-        (rows((90.0, 4000.0), (120.0, 4000.0), (118.0, 4000.0)), True, UNDECIDED),
-        (rows((90.0, 4000.0), (99.0, 3800.0), (108.0, 4200.0)), True, UNDECIDED),
-        (ACC_ROWS[:2], True, UNDECIDED),
-        ([], True, UNDECIDED),
+        (rows((90.0, 4000.0), (120.0, 4000.0), (118.0, 4000.0)), True, HARM_UNDECIDED),
+        (rows((90.0, 4000.0), (99.0, 3800.0), (108.0, 4200.0)), True, HARM_UNDECIDED),
+        (ACC_ROWS[:2], True, HARM_UNDECIDED),
+        ([], True, HARM_UNDECIDED),
     ],
 )
 def test_the_verdict_follows_from_both_intervals(own: list[dict[str, Any]], breakdown: bool, verdict: str) -> None:
@@ -120,9 +120,7 @@ def test_no_set_speed_is_reduced_in_dense_free_flow_far_below_the_limit(
 ) -> None:
     """Without the congestion report it is: the mean speed ahead is below three quarters of the limit."""
     road = OPEN_TEST_ROADS["limit far above the flow"]
-    acc, controller = (
-        travel_time(road, each, 700.0, tmp_path, simulation) for each in (ACC_BASELINE, TESTED_CONTROLLER)
-    )
+    acc, controller = (travel_time(road, each, 700.0, tmp_path, simulation) for each in (ACC_DRIVER, TESTED_CONTROLLER))
     assert controller == acc
     monkeypatch.setattr(CongestionMonitor, "update", lambda monitor, counts, sums: np.ones(len(counts), bool))
     assert travel_time(road, TESTED_CONTROLLER, 700.0, tmp_path, simulation) > 1.01 * acc
@@ -131,9 +129,7 @@ def test_no_set_speed_is_reduced_in_dense_free_flow_far_below_the_limit(
 @pytest.mark.slow
 def test_set_speeds_are_reduced_upstream_of_an_overloaded_ramp(tmp_path: Path, simulation: Simulation) -> None:
     road = OPEN_TEST_ROADS["on-ramp, overloaded"]
-    acc, controller = (
-        travel_time(road, each, 700.0, tmp_path, simulation) for each in (ACC_BASELINE, TESTED_CONTROLLER)
-    )
+    acc, controller = (travel_time(road, each, 700.0, tmp_path, simulation) for each in (ACC_DRIVER, TESTED_CONTROLLER))
     assert controller != acc
 
 

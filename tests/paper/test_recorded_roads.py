@@ -24,8 +24,7 @@ from unjam_paper.information_ahead import (
     roads_with_vehicles_between,
 )
 from unjam_paper.parameter_search import SearchBudget, measure_candidates
-from unjam_paper.recorded_gaps import FIXED_PARAMETERS as FIXED_BY_LAW
-from unjam_paper.recorded_gaps import LIMITED, RECORDED_GAPS, gap_limits, search_space
+from unjam_paper.recorded_gaps import FIXED_BY_LAW, LIMITED, RECORDED_GAPS, gap_limits, search_space
 from unjam_paper.recorded_roads import (
     DRIVE_SETTINGS,
     DRIVES_PARTS,

@@ -317,6 +317,6 @@ def test_a_vehicle_type_with_the_name_that_cavs_get_is_refused(tmp_path: Path) -
     types = '<vType id="car"/><vType id="cav_of_car"/><route id="short" edges="ab bc"/>'
     routes = f'<routes>{types}<vehicle id="v" type="car" route="short" depart="0"/></routes>'
     with pytest.raises(
-        InputError, match="file: the vehicle type 'cav_of_car' is not allowed: CAVs of type 'car' have it"
+        InputError, match="file: the vehicle type 'cav_of_car' is not allowed: CAVs of type 'car' have this name"
     ):
         own(tmp_path, routes=routes, penetration_rate=1.0)

@@ -86,9 +86,7 @@ class DriveResult(Evaluation):
 
     scenario: str = ""
     backend: str = "sumo"
-    """name of the simulator"""
     folder: Path | None = None
-    """folder of the results"""
     report: Path | None = None
     notes: list[str] = field(default_factory=list)
     """caveats, as controllers on a road that they were not made for"""
@@ -218,10 +216,7 @@ def evaluate_on_roads(
     with_plots: bool = True,
     backend: BackendLike = "sumo",
 ) -> Evaluation:
-    """Run every driver, each on its own road, on every seed, and measure.
-
-    With `with_plots` one episode of each is kept for figures, which needs much memory.
-    """
+    """Run every driver, each on its own road, on every seed, and measure; `with_plots` keeps an episode of each."""
     settings: dict[str, Any] = {"reward": reward, "backend": backend}
     settings |= {"record_details": True, "stop_at_contact": False}
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
@@ -302,9 +297,8 @@ def drivers_to_compare(config: RunConfig, folder: Path) -> dict[str, Driver]:
 
 def evaluation_steps(config: RunConfig, folder: Path) -> int:
     """Return the largest number of control steps of `evaluate_run`."""
-    return (
-        len(drivers_to_compare(config, folder)) * config.evaluation.episodes * config.make_scenario().max_episode_steps
-    )
+    episodes = len(drivers_to_compare(config, folder)) * config.evaluation.episodes
+    return episodes * config.make_scenario().max_episode_steps
 
 
 def evaluate_run(
@@ -450,5 +444,5 @@ def drive(
             report = write_report_page([folder], folder / "report.html")
     used_folder = folder if has_results else None
     made_by = scenario, backend_label(backend)
-    first = next(iter(drivers))
-    return DriveResult(evaluation.rows, evaluation.plot_episodes, *made_by, used_folder, report, notes, baseline, first)
+    details = used_folder, report, notes, baseline, next(iter(drivers))
+    return DriveResult(evaluation.rows, evaluation.plot_episodes, *made_by, *details)

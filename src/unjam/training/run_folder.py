@@ -24,6 +24,7 @@ from unjam.drivers.registry import driver_recipe
 from unjam.drivers.requirements import merge_requirements
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import DiskError, InputError, invalid_value
+from unjam.files import sha256_of, to_json
 from unjam.folders import reject_unsafe_files
 from unjam.manifest import manifest, package_versions
 from unjam.parameters import build_dataclass, check_integer, read_toml
@@ -175,7 +176,7 @@ def create_run_folder(folder: Path, config: RunConfig) -> None:
 
 def _write_manifest(folder: Path) -> None:
     facts = {"format": CHECKPOINT_FORMAT, "start_folder": os.path.relpath(Path.cwd(), folder.resolve()), **manifest()}
-    files.atomic_write(folder / MANIFEST_FILE, files.to_json(facts, indent=1))
+    files.atomic_write(folder / MANIFEST_FILE, to_json(facts, indent=1))
 
 
 def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
@@ -242,7 +243,7 @@ def append_lineage(folder: Path, iteration: int) -> None:
         lineage = [*made.get("lineage", []), {"iteration": iteration, **manifest()}]
     except (ValueError, AttributeError, TypeError) as error:
         raise InputError(f"run: {path} cannot be read: {error}") from None
-    files.atomic_write(path, files.to_json({**made, "lineage": lineage}, indent=1))
+    files.atomic_write(path, to_json({**made, "lineage": lineage}, indent=1))
 
 
 def controller_origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
@@ -261,7 +262,7 @@ def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> 
     from safetensors.torch import save
 
     data = save(tensors, {"state": json.dumps({**state, "format": CHECKPOINT_FORMAT})})
-    name = f"{state['iteration']:06d}-{files.sha256_of(data)}.safetensors"
+    name = f"{state['iteration']:06d}-{sha256_of(data)}.safetensors"
     files.make_folder(folder)
     files.atomic_write(folder / name, data)
     for damaged in [path for path in _checkpoint_files(folder) if path.name[:7] == name[:7] and path.name != name]:
@@ -284,7 +285,7 @@ def restore_newest_checkpoint(
     for place in progress_folders:
         files.remove_leftovers(place)
         if (place / PROGRESS_FILE).is_file():
-            rows = [files.to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= iteration]
+            rows = [to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= iteration]
             files.atomic_write(place / PROGRESS_FILE, "".join(rows))
     return checkpoint
 
@@ -315,7 +316,7 @@ def _valid_checkpoints(folder: Path) -> Iterator[tuple[Path, dict[str, Any], byt
         with suppress(*files.INVALID_DATA_ERRORS):
             data = path.read_bytes()
             header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
-            if f"-{files.sha256_of(data)}." in path.name:
+            if f"-{sha256_of(data)}." in path.name:
                 yield path, dict(json.loads(header["__metadata__"]["state"])), data
 
 

@@ -29,7 +29,7 @@ MAX_EPISODE_ATTEMPTS = 3
 """attempts to run an episode before its row reports a failure"""
 WORKER_TIMEOUT = 30.0
 """seconds without a message, except those of waiting for a processor, after which a worker counts as hung"""
-MIN_REMAINING_TIME = 0.1
+MIN_PROCESSOR_WAIT = 0.1
 """[s]"""
 
 ResultT = TypeVar("ResultT")
@@ -203,7 +203,7 @@ class _Worker:
                 return self._messages.get(timeout=timeout)
             except queue.Empty:  # on a busy machine the process may not have run
                 timeout = processor_wait(process.pid) - start
-                if timeout < MIN_REMAINING_TIME:
+                if timeout < MIN_PROCESSOR_WAIT:
                     raise
 
     def _send(self, process: subprocess.Popen[bytes], content: dict[str, Any], arrays: Arrays) -> None:
