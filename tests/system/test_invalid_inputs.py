@@ -64,7 +64,7 @@ INVALID: dict[str, tuple[str, list[str]]] = {
     "reward that is not in the file": ("has no 'ghost'", ["drive ring --driver pi --reward mine.py:ghost"]),
     "reward that is NaN": (
         "reward mine.py:wrong_reward: step 0: term 'speed' is nan",
-        ["drive ring --driver pi --reward mine.py:wrong_reward"],
+        ["drive ring --driver pi --reward mine.py:wrong_reward -n 1"],
     ),
     "driver file that is missing": ("is not a file", ["drive ring --driver none.py:gentle"]),
     "driver that is not in the file": ("has no 'ghost'", ["drive ring --driver mine.py:ghost"]),
