@@ -155,12 +155,15 @@ def evaluation_table(
 
 
 def unfiltered_table(study: str, road: str, columns: tuple[str, ...] = RING_COLUMNS) -> pd.DataFrame:
-    """Return `evaluation_table` without the safety filter, for PI, tuned experts and the trainings."""
-    names = f"{study}-unfiltered", UNFILTERED_ROADS[road]
-    learned = tuple(row["name"] for row in study_rows(*names) if row["is_learned"])
-    return evaluation_table(
-        *names, (*columns, "max braking [m/s²]"), ("PI (paper)", "tuned PI", "tuned pacer", *learned)
-    )
+    """Return `evaluation_table` of `study` without the safety filter."""
+    return learned_table(f"{study}-unfiltered", UNFILTERED_ROADS[road], columns)
+
+
+def learned_table(study: str, road: str, columns: tuple[str, ...] = RING_COLUMNS) -> pd.DataFrame:
+    """Return `evaluation_table` with braking, for PI, tuned experts and the trainings."""
+    learned = tuple(row["name"] for row in study_rows(study, road) if row["is_learned"])
+    drivers = ("PI (paper)", "tuned PI", "tuned pacer", *learned)
+    return evaluation_table(study, road, (*columns, "max braking [m/s²]"), drivers)
 
 
 def _feasibility_text(verdicts: str | list[str]) -> str:
