@@ -147,16 +147,20 @@ def test_controller_that_changes_nothing_is_reported() -> None:
 @pytest.mark.parametrize(
     ("result", "question"),
     [
-        (OPEN, "with 20 test seeds, the difference of travel time to ACC vehicles alone is -1.0 s ± 4.0 s"),
+        (OPEN, "with 20 test seeds, the difference of travel time to ACC vehicles alone is -1.0 [-5.0, +3.0] s"),
         (
             replace(OPEN, effect=replace(GOOD, travel_time=between(-12.0, 2.0))),
-            "with 20 test seeds, the difference of travel time to the human baseline is -5.0 s ± 7.0 s",
+            "with 20 test seeds, the difference of travel time to the human baseline is -5.0 [-12.0, +2.0] s",
         ),
         (
             replace(OPEN, effect=replace(GOOD, travel_time=between(-20.0, -2.0))),
-            "with 20 test seeds, the difference of travel time to ACC vehicles alone is -1.0 s ± 4.0 s",
+            "with 20 test seeds, the difference of travel time to ACC vehicles alone is -1.0 [-5.0, +3.0] s",
         ),
-        (replace(OPEN, difference_to_acc=between(-1.0, 1.0, 1)), "the budget had 1 test seed, and 10 are needed"),
+        (
+            replace(OPEN, difference_to_acc=between(-1.0, 1.0, 4)),
+            "with 4 test seeds, where a verdict needs 10, "
+            "the difference of travel time to ACC vehicles alone is +0.0 [-1.0, +1.0] s",
+        ),
     ],
 )
 def test_open_question_names_its_comparison(result: ControllerResult, question: str) -> None:

@@ -133,7 +133,7 @@ def test_page_describes_the_acc_of_cavs(tmp_path: Path, page: str) -> None:
 
 
 def test_tables_have_the_human_baseline_and_differences_to_it(page: str) -> None:
-    assert cells_of(page, "recommended") == ["", "–", "yes", "–", "no"]
+    assert cells_of(page, "verdict") == ["", "–", "recommended", "–", "not recommended"]
     assert cells_of(page, "feasible") == ["", "feasible", "feasible", "feasible", "brakes with 9 m/s2"]
     helps, harms = "-4.0 [-6.0, -2.0]", "+4.0 [+3.0, +5.0]"
     assert cells_of(page, "travel time, departure") == ["78.5", helps, helps, helps, harms]
@@ -170,7 +170,7 @@ def test_page_explains_why_nothing_is_recommended(tmp_path: Path) -> None:
 
 def test_page_without_an_evaluated_controller_has_acc_vehicles(tmp_path: Path) -> None:
     page = render_assessment(assessment_folder(tmp_path, []))
-    assert cells_of(page, "recommended") == ["", "–", "–"]
+    assert cells_of(page, "verdict") == ["", "–", "–"]
     assert WITH_ACC[0].summary in page
 
 

@@ -108,6 +108,14 @@ def test_lines_at_the_start_have_one_estimate_and_a_smaller_question(file: str) 
     assert len(budget_lines(request.smallest_question, budget)) == 2
 
 
+def test_a_time_that_is_too_short_for_an_answer_is_said_at_the_start(file: str) -> None:
+    request = make_request(file, [0.1, 0.2], 60, 0.02, 1.0, ["acc"])
+    budget = EpisodeBudget(59, 1.0, 2, clock=iter([0.0, *[12.0] * 9]).__next__)
+    budget.spend(1)
+    expected = "an answer takes longer than 1 min: about 96 s, as each option is simulated at least once"
+    assert expected in budget_lines(request, budget)
+
+
 def test_missing_budget_keeps_all_penetration_rates_and_the_undecided_controllers(file: str) -> None:
     request = make_request(file, [0.1, 0.2, 0.3], 400, 0.02, None, ["acc", "idm", "pi"])
     undecided = replace(OPEN, penetration_rate=0.1, missing_seeds=15.4)

@@ -178,12 +178,10 @@ class ControllerResult:
         """What is not yet known: the comparison whose interval includes zero, or is wider, as a clause."""
         comparisons = (self.difference_to_acc, ACC_BASELINE), (self.effect.travel_time, "the human baseline")
         change, baseline = max(comparisons, key=lambda each: (each[0].low <= 0 <= each[0].high, each[0].half_width))
-        if change.count < MIN_VERDICT_SEEDS:
-            return f"the budget had {format_count(change.count, 'test seed')}, and {MIN_VERDICT_SEEDS} are needed"
         seeds = f"with {format_count(change.count, 'test seed')}"
-        return (
-            f"{seeds}, the difference of travel time to {baseline} is {change.mean:+.1f} s ± {change.half_width:.1f} s"
-        )
+        if change.count < MIN_VERDICT_SEEDS:
+            seeds += f", where a verdict needs {MIN_VERDICT_SEEDS}"
+        return f"{seeds}, the difference of travel time to {baseline} is {format_seconds(change)}"
 
     @property
     def summary(self) -> str:
@@ -244,8 +242,10 @@ def road_verdict(results: Sequence[ControllerResult], baseline: Sequence[dict[st
         within = max(1, ceil(100 * delay_share))
         reason = f"there is nothing to gain, because human-only traffic is within {within} % of free flow"
     elif undecided := [each for each in results if each.verdict == UNDECIDED]:
-        best = _quickest(undecided) or undecided[0]
-        return RoadVerdict(UNDECIDED, f"Not yet known whether to recommend {best.label}: {best.open_question}.")
+        best, fastest = _quickest(undecided) or undecided[0], ", the fastest so far" if len(undecided) > 1 else ""
+        return RoadVerdict(
+            UNDECIDED, f"Not yet known whether to recommend {best.label}{fastest}: {best.open_question}."
+        )
     elif best := _quickest(results):
         reason = f"no controller passes the rule; the fastest is {best.label}, but {best.reasons[0]}"
     else:

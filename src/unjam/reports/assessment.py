@@ -25,7 +25,7 @@ ASSESSMENT_FILE, ASSESSMENT_PAGE = "assessment.json", "assessment.html"
 EFFECT_METRICS = (
     ("travel_time", "travel_time", "travel time, departure delay included", "s", 1),
     ("flow", "outflow_veh_per_h", "flow", "veh/h", 0),
-    ("fuel", "fuel_ml_per_km", "fuel", "ml/km", 1),
+    ("fuel", "fuel_ml_per_km", "fuel by emission model", "ml/km", 1),
     ("hard_braking", "human_braking_beyond_4_5", "human drivers' braking beyond 4.5 m/s²", "per million", 0),
 )
 """field of an effect, its metric, and label, unit and digits in tables"""
@@ -136,7 +136,7 @@ def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
     options = _evaluated_options(assessment)
     effects = [option["effect"] for option in options]
     baseline = assessment["baseline"]
-    verdicts = ["no" if each.get("reasons") else "yes" if "reasons" in each else "–" for each in options]
+    verdicts = [each.get("verdict", "–") for each in options]
     relative = [f"{100 * each['travel_time'].mean / each['baseline_travel_time']:+.1f}" for each in effects]
     acc = [format_difference(each["difference_to_acc"], 1) if "difference_to_acc" in each else "–" for each in options]
     contacts = [f"{each['collisions']:+.0f}" for each in effects]
@@ -146,7 +146,7 @@ def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
     )
     baseline_contacts = f"{baseline['collisions'].mean * baseline['collisions'].count:.0f}"
     rows = (
-        ("recommended", "", "", verdicts),
+        ("verdict", "", "", verdicts),
         ("feasible", "", "", [each["feasibility"] or "–" for each in effects]),
         time,
         ("travel time, relative to the human baseline", "%", "", relative),

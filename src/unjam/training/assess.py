@@ -278,6 +278,12 @@ def budget_lines(request: AssessmentRequest, budget: EpisodeBudget) -> list[str]
     lines = [f"a verdict needs at least {MIN_VERDICT_SEEDS} test seeds: {duration(needed)}"]
     too_small = ", which is too small for a verdict" if request.episodes < needed else ""
     lines.append(f"the budget is at most {duration(request.episodes)}{limit}{too_small}")
+    fewest = min_episodes(len(request.penetration_rates), len(request.drivers), request.has_acc_properties)
+    if request.minutes and (seconds := budget.estimate_seconds(fewest)) > 60.0 * request.minutes:
+        lines.append(
+            f"an answer takes longer than {request.minutes:g} min: about {format_duration(seconds)}, "
+            "as each option is simulated at least once"
+        )
     small = request.smallest_question
     if len(request.options) > 1:
         (option,) = small.options
