@@ -25,13 +25,14 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.seeds import held_out_seeds
 from unjam.training.evaluate import raise_failure
+from unjam.training.selection import ACC_DRIVER
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.open_test_roads import OPEN_TEST_ROADS, OpenTestRoad, write_road_files
 from unjam_paper.results_file import read_part
 from unjam_paper.study import Study, Table
 
-TESTED_CONTROLLER, ACC_DRIVER = "unjam:best", "cruise"
+TESTED_CONTROLLER = "unjam:best"
 PENETRATION_RATES = (0.05, 0.1)
 SEED_BATCH, MAX_SEEDS = 4, 16
 """number of seeds that are added at a time, and their maximum"""

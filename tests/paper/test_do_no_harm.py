@@ -11,6 +11,7 @@ from unjam.drivers.roadside import CongestionMonitor
 from unjam.measures.metrics import measure
 from unjam.scenarios import make_scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
+from unjam.training.selection import ACC_DRIVER
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.backend import SumoBackend
@@ -18,7 +19,6 @@ from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper import do_no_harm, open_test_roads
 from unjam_paper.do_no_harm import (
-    ACC_DRIVER,
     DO_NO_HARM,
     HARM,
     HARM_UNDECIDED,
