@@ -164,6 +164,11 @@ def format_count(count: float, noun: str, plural: str = "") -> str:
     return f"{count:,.0f} {noun if count == 1 else plural or f'{noun}s'}"
 
 
+def format_duration(seconds: float) -> str:
+    """Return a duration for a line of progress."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
 def shorten_list(names: Iterable[str]) -> str:
     """Return the names joined by commas, without those after the first `MAX_LISTED_NAMES`."""
     known = list(names)

@@ -13,7 +13,7 @@ from unjam.cli.output import console, err_console, print_json
 from unjam.controller import make_driver
 from unjam.controller.domain import controller_notes
 from unjam.drivers.driver import Driver
-from unjam.errors import InputError, MissingPartError, invalid_value
+from unjam.errors import InputError, MissingPartError, format_duration, invalid_value
 from unjam.files import check_parent_folder
 from unjam.measures.metrics import measure
 from unjam.measures.notes import episode_notes
@@ -216,7 +216,7 @@ def assess_command(
     - unjam assess my.sumocfg -d runs/my-001 --penetration-rates 0.1 --begin 28800 --end 32400 --json
     """
     from unjam.reports.assessment import OPTION_HEADINGS, option_rows, parse_assessment
-    from unjam.training.assess import DEFAULT_CONTROLLERS, assess, format_duration, make_request
+    from unjam.training.assess import DEFAULT_CONTROLLERS, assess, make_request
 
     drivers, changes = driver or DEFAULT_CONTROLLERS, opt.merge_settings(changes, opt.parse_settings(settings))
     request = make_request(scenario, _parse_rates(penetration_rates), episodes, precision, minutes, drivers, changes)

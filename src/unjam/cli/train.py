@@ -11,13 +11,12 @@ from typer import Option
 from unjam.cli import options as opt
 from unjam.cli import output
 from unjam.cli.output import console, err_console, print_json
-from unjam.errors import InputError, format_count
+from unjam.errors import InputError, format_count, format_duration
 from unjam.measures.notes import episode_notes
 from unjam.reports.results import read_progress, read_results
 from unjam.training.config import RunConfig, load_config, planned_steps
 from unjam.training.evaluate import Evaluation, evaluation_steps
 from unjam.training.run_folder import check_config, lock_new_folder, make_new_folder, read_config, removing_if_empty
-from unjam.training.selection import format_duration
 from unjam.training.trial_log import REQUEST_FILE
 
 if TYPE_CHECKING:

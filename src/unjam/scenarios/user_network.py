@@ -230,7 +230,7 @@ def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
         raise InputError(
             f"{name}: it is not allowed on your own network, only on motorways such as on-ramp; {ALTERNATIVES}"
         )
-    files = read_sumo_files(Path.cwd() / file)  # a link stays one: SUMO finds other files beside it
+    files = read_sumo_files(Path.cwd() / file)  # not its target: SUMO finds other files next to a link
     _log_once(*notes_on_files(files, MAX_LOGGED_NAMES))
     if isinstance(cruise := changes.get("cruise", {}), dict):
         changes = {**changes, "cruise": {"acceleration": None, "deceleration": None, **cruise}}

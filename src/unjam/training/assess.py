@@ -15,7 +15,7 @@ from typing import Any, cast
 from unjam.controller import DEFAULT_DRIVER, make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe
-from unjam.errors import InputError, NoCavError, format_count, invalid_value
+from unjam.errors import InputError, NoCavError, format_count, format_duration, invalid_value
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import HARD_BRAKING_METRIC
@@ -50,7 +50,6 @@ from unjam.training.selection import (
     OptionRows,
     Selection,
     compare_on_test_seeds,
-    format_duration,
     min_episodes,
     select_controllers,
     verdict_episodes,

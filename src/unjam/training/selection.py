@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from math import ceil, isfinite, log2
 from typing import Any, NamedTuple
 
-from unjam.errors import format_count
+from unjam.errors import format_count, format_duration
 from unjam.measures.effect import FLOW_METRIC, TIME_METRIC, Effect, describe_harm, effect_of, is_too_small
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.recommendation import MIN_VERDICT_SEEDS, AccResult, ControllerResult, required_seeds
@@ -308,8 +308,3 @@ def _width_text(widths: Sequence[float], precision: float) -> str:
 
 def _remaining_time_text(budget: EpisodeBudget) -> str:
     return f"at most {format_duration(budget.remaining_seconds)} more"
-
-
-def format_duration(seconds: float) -> str:
-    """Return a duration for a line of progress."""
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
