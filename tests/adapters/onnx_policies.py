@@ -61,6 +61,16 @@ def linear(columns: int, weights: Sequence[float], rows: str | int = "n", kind: 
     return model([node], [value("observation", (rows, columns), kind)], [value("action", (rows, 1), kind)], [matrix])
 
 
+def mixing(columns: int, weights: Sequence[float]) -> Any:
+    """The same graph with an output of (n, n), because it mixes the rows of its input: for one vehicle only."""
+    made = linear(columns, weights)
+    made.graph.node[0].output[0] = "product"
+    transpose = helper.make_node("Transpose", ["product"], ["row"])
+    made.graph.node.extend([transpose, helper.make_node("Add", ["product", "row"], ["action"])])
+    made.graph.output[0].CopyFrom(value("action", ("n", "n")))
+    return made
+
+
 def write(folder: Path, made: Any, description: str = DESCRIPTION, name: str = "policy") -> Path:
     (folder / f"{name}.toml").write_text(description)
     path = folder / f"{name}.onnx"

@@ -74,6 +74,16 @@ def test_insertion_backlog_is_noted(backlog: float, noted: bool) -> None:
     )
 
 
+@pytest.mark.parametrize(("unfinished", "delay_share", "noted"), [(2, 0.9, False), (20, 0.2, False), (20, 0.9, True)])
+def test_traffic_that_is_congested_at_the_end_is_noted(unfinished: int, delay_share: float, noted: bool) -> None:
+    rows = rows_of(2, unfinished_trips=unfinished, delay_share_at_end=delay_share)
+    note = (
+        "human, pi: traffic is still congested at the end, with 40 % of the vehicles under way or waiting; their travel "
+        "time counts until then, and a later --end shows more of it"
+    )
+    assert episode_notes({"human": rows, "pi": rows}) == [note][: int(noted)]
+
+
 def test_teleports_are_noted() -> None:
     note = "human: SUMO teleported or removed 6 vehicles, which had waited longer than time-to-teleport or collided"
     assert episode_notes({"human": rows_of(2, teleports=3)}) == [note]

@@ -7,8 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.adapters.onnx_policies import linear, write
+from tests.adapters.onnx_policies import linear, mixing, write
 from unjam.controller import make_driver
+from unjam.drivers.check import random_state
 from unjam.errors import InputError
 from unjam.physics.fuel import fuel_rate
 from unjam.worlds.batch.run import run_batches
@@ -37,6 +38,7 @@ from unjam_paper.recorded_roads import (
     TEST_DRIVES_PART,
     TRAINING_DRIVES_PART,
     DriveResults,
+    PublishedController,
     recorded_drives,
     tuned_name,
     untuned_driver,
@@ -59,10 +61,19 @@ def folder(tmp_path: Path) -> Path:
     for number, name in enumerate(("2021-03-01_a", "2021-03-02_b", "2021-04-01_c")):
         speeds = 15.0 + 4.0 * np.sin(times / (6.0 + number))
         pd.DataFrame({"time": times, "speed": speeds}).to_csv(drives / f"{name}.csv", index=False)
-    for file in map(Path, PUBLISHED_FILES.values()):
+    for file, make_graph in zip(map(Path, PUBLISHED_FILES.values()), (linear, mixing), strict=True):
         (tmp_path / file.parent).mkdir(exist_ok=True)
-        write(tmp_path / file.parent, linear(3, [-0.2, 0.15, 0.01]), DESCRIPTION, file.stem)
+        write(tmp_path / file.parent, make_graph(3, [-0.2, 0.15, 0.01]), DESCRIPTION, file.stem)
     return tmp_path
+
+
+@pytest.mark.parametrize("file", PUBLISHED_FILES.values())
+def test_published_networks_drive_several_vehicles_as_each_alone(folder: Path, file: str) -> None:
+    controller = PublishedController(str(folder / file))
+    state = random_state(np.random.default_rng(0), 3)
+    together, _ = controller.act(state, {})
+    alone = [controller.act(state.select(slice(row, row + 1)), {})[0].item() for row in range(3)]
+    np.testing.assert_array_equal(together, alone)
 
 
 def test_drives_are_split_by_month(folder: Path) -> None:

@@ -134,7 +134,7 @@ def test_page_describes_the_acc_of_cavs(tmp_path: Path, page: str) -> None:
 
 def test_tables_have_the_human_baseline_and_differences_to_it(page: str) -> None:
     assert cells_of(page, "verdict") == ["", "–", "recommended", "–", "not recommended"]
-    assert cells_of(page, "feasible") == ["", "feasible", "feasible", "feasible", "brakes with 9 m/s2"]
+    assert cells_of(page, "feasibility") == ["", "feasible", "feasible", "feasible", "brakes with 9 m/s2"]
     helps, harms = "-4.0 [-6.0, -2.0]", "+4.0 [+3.0, +5.0]"
     assert cells_of(page, "travel time, departure") == ["78.5", helps, helps, helps, harms]
     assert cells_of(page, "travel time, relative to") == ["", "-4.0", "-4.0", "-4.0", "+4.0"]

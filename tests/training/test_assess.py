@@ -123,8 +123,16 @@ def test_missing_budget_keeps_all_penetration_rates_and_the_undecided_controller
     unknown = replace(OPEN, penetration_rate=0.3, missing_seeds=inf)
     findings = AssessmentFindings({}, [undecided, rejected, unknown], [])
     missing = missing_budget(request, findings, EpisodeBudget(400))
-    assert (missing["test_seeds"], missing["drivers"]) == (36, ["acc"])
-    assert missing["episodes"] == verdict_episodes(3, 1, False, 36, 2) + 2
+    assert (missing["test_seeds"], missing["min_test_seeds"], missing["drivers"]) == (36, 36, ["acc"])
+    assert missing["episodes"] == missing["min_episodes"] == verdict_episodes(3, 1, False, 36, 2) + 2
+
+
+def test_missing_budget_estimated_from_few_seeds_begins_with_the_fewest_of_a_verdict(file: str) -> None:
+    request = make_request(file, [0.1], 400, 0.02, None, ["acc"])
+    few = replace(OPEN, difference_to_acc=replace(OPEN.difference_to_acc, count=3), missing_seeds=90.0)
+    missing = missing_budget(request, AssessmentFindings({}, [few], []), EpisodeBudget(400))
+    assert (missing["min_test_seeds"], missing["test_seeds"]) == (10, 93)
+    assert missing["min_episodes"] == verdict_episodes(1, 1, False, 10, 1) + 2
 
 
 def test_page_of_the_documentation_has_the_budgets_of_verdicts(file: str) -> None:

@@ -237,7 +237,7 @@ def assess_command(
     output.print_notes(document["notes"])
     err_console.print(f"report: {assessment.page}", soft_wrap=True)
     if missing := document["missing_budget"]:
-        size = f"{missing['test_seeds']} test seeds, about {format_duration(missing['seconds'])}"
+        size = f"{missing['test_seeds']} test seeds at most, about {format_duration(missing['seconds'])}"
         rest = output.arguments_without("--out", "--driver", "-d", "--episodes", "-n", "--minutes")
         drivers = [word for name in missing["drivers"] for word in ("-d", name)]
         output.print_next_command(f"for a verdict ({size})", *rest, *drivers, "--episodes", missing["episodes"])

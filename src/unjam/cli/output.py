@@ -35,8 +35,8 @@ NARROW_COLUMN_WIDTHS = 18, 7
 """widths of the columns of metrics and units in a narrow terminal [characters]"""
 WIDE_OPTIONS_WIDTH = 130
 """width from which a cell of the main table of an assessment is one line [characters]"""
-TEXT_COLUMN_WIDTH = 22
-"""width of headings and verdicts [characters]: that of most numbers with their intervals"""
+TEXT_COLUMN_WIDTHS = {" ": 22, "\n": 15}
+"""width of headings and verdicts [characters], by what separates a mean from its interval: that of most numbers"""
 
 
 class TerminalConsole(Console):
@@ -99,8 +99,8 @@ def print_wrapped(line: str) -> None:
 def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[str] = METRICS) -> None:
     """Print feasibility, metrics with 95 % confidence intervals, and the differences to a baseline if there is one.
 
-    If the terminal is too narrow for all drivers, there are several tables; if it is too narrow for one,
-    intervals are below means.
+    If the terminal is too narrow for all drivers, intervals are below means; if it is still too narrow, there are
+    several tables.
     """
     headings, rows = metric_table(rows_by_driver, baseline, names)
     columns = {label: [number] for number, label in enumerate(rows_by_driver)}
@@ -109,7 +109,9 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
         columns[label].append(number)  # without a baseline there are no differences
 
     def build_table(columns: Sequence[int], separator: str) -> Table:
-        table = new_table(("metric", "unit"), [fill(headings[number], TEXT_COLUMN_WIDTH) for number in columns])
+        table = new_table(
+            ("metric", "unit"), [fill(headings[number], TEXT_COLUMN_WIDTHS[separator]) for number in columns]
+        )
         for column in table.columns[2:]:
             column.no_wrap = True
         if separator != " ":
@@ -122,7 +124,8 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
         unlimited = console.options.update_width(10_000)
         return Measurement.get(console, unlimited, build_table(columns, separator)).maximum <= console.width
 
-    separator = " " if all(fits(each, " ") for each in columns.values()) else "\n"
+    everything = [number for each in columns.values() for number in each]
+    separator = " " if fits(everything, " ") else "\n"
     blocks = [list[int]()]
     for each in columns.values():
         block = sorted([*blocks[-1], *each])
@@ -155,7 +158,7 @@ def print_notes(notes: Sequence[str]) -> None:
 
 def _cell_text(cell: "TableCell", separator: str) -> Text:
     """Return a cell: its interval dim, verdicts wrapped."""
-    mean = fill(cell.mean, TEXT_COLUMN_WIDTH)
+    mean = fill(cell.mean, TEXT_COLUMN_WIDTHS[separator])
     return Text.assemble(mean, separator, (cell.interval, "dim")) if cell.interval else Text(mean)
 
 

@@ -15,6 +15,9 @@ MAX_WARNING_KINDS = 10
 """kinds of SUMO's warnings that are shown, the most frequent first"""
 MAX_BACKLOG_SHARE = 0.05
 """share of the vehicles in the insertion backlog at the end, above which there is a note"""
+MAX_UNFINISHED_SHARE, MAX_DELAY_SHARE = 0.05, 1 / 3
+"""share of the vehicles that have not arrived at the end, and share of delay in their travel time, above which traffic
+is still congested"""
 LOST_DEMAND_PATTERN = re.compile(
     "sorted by departure time|no (valid )?route|discard|removing vehicle|not reachable|inserted", re.IGNORECASE
 )
@@ -24,7 +27,7 @@ LOST_DEMAND_PATTERN = re.compile(
 def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return all notes on the episodes of several drivers, the most serious first."""
     lost, others = warning_notes(rows_by_driver)
-    kinds = early_end_notes, _backlog_notes, _entrance_notes, teleport_notes, _repeated_drive_notes
+    kinds = early_end_notes, _backlog_notes, _congestion_notes, _entrance_notes, teleport_notes, _repeated_drive_notes
     notes = (note(rows_by_driver) for note in kinds)
     return [*lost, *(each for group in notes for each in group), *others]
 
@@ -92,6 +95,23 @@ def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
             count = f"{backlog:,.0f} of {format_count(demand, 'vehicle')}"
             notes.append(f"{label}: {count} had not entered by the end: they wait in the insertion backlog")
     return notes
+
+
+def _congestion_notes(rows_by_driver: RowsByDriver) -> list[str]:
+    """Return a note if traffic is still congested at the end with some drivers, so that travel times are cut off."""
+    shares = dict[str, float]()
+    for label, rows in rows_by_driver.items():
+        complete = [row for row in rows if row["status"] == "completed" and "unfinished_trips" in row]
+        demand = sum(row["vehicles"] + row["insertion_backlog_veh"] for row in complete)
+        unfinished = sum(row["unfinished_trips"] for row in complete if row["delay_share_at_end"] > MAX_DELAY_SHARE)
+        if unfinished > MAX_UNFINISHED_SHARE * demand:
+            shares[label] = unfinished / demand
+    if not shares:
+        return []
+    return [
+        f"{', '.join(shares)}: traffic is still congested at the end, with {100 * max(shares.values()):.0f} % of the "
+        "vehicles under way or waiting; their travel time counts until then, and a later --end shows more of it"
+    ]
 
 
 def _entrance_notes(rows_by_driver: RowsByDriver) -> list[str]:

@@ -32,7 +32,7 @@ EFFECT_METRICS = (
 HUMAN_BASELINE_LABEL, ACC_LABEL = "human baseline", "ACC alone"
 OPTION_HEADINGS = (
     *("CAVs", "driver", "travel time − human [s]", "travel time − ACC [s]"),
-    *("flow − human [veh/h]", "flow − ACC [veh/h]", "feasible", "verdict"),
+    *("flow − human [veh/h]", "flow − ACC [veh/h]", "feasibility", "verdict"),
 )
 """columns of the main table: differences to the human baseline and to ACC vehicles alone"""
 ACC_DIFFERENCES = "difference_to_acc", "flow_difference_to_acc"
@@ -114,6 +114,8 @@ def parse_assessment(document: dict[str, Any]) -> dict[str, Any]:
     groups = {
         name: [*map(parse_values, document[name])] for name in ("controller_results", "acc_results", "candidates")
     }
+    for each in groups["acc_results"]:
+        each["driver"] = ACC_LABEL
     return {**document, **groups, "baseline": parse_values(document["baseline"])}
 
 
@@ -125,9 +127,8 @@ def option_rows(assessment: dict[str, Any]) -> list[list[str]]:
         effect, to_acc = each["effect"], [each.get(name, MISSING) for name in ACC_DIFFERENCES]
         times = [format_difference(change, 1) for change in (effect["travel_time"], to_acc[0])]
         flows = [format_difference(change) for change in (effect["flow"], to_acc[1])]
-        driver = ACC_LABEL if "verdict" not in each else each["driver"]
         verdicts = effect["feasibility"] or "–", each.get("verdict", "–")
-        rows.append([format_percent(each["penetration_rate"]), driver, *times, *flows, *verdicts])
+        rows.append([format_percent(each["penetration_rate"]), each["driver"], *times, *flows, *verdicts])
     return rows
 
 
@@ -147,7 +148,7 @@ def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
     baseline_contacts = f"{baseline['collisions'].mean * baseline['collisions'].count:.0f}"
     rows = (
         ("verdict", "", "", verdicts),
-        ("feasible", "", "", [each["feasibility"] or "–" for each in effects]),
+        ("feasibility", "", "", [each["feasibility"] or "–" for each in effects]),
         time,
         ("travel time, relative to the human baseline", "%", "", relative),
         ("travel time, compared with ACC vehicles", "s", "", acc),

@@ -294,16 +294,25 @@ def budget_lines(request: AssessmentRequest, budget: EpisodeBudget) -> list[str]
 def missing_budget(request: AssessmentRequest, findings: AssessmentFindings, budget: EpisodeBudget) -> dict[str, Any]:
     """Return the budget with which the open questions would probably be answered.
 
-    All penetration rates stay, and only controllers are left out: they were selected on other seeds.
+    All penetration rates stay, and only controllers are left out: they were selected on other seeds. The estimate from
+    fewer seeds than a verdict needs is rough, so that the smallest budget of a verdict is returned, too.
     """
     undecided = [each for each in findings.controller_results if each.verdict == UNDECIDED]
     needed = [each.difference_to_acc.count + each.missing_seeds for each in undecided]
     seeds = max([MIN_VERDICT_SEEDS, *(ceil(each) for each in needed if isfinite(each))])
     drivers = list(dict.fromkeys(each.driver for each in undecided))
     counts = len(request.penetration_rates), len(drivers), request.has_acc_properties
-    episodes = verdict_episodes(*counts, seeds, len(undecided)) + PLOT_EPISODE_COUNT
-    seconds = budget.estimate_seconds(episodes)
-    return {"test_seeds": seeds, "episodes": episodes, "seconds": seconds, "drivers": drivers}
+    is_rough = any(each.difference_to_acc.count < MIN_VERDICT_SEEDS for each in undecided)
+    min_seeds = MIN_VERDICT_SEEDS if is_rough else seeds
+    fewest, episodes = (verdict_episodes(*counts, n, len(undecided)) + PLOT_EPISODE_COUNT for n in (min_seeds, seeds))
+    return {
+        "test_seeds": seeds,
+        "min_test_seeds": min_seeds,
+        "episodes": episodes,
+        "min_episodes": fewest,
+        "seconds": budget.estimate_seconds(episodes),
+        "drivers": drivers,
+    }
 
 
 def sensing_notes(request: AssessmentRequest) -> list[str]:
@@ -315,6 +324,10 @@ def sensing_notes(request: AssessmentRequest) -> list[str]:
         return []
     known = request.network.roadside.description
     return [f"{', '.join(readers)}: assumed to know {known}; roadside.latency, smoothing_time and loss_rate change it"]
+
+
+def _range_text(low: int, high: int) -> str:
+    return f"{low:,} to {high:,}" if low < high else f"about {high:,}"
 
 
 def _assessment_document(
@@ -329,8 +342,9 @@ def _assessment_document(
     answer, missing = road_verdict(findings.controller_results, baseline_rows), None
     if answer.verdict == UNDECIDED:
         missing = missing_budget(request, findings, budget)
-        size = f"{format_count(missing['test_seeds'], 'test seed')} ({format_count(missing['episodes'], 'episode')}"
-        more = f"a verdict needs about {size}, about {format_duration(missing['seconds'])})"
+        seeds, episodes = (_range_text(missing[f"min_{name}"], missing[name]) for name in ("test_seeds", "episodes"))
+        duration = f"at most about {format_duration(missing['seconds'])}"
+        more = f"a verdict needs {seeds} test seeds ({episodes} episodes, {duration})"
         answer = answer._replace(sentence=f"{answer.sentence.removesuffix('.')}; {more}.")
     candidates = [
         {

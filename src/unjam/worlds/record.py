@@ -137,6 +137,12 @@ class Trips:
         """Travel time of each trip, including the time that the vehicle waited for its insertion [s]."""
         return self.duration + self.depart_delay
 
+    @property
+    def delay_share_at_end(self) -> float:
+        """Delay of the vehicles that have not arrived, as a share of their travel time so far; 0 without such."""
+        spent = float(self.travel_time[~self.has_arrived].sum())
+        return float(self.delay[~self.has_arrived].sum()) / spent if spent else 0.0
+
     def mean_travel_time(self, group: str) -> float:
         """Return the mean travel time of a group of `VEHICLE_GROUPS` [s]; NaN if it has no vehicles."""
         is_in_group = np.isin(self.vehicle_classes, VEHICLE_GROUPS[group])
