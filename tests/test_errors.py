@@ -7,8 +7,9 @@ import pytest
 
 import unjam
 from unjam.drivers.registry import driver_from_name
-from unjam.errors import InputError, format_count, invalid_value, one_line, printable
+from unjam.errors import InputError, invalid_value
 from unjam.scenarios import make_scenario
+from unjam.text import format_count, one_line, printable
 from unjam.training.config import load_config
 from unjam.worlds.reward import make_reward
 

@@ -26,7 +26,7 @@ ORDER = (
 """each may import those before it, and none after it"""
 EVERYWHERE = {
     *("", "adam", "child_processes", "errors", "file_names", "files", "folders", "kernels", "manifest", "onnx_models"),
-    *("parameters", "plugins", "processes", "road_family", "sandbox", "seeds", "tree", "trust", "user_code"),
+    *("parameters", "plugins", "processes", "road_family", "sandbox", "seeds", "text", "tree", "trust", "user_code"),
 }
 """modules that every part may import: they import none of the layers"""
 ALLOWED = {

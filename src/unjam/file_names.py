@@ -5,7 +5,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from unjam.errors import InputError, one_line
+from unjam.errors import InputError
+from unjam.text import one_line
 
 _SEPARATOR = re.compile(r"\+(?=[^\W\d]|[./~])")  # + between two names, but not that in 1e+5
 _MAX_LENGTH = 4096  # letters of a path, the limit of Linux

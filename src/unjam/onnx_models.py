@@ -12,7 +12,8 @@ from math import prod
 from threading import Timer
 from typing import Any
 
-from unjam.errors import InputError, import_optional, invalid_value, one_line
+from unjam.errors import InputError, import_optional, invalid_value
+from unjam.text import one_line
 
 _OPERATORS = """
 Abs Add And BatchNormalization Cast Ceil Clip Concat Constant Cos Div Elu Equal Erf Exp Expand Flatten Floor Gather

@@ -16,7 +16,8 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, Strict,
 from pydantic.dataclasses import dataclass
 from pydantic.errors import PydanticUserError
 
-from unjam.errors import InputError, invalid_value, one_line, spelling_hint
+from unjam.errors import InputError, invalid_value
+from unjam.text import one_line, spelling_hint
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 """configuration of parameter dataclasses, of which `unjam drivers` and the documentation show the texts under fields"""

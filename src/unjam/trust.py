@@ -10,8 +10,9 @@ from typing import Any
 
 import platformdirs
 
-from unjam.errors import InputError, UnjamError, one_line
+from unjam.errors import InputError, UnjamError
 from unjam.files import atomic_write, make_folder, sha256_of
+from unjam.text import one_line
 from unjam.user_code import UserCode, read_code
 
 TRUSTED_VARIABLE = "UNJAM_TRUSTED"  # keys of trusted code, in addition to the remembered ones

@@ -11,7 +11,6 @@ from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
 from shutil import copyfile, rmtree
-from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import numpy as np
@@ -23,6 +22,8 @@ from unjam.controller.file import SUFFIX
 from unjam.drivers.car_following import ACC, FollowerStopper
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.onnx_policy import OnnxDriver
+from unjam.drivers.policy import PolicyDescription, PolicyInput
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.smooth_acc import SmoothACC
 from unjam.errors import InputError
@@ -70,6 +71,7 @@ RECORDINGS_FOLDER = "recordings/i24"
 PUBLISHED_LABEL, LATER_LABEL = "published", "published, later version"
 PUBLISHED_FILES = {PUBLISHED_LABEL: "recordings/model.onnx", LATER_LABEL: "recordings/later/model.onnx"}
 """controllers/cra/model.onnx of CIRCLES-consortium/algos-stack, there: of the branches `master` and `cra_08_04`"""
+PUBLISHED_DESCRIPTION = PolicyDescription(tuple(map(PolicyInput, ("speed", "leader_speed", "leader_gap"))))
 TRAINING_MONTH, TEST_MONTH = "2021-03", "2021-04"
 TIME_STEP = 0.1
 TUNED_SET_SPEED = 45.0
@@ -132,7 +134,7 @@ class PublishedController(Driver):
     """The published controller of the CIRCLES experiment: a FollowerStopper limits the acceleration of a network."""
 
     file: str
-    """its ONNX graph; the same folder has the description"""
+    """its ONNX graph"""
 
     @cached_property
     def network(self) -> Driver:
@@ -140,11 +142,8 @@ class PublishedController(Driver):
         path = Path(self.file)
         model = parse_model(path.read_bytes())
         model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 1
-        with TemporaryDirectory() as folder:
-            copy = Path(folder, path.name)
-            copy.write_bytes(model.SerializeToString())
-            copy.with_suffix(".toml").write_bytes(path.with_suffix(".toml").read_bytes())
-            return make_driver(str(copy), TIME_STEP)
+        graph = np.frombuffer(model.SerializeToString(), np.uint8)
+        return OnnxDriver(path.name, PUBLISHED_DESCRIPTION, time_step=TIME_STEP, graph=graph)
 
     @cached_property
     def stopper(self) -> FollowerStopper:

@@ -78,8 +78,8 @@ def test_insertion_backlog_is_noted(backlog: float, noted: bool) -> None:
 def test_traffic_that_is_congested_at_the_end_is_noted(unfinished: int, delay_share: float, noted: bool) -> None:
     rows = rows_of(2, unfinished_trips=unfinished, delay_share_at_end=delay_share)
     note = (
-        "human, pi: traffic is still congested at the end, with 40 % of the vehicles under way or waiting; their travel "
-        "time counts until then, and a later --end shows more of it"
+        "human, pi: traffic is still congested at the end, with 40 % of the vehicles under way or waiting; their "
+        "travel time counts until then, and a later --end shows more of it"
     )
     assert episode_notes({"human": rows, "pi": rows}) == [note][: int(noted)]
 

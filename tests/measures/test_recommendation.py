@@ -6,7 +6,6 @@ from math import inf, nan
 import pytest
 
 from tests.measures.test_effect import GOOD, between
-from unjam.errors import format_count
 from unjam.measures.recommendation import (
     MIN_VERDICT_SEEDS,
     NOT_RECOMMENDED,
@@ -21,6 +20,7 @@ from unjam.measures.recommendation import (
     road_verdict,
 )
 from unjam.measures.statistics import Estimate
+from unjam.text import format_count
 
 BEYOND = between(-3.0, -1.0)
 MORE_FLOW = between(-20.0, 40.0)

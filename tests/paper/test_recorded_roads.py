@@ -47,9 +47,6 @@ from unjam_paper.results_file import read_part
 from unjam_paper.study import NO_VALUE_TEXT, StudyFolder
 
 STEP = 0.1
-DESCRIPTION = """inputs = [{ quantity = "speed" }, { quantity = "leader_speed" }, { quantity = "leader_gap" }]
-output = { quantity = "acceleration" }
-"""
 
 
 @pytest.fixture
@@ -63,7 +60,7 @@ def folder(tmp_path: Path) -> Path:
         pd.DataFrame({"time": times, "speed": speeds}).to_csv(drives / f"{name}.csv", index=False)
     for file, make_graph in zip(map(Path, PUBLISHED_FILES.values()), (linear, mixing), strict=True):
         (tmp_path / file.parent).mkdir(exist_ok=True)
-        write(tmp_path / file.parent, make_graph(3, [-0.2, 0.15, 0.01]), DESCRIPTION, file.stem)
+        write(tmp_path / file.parent, make_graph(3, [-0.2, 0.15, 0.01]), name=file.stem)
     return tmp_path
 
 

@@ -20,7 +20,6 @@ from matplotlib.text import Text
 from PIL import Image
 
 from tests.reports.open_roads import merge_episode, plot_episode_of, user_episode
-from unjam.errors import printable
 from unjam.measures.statistics import estimate
 from unjam.reports.figures import (
     CAV_PLOT_COLOR,
@@ -36,6 +35,7 @@ from unjam.reports.figures import (
 )
 from unjam.reports.results import PlotEpisode
 from unjam.reports.space_time import speed_field, speed_scale, trajectory_figure
+from unjam.text import printable
 
 LENGTH = 120.0
 

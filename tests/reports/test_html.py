@@ -14,7 +14,7 @@ from tests.measures.test_metrics import LENGTH, episode_of
 from tests.reports.test_model import facts_of, progress_of
 from tests.reports.test_replay import decode
 from unjam import __version__
-from unjam.errors import DiskError, InputError, printable
+from unjam.errors import DiskError, InputError
 from unjam.files import to_json
 from unjam.measures.metrics import METRICS, measure
 from unjam.measures.statistics import Estimate
@@ -23,6 +23,7 @@ from unjam.reports.figures import learning_curve_figure
 from unjam.reports.html import REPLAY_STEP, write_report_page
 from unjam.reports.results import read_results
 from unjam.reports.space_time import speed_scale
+from unjam.text import printable
 from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode, failed_episode
 

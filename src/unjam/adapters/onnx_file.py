@@ -16,10 +16,11 @@ from unjam.drivers.onnx_policy import OnnxDriver
 from unjam.drivers.policy import PolicyDescription
 from unjam.drivers.registry import DRIVERS, driver_from_name
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, invalid_value, naming, one_line, unknown_name
+from unjam.errors import InputError, invalid_value, naming, unknown_name
 from unjam.folders import open_folder
 from unjam.onnx_models import MAX_MODEL_BYTES, parse_model
 from unjam.parameters import build_dataclass, parse_toml, split_parameters
+from unjam.text import one_line
 
 GRAPH_SUFFIX, DESCRIPTION_SUFFIX = ".onnx", ".toml"
 DESCRIPTION_KEY = "unjam"

@@ -15,7 +15,8 @@ from unjam.drivers.car_following import Constant
 from unjam.drivers.observation import FeatureLike, as_features, observation_size
 from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyOutput, TensorPolicyDriver
 from unjam.drivers.user_driver import DriverLike, UserFunction, as_driver, object_label
-from unjam.errors import InputError, invalid_value, one_line
+from unjam.errors import InputError, invalid_value
+from unjam.text import one_line
 
 
 def policy_driver(

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box
 
-from unjam.errors import InputError, MissingPartError, import_optional, one_line
+from unjam.errors import InputError, MissingPartError, import_optional
 from unjam.physics.arrays import Floats
+from unjam.text import one_line
 
 DATA_PART, POLICY_PART, PICKLE_SUFFIX = "data", "policy.pth", ".pkl"
 MAX_ARCHIVE_BYTES = 64 * 2**20

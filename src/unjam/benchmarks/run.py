@@ -25,7 +25,7 @@ from unjam.controller.file import read_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable, user_code_recipes
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, format_count, invalid_value, one_line, unknown_name
+from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.files import make_folder, sha256_of, sha256_of_file, to_json
 from unjam.manifest import manifest, without_folders
 from unjam.measures.gain import EpisodeRows
@@ -36,6 +36,7 @@ from unjam.processes import lock_file
 from unjam.road_family import FAMILY_PREFIX
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
+from unjam.text import format_count, one_line
 from unjam.training.evaluate import raise_failure
 from unjam.worlds.backend import check_support, open_backend
 from unjam.worlds.batch.run import run_batches

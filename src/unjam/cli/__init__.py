@@ -18,9 +18,10 @@ from typer.core import TyperGroup
 from unjam import __version__, errors
 from unjam.child_processes import isolate_children, isolate_matplotlib
 from unjam.cli.options import with_trust_option
-from unjam.errors import InputError, UnjamError, invalid_value, missing_package_error, printable, unknown_name
+from unjam.errors import InputError, UnjamError, invalid_value, missing_package_error, unknown_name
 from unjam.plugins import load_plugins, plugin_names
 from unjam.processes import exit_with_parent, mark_as_command_line
+from unjam.text import printable
 
 INTERRUPTED_EXIT_CODE = 130
 COMMANDS = {

@@ -9,8 +9,9 @@ from typer import Argument, Option
 from unjam.cli import options as opt
 from unjam.cli.output import console, err_console, new_table, print_json, print_next_command
 from unjam.controller import DEFAULT_DRIVER
-from unjam.errors import InputError, format_count, invalid_value
+from unjam.errors import InputError, invalid_value
 from unjam.files import atomic_write, make_folder
+from unjam.text import format_count
 
 LEADERBOARD_WIDTH = 80  # [characters]
 

@@ -13,7 +13,7 @@ from unjam.cli.output import console, err_console, print_json
 from unjam.controller import make_driver
 from unjam.controller.domain import controller_notes
 from unjam.drivers.driver import Driver
-from unjam.errors import InputError, MissingPartError, format_duration, invalid_value
+from unjam.errors import InputError, MissingPartError, invalid_value
 from unjam.files import check_parent_folder
 from unjam.measures.metrics import measure
 from unjam.measures.notes import episode_notes
@@ -21,6 +21,7 @@ from unjam.processes import has_display
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
+from unjam.text import format_duration
 from unjam.training.evaluate import drive, raise_failure, raise_failures
 from unjam.training.run_folder import lock_new_folder
 from unjam.worlds.backend import backend_notes, check_support, open_backend

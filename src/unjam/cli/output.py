@@ -20,12 +20,13 @@ from rich.text import Text
 
 from unjam.controller import DEFAULT_DRIVER
 from unjam.drivers.registry import DRIVERS
-from unjam.errors import InputError, MissingPartError, format_duration, printable
+from unjam.errors import InputError, MissingPartError
 from unjam.files import to_json
 from unjam.measures.metric_table import RowsByDriver, TableCell, choose_baseline, metric_table
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, is_expert_unchanged
 from unjam.measures.verdict import short_table_metrics, verdicts
+from unjam.text import format_duration, printable
 
 PROGRESS_LINE_SECONDS = 5.0
 """time between two plain lines of progress without a terminal"""

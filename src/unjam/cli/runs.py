@@ -14,10 +14,11 @@ from unjam.cli import output
 from unjam.cli.output import console, err_console, print_json
 from unjam.controller import make_driver
 from unjam.drivers.registry import DRIVERS
-from unjam.errors import InputError, printable, resume_hint
+from unjam.errors import InputError, resume_hint
 from unjam.measures.statistics import format_difference
 from unjam.processes import check_not_locked, continue_in_limited_child, lock_folder
 from unjam.reports.results import read_progress, read_results
+from unjam.text import printable
 from unjam.training.evaluate import evaluate_run, evaluation_steps, gain_over_expert
 from unjam.training.run_folder import check_run_files, lock_new_folder, read_config
 from unjam.training.runs import config_differences, find_run, list_runs, read_run, remove_run

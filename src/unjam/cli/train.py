@@ -11,9 +11,10 @@ from typer import Option
 from unjam.cli import options as opt
 from unjam.cli import output
 from unjam.cli.output import console, err_console, print_json
-from unjam.errors import InputError, format_count, format_duration
+from unjam.errors import InputError
 from unjam.measures.notes import episode_notes
 from unjam.reports.results import read_progress, read_results
+from unjam.text import format_count, format_duration
 from unjam.training.config import RunConfig, load_config, planned_steps
 from unjam.training.evaluate import Evaluation, evaluation_steps
 from unjam.training.run_folder import check_config, lock_new_folder, make_new_folder, read_config, removing_if_empty

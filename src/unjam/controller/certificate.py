@@ -12,10 +12,11 @@ from unjam.drivers.local_state import MAX_OBSERVED_GAP, LocalState
 from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, FollowingState
 from unjam.drivers.wrappers import FilteredDriver
-from unjam.errors import InputError, format_count, invalid_value
+from unjam.errors import InputError, invalid_value
 from unjam.files import reject_damaged
 from unjam.parameters import build_dataclass
 from unjam.physics.idm import IDMParameters
+from unjam.text import format_count
 from unjam.worlds.drive import drive_world
 from unjam.worlds.world import CarFollowingWorld
 

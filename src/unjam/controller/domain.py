@@ -10,9 +10,10 @@ from unjam.controller import controller_path
 from unjam.controller.certificate import OperatingDomain
 from unjam.controller.file import CERTIFICATE_PART, Controller, read_controller
 from unjam.drivers.local_state import LocalState
-from unjam.errors import InputError, one_line
+from unjam.errors import InputError
 from unjam.files import UNREADABLE_ERRORS, parse_json
 from unjam.parameters import build_dataclass, flatten_keys
+from unjam.text import one_line
 from unjam.worlds.record import Episode
 
 IRRELEVANT_PARAMETERS = {

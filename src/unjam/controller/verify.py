@@ -19,8 +19,9 @@ from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_recipe, user_code_recipes
 from unjam.drivers.wrappers import FilteredDriver
-from unjam.errors import InputError, MissingPartError, format_count
+from unjam.errors import InputError, MissingPartError
 from unjam.files import parse_json, reject_damaged, sha256_of, to_json
+from unjam.text import format_count
 
 REPLAY_TOLERANCE = 1e-9  # allowed difference between recorded accelerations and those on this machine [m/s2]
 CERTIFICATE_TOLERANCE = 1e-6  # allowed difference between the numbers of a certificate and those on this machine

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.errors import InputError, one_line
+from unjam.errors import InputError
 from unjam.physics.arrays import Array, clip, namespace
+from unjam.text import one_line
 
 
 class Command(NamedTuple):

@@ -31,9 +31,10 @@ from unjam.drivers.local_state import (
 )
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements
 from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference
-from unjam.errors import InputError, RowError, format_count, invalid_value, unknown_name
+from unjam.errors import InputError, RowError, invalid_value, unknown_name
 from unjam.parameters import STRICT, Number, parameter_dataclass
 from unjam.physics.arrays import Array, Floats, as_column, clip, join_columns, namespace, stack_columns
+from unjam.text import format_count
 
 RELATIVE_SPEED_SCALE, GAP_SCALE, MERGE_DISTANCE_SCALE = 5.0, 20.0, 1000.0
 MAX_OBSERVATION = 50.0

@@ -15,9 +15,10 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.observation import FEATURES, Feature, NetworkInput, PolicyInput, Scale, unit_factor
 from unjam.drivers.requirements import Requirements
 from unjam.drivers.residual import ExpertWrapper
-from unjam.errors import InputError, format_count, invalid_value, unknown_name
+from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import STRICT, Number, build_dataclass, parameter_dataclass
 from unjam.physics.arrays import Array, namespace
+from unjam.text import format_count
 
 POLICY_KEY = "policy"
 """name in the memory: that of the policy"""

@@ -23,9 +23,10 @@ from unjam.drivers.wrappers import (
     QueueFallback,
     RoadTypeSwitch,
 )
-from unjam.errors import InputError, invalid_value, spelling_hint
+from unjam.errors import InputError, invalid_value
 from unjam.files import to_json
 from unjam.parameters import build_dataclass, check_part, check_values, is_packaged, split_parameters
+from unjam.text import spelling_hint
 from unjam.tree import Arrays, named_parts, pack, unpack
 
 _DRIVER_CLASSES = (

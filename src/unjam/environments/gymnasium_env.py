@@ -20,7 +20,7 @@ from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features,
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
 from unjam.environments.threads import CopyableLock, synchronized
-from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, one_line, unknown_name
+from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
 from unjam.measures.step_metrics import StepMetricMeans
 from unjam.parameters import check_integer, merge_changes, nest_keys
 from unjam.physics.arrays import clip
@@ -29,6 +29,7 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.road import OrderedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import warn_of_reserved_seed
+from unjam.text import one_line
 from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend, open_world
 from unjam.worlds.drive import DriveLoop
 from unjam.worlds.episode import check_can_drive, check_policy_inputs

@@ -10,7 +10,8 @@ from unjam.drivers.user_driver import DriverLike
 from unjam.environments.gymnasium_env import RoadStepper, as_action
 from unjam.environments.slots import RoadAgents, SlottedRoadEnv
 from unjam.environments.threads import synchronized
-from unjam.errors import InputError, format_count
+from unjam.errors import InputError
+from unjam.text import format_count
 from unjam.worlds.backend import BackendLike
 from unjam.worlds.reward import RewardLike
 

@@ -19,13 +19,14 @@ from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
 from unjam.environments.gymnasium_env import RoadStepper, check_single_cav, episode_seed
-from unjam.errors import InputError, MissingPartError, UnjamError, format_count, import_optional, invalid_value
+from unjam.errors import InputError, MissingPartError, UnjamError, import_optional, invalid_value
 from unjam.measures.step_metrics import step_metrics
 from unjam.parameters import check_integer
 from unjam.physics.arrays import Array, clip, copy_array, namespace, replace_entries
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import warn_of_reserved_seed
+from unjam.text import format_count
 from unjam.tree import map_leaves
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, draw_single_normal
 from unjam.worlds.batch.ring.record import as_numpy

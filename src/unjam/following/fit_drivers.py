@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from unjam.drivers.network import Network
-from unjam.errors import InputError, format_count, invalid_value, shorten_list, unknown_name
+from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.files import check_parent_folder
 from unjam.following.calibration import (
     CALIBRATED_PARAMETERS,
@@ -27,6 +27,7 @@ from unjam.physics.idm import IDMParameters
 from unjam.recordings.loaders import ReadOptions, read_trajectories
 from unjam.recordings.trajectories import FollowingTrajectory, select_splits, split_by_driver
 from unjam.scenarios.population import Population
+from unjam.text import format_count, shorten_list
 
 DriverProgress = Callable[[int, int], object]
 """called with the number of finished drivers and the number of all drivers"""

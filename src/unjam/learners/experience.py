@@ -6,8 +6,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from unjam.errors import InputError, UnjamError, format_count
+from unjam.errors import InputError, UnjamError
 from unjam.learners.agent import AgentSpec
+from unjam.text import format_count
 from unjam.worlds.record import Episode, Trajectory
 
 Float32 = NDArray[np.float32]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from math import isnan
 from typing import Any
 
-from unjam.errors import format_count
+from unjam.text import format_count
 
 MIN_TIME_GAP_FRACTION = 0.9
 """minimum time gap in every step, as a fraction of the required time gap"""

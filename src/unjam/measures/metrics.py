@@ -432,8 +432,6 @@ def measure(episode: Episode) -> dict[str, Any]:
 
     The metrics of a failed episode are NaN, and its row contains the reason.
     """
-    trips = episode.trips
-    at_end = {"unfinished_trips": int((~trips.has_arrived).sum()), "delay_share_at_end": trips.delay_share_at_end}
     row = {
         "seed": episode.seed[0] if len(episode.seed) == 1 else list(episode.seed),
         "sumo_seed": sumo_seed(episode.seed),
@@ -442,7 +440,7 @@ def measure(episode: Episode) -> dict[str, Any]:
         "warnings": [asdict(each) for each in episode.warnings],
         **({"slow_entrances": [*map(asdict, episode.slow_entrances)]} if episode.slow_entrances else {}),
         "vehicles": len(episode.vehicle_ids),
-        **(at_end if trips.vehicle_ids else {}),
+        **episode.trips.at_end,
         **episode.drawn_values,
         "required_time_gap": episode.audit.required_time_gap,
         "has_lanes": episode.audit.has_lanes,

@@ -5,9 +5,10 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from unjam.errors import InputError, format_count
+from unjam.errors import InputError
 from unjam.measures.metric_table import RowsByDriver
 from unjam.measures.statistics import has_ended_early
+from unjam.text import format_count
 
 MAX_EARLY_END_SHARE = 0.05
 """maximum share of the baseline's episodes that end early; with more of them comparisons would mislead"""

@@ -11,7 +11,6 @@ from math import ceil, inf, isfinite
 from operator import attrgetter
 from typing import Any, NamedTuple
 
-from unjam.errors import format_count
 from unjam.measures.effect import (
     MAX_FLOW_LOSS,
     TIME_METRIC,
@@ -23,6 +22,7 @@ from unjam.measures.effect import (
 )
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.statistics import Estimate, format_difference, format_percent, metric_estimate
+from unjam.text import format_count
 
 MAX_TELEPORT_SHARE = 0.01
 """share of the baseline's vehicles that SUMO may teleport or remove; with more of them travel times mean nothing"""

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
-from unjam.errors import format_count
 from unjam.measures.effect import FLOW_METRIC, FUEL_METRIC, LAG_METRIC, POWER_FUEL_METRIC, TIME_METRIC, is_measured
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import HUMAN_LABEL, RowsByDriver, estimate_cell, metric_table
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, paired_difference, relative_difference
+from unjam.text import format_count
 
 if TYPE_CHECKING:  # imported late, so that commands start quickly
     import pandas as pd

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from unjam.errors import InputError, shorten_list
+from unjam.errors import InputError
 from unjam.recordings.leaders import LeaderRecording
 from unjam.recordings.loaders import (
     ReadOptions,
@@ -20,6 +20,7 @@ from unjam.recordings.loaders import (
 )
 from unjam.recordings.tables import check_unique, read_table
 from unjam.sumo_files import file_stamp
+from unjam.text import shorten_list
 
 SPEED_COLUMN = re.compile("speed|(?:speed|velocity|vel|v)(?:ms|mps)|(?:speed|velocity|vel|v)?(kmh|kmph|kph|mph)")
 """columns of speeds in a table, in lower case without other signs, as `Speed [km/h]`; without a unit in m/s"""

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from unjam.errors import invalid_value, shorten_list
+from unjam.errors import invalid_value
 from unjam.physics.arrays import Floats
 from unjam.recordings.trajectories import even_times
+from unjam.text import shorten_list
 
 FILE_SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".xml", ".gz")
 WILDCARDS = {*"*?["}

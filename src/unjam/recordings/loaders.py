@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from unjam.errors import InputError, format_count, shorten_list, unknown_name
+from unjam.errors import InputError, unknown_name
 from unjam.physics.arrays import Floats
 from unjam.recordings.tables import check_unique, read_table
 from unjam.recordings.trajectories import FollowingTrajectory, even_times
+from unjam.text import format_count, shorten_list
 
 TABLE_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
 """required columns of a plain table; `pair` identifies follower and leader, the others are in s, m/s, m/s and m"""

@@ -13,9 +13,9 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
-from unjam.errors import one_line, printable
 from unjam.measures.statistics import Estimate
 from unjam.reports.results import PlotEpisode, seconds_by_part
+from unjam.text import one_line, printable
 
 SPEED_COLORMAP = "viridis"
 """slow is dark, fast is bright: readable with color blindness and in print"""

@@ -15,7 +15,6 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from unjam import __version__
-from unjam.errors import printable
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, check_parent_folder
 from unjam.measures.metric_table import metric_table
 from unjam.measures.statistics import metric_estimate
@@ -27,6 +26,7 @@ from unjam.reports.summary import ReportColumn
 from unjam.reports.video import split_lines
 from unjam.scenarios.road import format_drawn_values
 from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.text import printable
 from unjam.worlds.record import assign_columns
 
 MAX_PANELS = 6

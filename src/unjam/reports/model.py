@@ -9,10 +9,10 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from unjam.errors import format_count
 from unjam.reports.figures import LINE_COLORS, MUTED_COLOR, PLOT_STYLE, TEXT_COLOR, new_figure
 from unjam.reports.results import PlotEpisode, Results
 from unjam.reports.space_time import space_time_figure
+from unjam.text import format_count
 
 PREDICTED_QUANTITIES = {
     "speed": ("own speed", "m/s"),

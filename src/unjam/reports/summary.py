@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from unjam.errors import format_count, printable
 from unjam.measures.effect import LAG_METRIC, POWER_FUEL_METRIC
 from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, driver_rank, estimate_cell
 from unjam.measures.metrics import METRICS
@@ -15,6 +14,7 @@ from unjam.measures.notes import early_end_notes
 from unjam.measures.statistics import format_difference, gain_verdict, metric_estimate, pair_rows, paired_difference
 from unjam.measures.verdict import Verdict, is_better, road_metrics, verdicts
 from unjam.reports.results import PlotEpisode, Results
+from unjam.text import format_count, printable
 
 CLOSE_TIME_GAP = 1.0
 """time gap below which the report has a note [s]; the paper's h_max"""

@@ -17,13 +17,14 @@ from pydantic import model_validator
 
 from unjam.drivers.command import Limits
 from unjam.drivers.safety import Actuator
-from unjam.errors import InputError, format_count, shorten_list
+from unjam.errors import InputError
 from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
 from unjam.physics.arrays import Floats
 from unjam.physics.idm import IDMParameters, equilibrium_gap
 from unjam.recordings.leaders import LeaderRecording, recording_files
 from unjam.scenarios.road import Edge, Entry, Node, RecordedRoad, Road, RoadNetwork, Route
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Horizon, Scenario
+from unjam.text import format_count, shorten_list
 
 LEADER_ID = "leader"
 EDGE_NAME = "road"

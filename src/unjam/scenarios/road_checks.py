@@ -5,10 +5,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from unjam.errors import InputError, format_count, shorten_list
+from unjam.errors import InputError
 from unjam.physics.arrays import Floats
 from unjam.physics.kinematics import gap_on_loop
 from unjam.scenarios.road import BuiltRoad, ClosedRoad, Edge, Road
+from unjam.text import format_count, shorten_list
 
 ROUNDING = 1.0, 0.02
 """difference between two lengths that is rounding: [m], and relative to the length"""

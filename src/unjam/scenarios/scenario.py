@@ -16,7 +16,6 @@ from unjam.drivers.requirements import RoadInterface
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.drivers.user_driver import UserFunction
-from unjam.errors import format_count
 from unjam.parameters import (
     STRICT,
     NonNegative,
@@ -34,6 +33,7 @@ from unjam.physics.kinematics import next_speed
 from unjam.scenarios.population import Population, population_file, read_population
 from unjam.scenarios.road import Road
 from unjam.scenarios.road_checks import check_road
+from unjam.text import format_count
 
 UNLIMITED_ACCELERATION = 20.0
 """acceleration limit of a CAV's vehicle type in SUMO [m/s2]: far above any command, so that only safety clips"""

@@ -8,8 +8,9 @@ from typing import Any, Literal, NamedTuple
 
 from unjam import sandbox
 from unjam.child_processes import child_environment, python_command
-from unjam.errors import InputError, invalid_value, spelling_hint
+from unjam.errors import InputError, invalid_value
 from unjam.sumo_files.reader import ALLOWED_VARIABLES, UNKNOWN_VARIABLE, FileStamp, file_stamp
+from unjam.text import spelling_hint
 
 READER_PROGRAM = Path(__file__).with_name("reader_program.py")
 MAX_READER_MEMORY, MAX_READER_TIME = 4 * 2**30, 120  # maximum memory [bytes] and time [s] of the reader process

@@ -15,7 +15,7 @@ from typing import Any, cast
 from unjam.controller import DEFAULT_DRIVER, make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe
-from unjam.errors import InputError, NoCavError, format_count, format_duration, invalid_value
+from unjam.errors import InputError, NoCavError, invalid_value
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import HARD_BRAKING_METRIC
@@ -36,6 +36,7 @@ from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
 from unjam.seeds import held_out_seeds
+from unjam.text import format_count, format_duration
 from unjam.training.evaluate import Evaluation, evaluate_on_roads, raise_failure, save_evaluation
 from unjam.training.executors import MessageCallback
 from unjam.training.run_folder import make_new_folder

@@ -16,15 +16,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.samplers import TPESampler
 from optuna.trial import TrialState
 
-from unjam.errors import (
-    EpisodeError,
-    InputError,
-    LostWorkerError,
-    UnjamError,
-    invalid_value,
-    spelling_hint,
-    unknown_name,
-)
+from unjam.errors import EpisodeError, InputError, LostWorkerError, UnjamError, invalid_value, unknown_name
 from unjam.files import atomic_write, sha256_of_file, to_json
 from unjam.manifest import manifest
 from unjam.measures.detectors import Agreement, Measurement, aggregate_passages, compute_agreement, read_detectors
@@ -35,6 +27,7 @@ from unjam.scenarios.user_network import ROAD_CLASSES, UserNetwork, load_user_ne
 from unjam.seeds import held_out_seeds, tuning_seeds
 from unjam.sumo_files import SumoFiles, read_sumo_files
 from unjam.sumo_files.variants import write_variant
+from unjam.text import spelling_hint
 from unjam.training.assess import ZERO_PENETRATION_RATE
 from unjam.training.search_space import SearchSpace, boundary_values, float_range, parse_search_space
 from unjam.training.trial_log import TrialLog

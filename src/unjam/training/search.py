@@ -15,12 +15,13 @@ from optuna import Study, create_study
 from optuna.samplers import TPESampler
 from optuna.trial import TrialState, create_trial
 
-from unjam.errors import InputError, UnjamError, format_count, invalid_value
+from unjam.errors import InputError, UnjamError, invalid_value
 from unjam.files import atomic_write, to_json
 from unjam.learners.settings import unused_tables
 from unjam.manifest import manifest
 from unjam.parameters import merge_changes, nest_keys
 from unjam.reports.results import read_progress, validation_gains
+from unjam.text import format_count
 from unjam.training.config import CONFIG_FILE, RunConfig, load_config, to_toml
 from unjam.training.executors import CommandLine, Executor, MessageCallback, open_executor, training_command
 from unjam.training.run_folder import check_config

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from math import ceil, isfinite, log2
 from typing import Any, NamedTuple
 
-from unjam.errors import format_count, format_duration
 from unjam.measures.effect import FLOW_METRIC, TIME_METRIC, Effect, describe_harm, effect_of, is_too_small
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.recommendation import MIN_VERDICT_SEEDS, AccResult, ControllerResult, required_seeds
 from unjam.measures.statistics import CONFIDENCE, Estimate, format_percent, paired_difference
 from unjam.seeds import held_out_seeds, selection_seeds
+from unjam.text import format_count, format_duration
 from unjam.training.evaluate import raise_failure
 from unjam.training.executors import MessageCallback
 

@@ -15,7 +15,7 @@ from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.user_driver import is_file_reference
-from unjam.errors import InputError, invalid_value, one_line
+from unjam.errors import InputError, invalid_value
 from unjam.files import UNREADABLE_ERRORS, append_line, atomic_write, make_folder, to_json
 from unjam.kernels import needs_new_process
 from unjam.learners.agent import AgentSpec, check_network, check_state, learner_class, reporting_user_errors
@@ -37,6 +37,7 @@ from unjam.processes import lock_folder
 from unjam.reports.html import write_report_page
 from unjam.reports.results import read_progress
 from unjam.seeds import VALIDATION_SEED
+from unjam.text import one_line
 from unjam.training import run_folder
 from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
 from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert, raise_failure

@@ -17,9 +17,10 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.observation import NetworkInput, feature
 from unjam.drivers.requirements import Requirements
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, NoCavError, format_count
+from unjam.errors import InputError, NoCavError
 from unjam.parameters import check_integer
 from unjam.scenarios.scenario import Scenario
+from unjam.text import format_count
 from unjam.worlds.backend import BackendLike, WorldOptions, check_support, open_backend, open_world
 from unjam.worlds.drive import drive_world
 from unjam.worlds.record import Episode

@@ -138,10 +138,12 @@ class Trips:
         return self.duration + self.depart_delay
 
     @property
-    def delay_share_at_end(self) -> float:
-        """Delay of the vehicles that have not arrived, as a share of their travel time so far; 0 without such."""
-        spent = float(self.travel_time[~self.has_arrived].sum())
-        return float(self.delay[~self.has_arrived].sum()) / spent if spent else 0.0
+    def at_end(self) -> dict[str, float]:
+        """Number of vehicles that have not arrived, and share of delay in their travel time; empty without trips."""
+        unfinished = ~self.has_arrived
+        delay, spent = (float(each[unfinished].sum()) for each in (self.delay, self.travel_time))
+        values = {"unfinished_trips": int(unfinished.sum()), "delay_share_at_end": delay / spent if spent else 0.0}
+        return values if self.vehicle_ids else {}
 
     def mean_travel_time(self, group: str) -> float:
         """Return the mean travel time of a group of `VEHICLE_GROUPS` [s]; NaN if it has no vehicles."""

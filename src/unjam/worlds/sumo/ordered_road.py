@@ -14,13 +14,14 @@ from unjam.drivers.car_following import MIN_IDM_GAP
 from unjam.drivers.command import Command
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.safety import FollowingState
-from unjam.errors import EpisodeError, format_count
+from unjam.errors import EpisodeError
 from unjam.physics.arrays import Array, clamp_min
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import gap_on_loop, next_speed
 from unjam.scenarios.population import apply_population
 from unjam.scenarios.road import OrderedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
+from unjam.text import format_count
 from unjam.worlds import ordered_road
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.road_world import RoadScene

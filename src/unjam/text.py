@@ -1,0 +1,49 @@
+"""Text for users: counts, durations, lists of names, and texts of strangers without hidden characters."""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from unicodedata import category
+
+MAX_LISTED_NAMES = 20  # names that a message lists of a list from a file
+INVISIBLE_LETTERS = {
+    *"\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0",
+    *map(chr, (*range(0x180B, 0x1810), *range(0xFE00, 0xFE10), *range(0xE0100, 0xE01F0))),
+}
+"""letters and marks that are not shown, although Unicode does not count them as control characters"""
+
+
+def one_line(value: object, length: int = 200) -> str:
+    """Return a text of a stranger without control characters on one line, cut to `length` letters with `…`."""
+    text = printable(" ".join(str(value).split()))
+    return text if len(text) <= length else f"{text[: length - 1]}…"
+
+
+def printable(text: str) -> str:
+    """Return a text with `?` for characters that move the cursor, turn the direction of text or are invisible."""
+    letters = set(text) - {"\n"}
+    hidden = {each for each in letters if not each.isprintable() and category(each) != "Zs"}
+    hidden |= letters & INVISIBLE_LETTERS
+    return "".join("?" if letter in hidden else letter for letter in text) if hidden else text
+
+
+def format_count(count: float, noun: str, plural: str = "") -> str:
+    """Return a number with its noun: `1 file`, `2,000 files`; `plural` is for a noun with an irregular one."""
+    return f"{count:,.0f} {noun if count == 1 else plural or f'{noun}s'}"
+
+
+def format_duration(seconds: float) -> str:
+    """Return a duration for a line of progress."""
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
+def shorten_list(names: Iterable[str]) -> str:
+    """Return the names joined by commas, without those after the first `MAX_LISTED_NAMES`."""
+    known = list(names)
+    more = len(known) - MAX_LISTED_NAMES
+    return ", ".join(known[:MAX_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")
+
+
+def spelling_hint(value: object, names: Iterable[str], similarity: float = 0.6) -> str:
+    """Return `; did you mean 'ring'?`, or an empty text if no name is similar; a `similarity` of 1 is equality."""
+    close = get_close_matches(str(value), list(names), 1, similarity)
+    return f"; did you mean {close[0]!r}?" if close else ""
