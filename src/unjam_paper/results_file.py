@@ -2,7 +2,7 @@
 
 A part is measured once, and again if its arguments, or the controllers that they name, have changed. Tables of rows
 with the same keys are stored by columns, `{"columns": {NAME: [VALUES]}}`; what is the same in all rows is stored once,
-`{NAME: VALUE}`, and numbers have eight digits. Figures and controllers are separate files: NAME-FIGURE.png and
+`{NAME: VALUE}`, and numbers have seven digits. Figures and controllers are separate files: NAME-FIGURE.png and
 NAME-controllers.zip. Names in manifests are those of the commit that made the results (CONTRIBUTING.md).
 """
 
@@ -46,7 +46,7 @@ def write_results(path: Path, parts: Mapping[str, Any]) -> None:
     """Write a results file, one line for each part; NaN and infinities become null."""
     lines = list[str]()
     for name, part in parts.items():
-        rounded = json.loads(to_json(_by_columns(part)), parse_float=lambda text: float(f"{float(text):.8g}"))
+        rounded = json.loads(to_json(_by_columns(part)), parse_float=lambda text: float(f"{float(text):.7g}"))
         lines.append(f"{json.dumps(name)}: {json.dumps(rounded, separators=(',', ':'))}")
     atomic_write(path, "{\n" + ",\n".join(lines) + "\n}\n")
 
