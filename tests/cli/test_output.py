@@ -77,6 +77,26 @@ def test_without_a_terminal_output_has_80_columns_or_as_many_as_columns_says(
     assert found.stdout.split() == [str(width)] * 2
 
 
+def test_names_are_printed_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = StringIO()
+    monkeypatch.setattr(output.console, "file", text)
+    output.print_results({"human": rows_of(1.0), "a.py:car:zero: [b]x": rows_of(2.0)}, shows_all=False)
+    assert "a.py:car:zero: [b]x: " in text.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("label", "lines"),
+    [
+        ("my_driver.py:steady", ["my_driver.py:", "steady"]),
+        ("a_name_without_end.py:f", ["a_name_without_", "end.py:f"]),
+        ("unjam:ring-jammed-best", ["unjam:ring-", "jammed-best"]),
+        ("pi", ["pi"]),
+    ],
+)
+def test_headings_break_after_punctuation(label: str, lines: list[str]) -> None:
+    assert output.break_label(label, 15).splitlines() == lines
+
+
 def test_tables_cut_nothing_and_keep_names_whole() -> None:
     name, words = "a-run-with-a-long-name-001", "a-word-that-is-longer-than-its-column " * 3
     table = output.new_table(("run", "scenario", "state"), ("steps",))
@@ -158,7 +178,7 @@ def test_progress_names_the_road_with_the_smallest_difference(
         progress.show_iteration(
             {**row, "iteration": 11, "environment_steps": 30, "return_validation": None, "tasks": {}}
         )
-    text = "return 5, validation 6 (expert 4; smallest difference on eight: -3)"
+    text = "return 5, validation 6 at 10 (expert 4; smallest difference on eight: -3)"
     lines = [line.partition("steps, ")[2] for line in messages.getvalue().splitlines()]
     assert lines == [f"{text}, 0 s left", text]
     assert "30 of 30 steps" in messages.getvalue(), "the steps that will be trained, not those of the configuration"

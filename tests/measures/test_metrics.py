@@ -458,6 +458,13 @@ def test_vehicles_count_only_on_the_road() -> None:
     assert np.isnan(metric("cav_mean_speed", episode))
 
 
+def test_fuel_by_power_does_not_depend_on_when_a_vehicle_enters() -> None:
+    late = np.full((11, 2), 20.0)
+    late[:4, 1] = np.nan
+    steady, entering = (metric("fuel_by_power", open_episode(speeds)) for speeds in (np.full((11, 2), 20.0), late))
+    assert entering == pytest.approx(steady)
+
+
 def test_outflow_and_backlog_of_an_open_road() -> None:
     episode = open_episode(np.full((121, 3), 5.0), arrivals=7, backlog=np.arange(121.0))
     assert metric("outflow_veh_per_h", episode) == pytest.approx(7 * 30.0)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import (
@@ -355,6 +356,22 @@ def test_episodes_that_ended_early_are_not_averaged_with_complete_ones(status: s
     assert counts["return"] == counts["return_eq16"] == (2 if status == "collision" else 1)
     assert paired_difference(rows, others, "travel_time").count == 1
     assert paired_differences([rows], others, "mean_speed").shape == (1, 1)
+
+
+@given(values=arrays(float, (5, 2), elements=st.floats(1.0, 99.0)), early=arrays(bool, (5, 2)))
+def test_a_relative_difference_is_of_the_seeds_of_the_difference(values: Any, early: Any) -> None:
+    ours, others = (
+        [
+            {"seed": seed, "mean_speed": value, "status": "collision" if is_early else "completed"}
+            for seed, (value, is_early) in enumerate(zip(values[:, column], early[:, column], strict=True))
+        ]
+        for column in range(2)
+    )
+    difference, relative = (each(ours, others, "mean_speed") for each in (paired_difference, relative_difference))
+    complete = ~early.any(axis=1)
+    assert relative.count == difference.count == complete.sum()
+    if complete.any():
+        assert relative.mean == pytest.approx(difference.mean / values[complete, 1].mean())
 
 
 def test_a_relative_difference_is_that_of_the_means_and_unknown_relative_to_zero() -> None:

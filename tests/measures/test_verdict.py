@@ -37,7 +37,7 @@ def test_each_kind_of_road_has_its_metrics() -> None:
     [
         ({"mean_speed": 21.0}, "pi: feasible; mean speed better than that of human drivers, 4 paired seeds"),
         ({"mean_speed": 19.0}, "pi: feasible; mean speed worse than that of human drivers, 4 paired seeds"),
-        ({}, "pi: feasible; mean speed undecided compared with human drivers, 4 paired seeds"),
+        ({}, "pi: feasible; mean speed undecided compared with human drivers, 4 paired seeds; more may decide"),
         (
             {"mean_speed": 21.0, "outflow_veh_per_h": 1900.0},
             "pi: feasible; mean speed better than that of human drivers, but less flow, 4 paired seeds",

@@ -54,7 +54,18 @@ def test_finding_compares_with_the_expert() -> None:
     finding = main_finding(trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT))
     gain = format_difference(estimate([12.0, 8.0, 10.0, 10.0]))
     assert finding.startswith(f"Return difference to its expert, pi, on 4 test seeds: {gain}. ")
-    assert finding.endswith("The return increases in one training; a verdict on the residual needs 10 trainings.")
+    assert "The return increases in one training; a verdict on the residual needs 10 trainings. " in finding
+    assert finding.endswith("Difference of travel time to pi: +0.0 [+0.0, +0.0] s (no difference is shown).")
+
+
+def test_finding_says_which_network_was_kept() -> None:
+    result = trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT)
+    validations = {100: None, 200: 90.0, 300: 130.0, 400: 120.0}
+    result.progress.extend(
+        {"environment_steps": step, "return_validation": value, "return_expert": 100.0}
+        for step, value in validations.items()
+    )
+    assert "The network is that after 300 environment steps, the best in validation." in main_finding(result)
 
 
 def test_finding_compares_with_the_expert_of_highest_return() -> None:
@@ -71,9 +82,8 @@ def test_finding_reports_a_negative_gain() -> None:
 
 @pytest.mark.parametrize("trained", [[125.0, 125.0, 205.0, 110.0], [90.0, 150.0, 155.0, 125.0]])
 def test_finding_claims_no_gain_that_may_be_zero(trained: list[float]) -> None:
-    assert main_finding(trained_on_pi(trained, EXPERT)).endswith(
-        "No gain is shown: the confidence interval contains zero."
-    )
+    finding = main_finding(trained_on_pi(trained, EXPERT))
+    assert "No gain is shown: the confidence interval contains zero." in finding
 
 
 def test_finding_says_that_the_controller_is_its_expert() -> None:
@@ -107,7 +117,7 @@ def test_roads_of_one_training_are_compared_without_a_warning(tmp_path: Path) ->
 def test_finding_on_one_seed_has_no_interval() -> None:
     result = trained_on_pi([150.0], [100.0])
     finding = main_finding(result)
-    assert finding.endswith("+50. No conclusion: there is no confidence interval.")
+    assert "+50. No conclusion: there is no confidence interval." in finding
     assert "verdict" not in finding
     assert "contains zero" not in finding
     assert not any("nan" in text for text in (finding, *(card["detail"] for card in key_figures(result))))

@@ -1,5 +1,6 @@
 import re
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,24 @@ def test_step_and_horizon_are_those_of_the_configuration_unless_set(
 ) -> None:
     found = own(tmp_path, TIMES, penetration_rate=0.1, **changes)
     assert (found.simulation_step, found.horizon) == (step, horizon)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, ""),
+        ({"begin": 50.0}, " --begin 50"),
+        ({"end": 70.0}, " --end 70"),
+        ({"horizon": 99}, " --end 50"),
+        ({"begin": 40.0, "end": 60.0}, " --begin 40 --end 60"),
+    ],
+)
+def test_the_command_for_plain_sumo_has_changed_times_and_no_calibrated_drivers(
+    changes: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    road = own(tmp_path, TIMES, penetration_rate=0.1, **changes)
+    assert road.plain_sumo_command(7) == f"sumo -c {road.file} --seed 7{words}"
+    assert replace(road, population="unjam:ngsim").plain_sumo_command(7) == ""
 
 
 @pytest.mark.long

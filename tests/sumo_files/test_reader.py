@@ -12,7 +12,7 @@ import pytest
 
 from tests.sumo_files.test_sumo_files import NETWORK, ROUTES, configuration
 from unjam import sandbox, sumo_files
-from unjam.errors import InputError
+from unjam.errors import DiskError, InputError
 from unjam.sumo_files import read_lanes, read_sumo_files, write_harmless_copy
 from unjam.sumo_files import reader_program as reader
 from unjam.sumo_files.variants import write_variant
@@ -179,6 +179,26 @@ def test_elements_for_vehicle_types_apply_to_their_cavs(tmp_path: Path) -> None:
     write_harmless_copy(tmp_path / "road.rou.xml", tmp_path / "copy.xml")
     lists = [each.get("vTypes") for each in ElementTree.parse(tmp_path / "copy.xml").iter() if each.get("vTypes")]
     assert lists == ["car bus cav_of_car cav_of_bus", "car"]
+
+
+def test_a_full_disk_is_named_as_such(tmp_path: Path) -> None:
+    routes = f'<routes><vType id="car" color="{"1" * 99_999}"/><vehicle id="v"/></routes>'
+    path = configuration(tmp_path, routes=routes)
+    assert path.is_file()
+    with pytest.raises(DiskError, match="cannot write /dev/full: No space left"):
+        write_harmless_copy(tmp_path / "road.rou.xml", Path("/dev/full"))
+
+
+def test_lists_of_types_have_the_types_of_calibrated_drivers_too(tmp_path: Path) -> None:
+    light = '<tlLogic id="t" type="actuated"><param key="vTypes" value="car"/><param key="show" value="car"/></tlLogic>'
+    path = configuration(tmp_path, routes=f'<routes>{light}<e1Detector vTypes="car"/><vehicle id="v"/></routes>')
+    assert list(read_sumo_files(path).copy_sources) == [tmp_path / "road.rou.xml"]
+    write_harmless_copy(tmp_path / "road.rou.xml", tmp_path / "copy.xml", driver_count=2)
+    elements = ElementTree.parse(tmp_path / "copy.xml")
+    drivers = ["car_of_driver_0", "car_of_driver_1"]
+    names = " ".join(["car", *drivers, "cav_of_car", *(f"cav_of_{each}" for each in drivers)])
+    assert [each.get("value") for each in elements.iter("param")] == [names, "car"]
+    assert [each.get("vTypes") for each in elements.iter("e1Detector")] == [names]
 
 
 @pytest.mark.parametrize(

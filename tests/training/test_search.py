@@ -25,7 +25,7 @@ from unjam.training.search import (
     validation_gain,
 )
 from unjam.training.search_space import parse_search_space
-from unjam.training.trial_log import TRIALS_FILE, TrialLog
+from unjam.training.trial_log import REQUEST_FILE, TRIALS_FILE, TrialLog
 
 BASE = small_config(evaluation__validation_interval=1)
 SPACE = parse_search_space(["trpo.target_kl=0.001..0.1:log", "trpo.critic_batch_size=8,16", "trpo.critic_epochs=1..9"])
@@ -208,10 +208,10 @@ def test_search_resumes_only_with_the_same_settings(tmp_path: Path, trainings: T
 @pytest.mark.parametrize(
     "row",
     [
-        {"values": {"expert": "code.py:of_others"}},
-        {"values": {}},
-        {"values": {"expert": "pi", "reward": "code.py:of_others"}},
-        {"values": ["expert"]},
+        {"proposal": 1, "values": {"expert": "code.py:of_others"}},
+        {"proposal": 1, "values": {}},
+        {"proposal": 1, "values": {"expert": "pi", "reward": "code.py:of_others"}},
+        {"proposal": 1, "values": ["expert"]},
         {"trial": []},
     ],
 )
@@ -223,6 +223,32 @@ def test_stored_trials_outside_the_space_are_refused(row: dict[str, Any], tmp_pa
     with pytest.raises(InputError, match=r"^out: trials\.jsonl has a trial outside the search space"):
         search(BASE, space, 3, tmp_path, 1)
     assert len(trainings.done) == 1
+
+
+def test_a_log_without_one_of_its_trials_is_refused(tmp_path: Path, trainings: Trainings) -> None:
+    search(BASE, SPACE, 2, tmp_path, 1)
+    rows = (tmp_path / TRIALS_FILE).read_text().splitlines(keepends=True)
+    (tmp_path / TRIALS_FILE).write_text("".join(row for row in rows if '"proposal": 0' not in row))
+    with pytest.raises(InputError, match=r"^out: trials\.jsonl lacks a trial"):
+        search(BASE, SPACE, 3, tmp_path, 1)
+
+
+@pytest.mark.parametrize("starts", [None, 5, "abc", [1]])
+def test_a_damaged_request_is_refused(starts: Any, tmp_path: Path) -> None:
+    TrialLog(tmp_path, {"seed": 1})
+    stored = json.loads((tmp_path / REQUEST_FILE).read_text())
+    (tmp_path / REQUEST_FILE).write_text(to_json({**stored, "starts": starts}))
+    with pytest.raises(InputError, match=r"^out: request\.json in .* is damaged; allowed: a new folder"):
+        TrialLog(tmp_path, {"seed": 1})
+
+
+@pytest.mark.parametrize(("score", "verdict"), [("abc", ""), ([1], ""), (1e999, ""), (True, ""), (1.0, 5)])
+def test_damaged_verdicts_are_measured_again(score: Any, verdict: Any, tmp_path: Path) -> None:
+    TrialLog(tmp_path, {}).add(0, "pi", (2.0, "feasible"))
+    row = {"first_seed": 0, "driver": "acc", "score": score, "verdict": verdict}
+    with (tmp_path / TRIALS_FILE).open("a") as file:
+        file.write(f"{json.dumps(row)}\n")
+    assert TrialLog(tmp_path, {}).verdicts == {(0, "pi"): (2.0, "feasible")}
 
 
 def test_folder_with_other_files_is_not_changed(tmp_path: Path) -> None:

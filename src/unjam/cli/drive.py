@@ -20,7 +20,7 @@ from unjam.measures.notes import episode_notes
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.scenarios.user_network import ACC_SETTINGS
+from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
 from unjam.text import format_duration
 from unjam.training.evaluate import drive, raise_failure, raise_failures
 from unjam.training.run_folder import lock_new_folder
@@ -95,9 +95,8 @@ def drive_command(
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
         output.print_results(result.rows, show_all, result.baseline)
         output.print_notes(result.notes)
-        if scenario.endswith(".sumocfg"):
-            first = next(iter(result.rows.values()))[0]
-            command = f"sumo -c {scenario} --seed {first['sumo_seed']}"
+        first = next(iter(result.rows.values()))[0]
+        if isinstance(road, UserNetwork) and (command := road.plain_sumo_command(first["sumo_seed"])):
             output.print_notes([f"plain SUMO has the traffic of seed {first['seed']} without CAVs: {command}"])
         if result.report is not None:
             err_console.print(f"report: {result.report}")

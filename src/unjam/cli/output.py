@@ -1,6 +1,7 @@
 """Output of the command line: tables, one JSON document, progress on standard error, and suggested next commands."""
 
 import json
+import re
 import shlex
 import sys
 import time
@@ -54,8 +55,8 @@ def _width(stream: TextIO) -> int | None:
     return None if stream.isatty() else get_terminal_size().columns
 
 
-console = TerminalConsole(highlight=False, markup=False, width=_width(sys.stdout))
-err_console = TerminalConsole(stderr=True, highlight=False, markup=False, width=_width(sys.stderr))
+console = TerminalConsole(highlight=False, markup=False, emoji=False, width=_width(sys.stdout))
+err_console = TerminalConsole(stderr=True, highlight=False, markup=False, emoji=False, width=_width(sys.stderr))
 """progress and messages; standard output is for results"""
 
 
@@ -111,7 +112,7 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
 
     def build_table(columns: Sequence[int], separator: str) -> Table:
         table = new_table(
-            ("metric", "unit"), [fill(headings[number], TEXT_COLUMN_WIDTHS[separator]) for number in columns]
+            ("metric", "unit"), [break_label(headings[number], TEXT_COLUMN_WIDTHS[separator]) for number in columns]
         )
         for column in table.columns[2:]:
             column.no_wrap = True
@@ -136,6 +137,14 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
             blocks[-1] = block
     for block in blocks:
         console.print(build_table(block, separator))
+
+
+def break_label(label: str, width: int) -> str:
+    """Return the name of a driver in lines of at most `width` characters, broken after punctuation where possible."""
+    lines = [""]
+    for part in re.split(r"(?<=[\s:,=/_-])", label):
+        lines[-1:] = [lines[-1] + part] if len(lines[-1] + part) <= width else [lines[-1], part]
+    return "\n".join(filter(None, lines))
 
 
 def print_options(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -37,7 +37,12 @@ def evaluate_command(
             show_default="human and every formula of the package",
         ),
     ] = None,
-    episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Test episodes per driver.")] = 20,
+    episodes: Annotated[
+        int | None,
+        Option(
+            "--episodes", "-n", min=1, help="Test episodes per driver.", show_default="as in the run's configuration"
+        ),
+    ] = None,
     humans: opt.HumansOption = None,
     out: Annotated[
         Path | None,
@@ -62,6 +67,7 @@ def evaluate_command(
     """
     config = read_config(run)
     check_run_files(run, config, "evaluate")
+    episodes = episodes or config.evaluation.episodes
     if driver or humans is not None or episodes < config.evaluation.episodes:
         out = opt.new_folder(out, f"evaluate-{run.resolve().name}")
     evaluation = replace(config.evaluation, baselines=tuple(driver or DRIVERS), episodes=episodes)
@@ -92,7 +98,7 @@ def evaluate_command(
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in evaluation.rows.items()]
         print_json({**facts, "drivers": drivers, "notes": results.metadata["notes"]})
         return
-    console.print(main_finding(results), soft_wrap=True)
+    output.print_wrapped(main_finding(results))
     output.print_results(evaluation.rows, show_all)
     output.print_notes(results.metadata["notes"])
     err_console.print(f"report: {page}")
@@ -223,7 +229,8 @@ def list_runs_command(
         for number, (road, config) in enumerate(run.config.task_configs().items()):
             cells = ("", "", "") if number else (run.config.preset or "–", run.state, steps)
             name = f"  {road}" if number else run.name
-            table.add_row(name, Path(config.scenario).name, *cells, _gain_text(run.gains[road]))
+            reward = f", reward {config.reward}" if config.reward else ""
+            table.add_row(name, f"{Path(config.scenario).name}{reward}", *cells, _gain_text(run.gains[road]))
     console.print(table)
 
 

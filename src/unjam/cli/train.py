@@ -103,7 +103,7 @@ def train_command(
         if name:
             console.print(f"{name}:")
         results = read_results(road.folder)
-        console.print(main_finding(results), soft_wrap=True)
+        output.print_wrapped(main_finding(results))
         output.print_results(road.rows, show_all)
         output.print_notes(results.metadata["notes"])
         err_console.print(f"controller: {road.controller}")
@@ -137,7 +137,7 @@ class _TrainingProgress(output.ProgressReporter):
     def show_iteration(self, row: dict[str, Any]) -> None:
         """Show the progress row of an iteration."""
         if row["return_validation"] is not None:
-            self._validation_text = f"{row['return_validation']:.0f}"
+            self._validation_text = f"{row['return_validation']:.0f} at {row['environment_steps']:,}"
             self._worst_road = _worst_road_text(row.get("tasks", {}))
         expert = f"expert {row['return_expert']:.0f}"
         text = f"return {row['return_mean']:.0f}, validation {self._validation_text} ({expert}{self._worst_road})"
@@ -178,7 +178,9 @@ def _plan_text(config: "RunConfig") -> str:
     tasks = config.task_configs().values()
     roads = f"{len(tasks)} roads" if len(tasks) > 1 else Path(config.scenario).name
     policy = f"{config.agent} without an expert" if config.expert == "none" else f"{config.agent} on {config.expert}"
-    return f"{policy}: {roads}, {config.steps:,} environment steps"
+    ratio = config.model.model_ratio
+    model = f"{ratio:g} steps of the learned model for each" if ratio else "without a learned model"
+    return f"{policy}: {roads}, {config.steps:,} environment steps, {model}"
 
 
 def _worst_road_text(roads: dict[str, dict[str, Any]]) -> str:

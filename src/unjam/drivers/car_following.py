@@ -247,7 +247,7 @@ class FollowerStopper(FormulaDriver):
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class Constant(FormulaDriver):
-    """Commands the same acceleration in every step; only SUMO's own safety check prevents a collision."""
+    """Commands the same acceleration in every step; only the safety filter prevents a collision, or without it SUMO."""
 
     name: ClassVar[str] = "constant"
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from unjam.measures.averages import mean_over_cavs, per_kilometer, row_chunks
+from unjam.measures.averages import mean_over_cavs, row_chunks
 from unjam.physics.fuel import fuel_rate
 from unjam.worlds.record import Episode, Floats
 
@@ -33,13 +33,15 @@ def human_fuel_by_power(episode: Episode) -> float:
 
 
 def _fuel_by_power(episode: Episode, columns: Any) -> float:
-    """Return the fuel of the vehicles in some columns; acceleration is the change of speed in a control step."""
-    speeds = episode.speeds[:, columns]
-    fuel = sum(
-        float(np.nansum(fuel_rate(after, (after - before) / episode.control_step)))
-        for before, after in zip(row_chunks(speeds[:-1]), row_chunks(speeds[1:]), strict=True)
-    )
-    return per_kilometer(episode, fuel, speeds)
+    """Return the fuel of the vehicles in some columns; acceleration is the change of speed in a control step.
+
+    The step in which a vehicle enters has no acceleration, so that neither its fuel nor its distance counts.
+    """
+    speeds, fuel, distance = episode.speeds[:, columns], 0.0, 0.0
+    for before, after in zip(row_chunks(speeds[:-1]), row_chunks(speeds[1:]), strict=True):
+        fuel += float(np.nansum(fuel_rate(after, (after - before) / episode.control_step)))
+        distance += float(np.nansum(np.where(np.isnan(before), np.nan, after)))
+    return fuel / (distance / 1000.0) if distance else nan
 
 
 def cav_mean_gap(episode: Episode) -> float:

@@ -142,9 +142,10 @@ def linearized_ratio(numerators: Any, denominators: Any) -> Any:
 def relative_difference(rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]], name: str) -> Estimate:
     """Return the estimate of the paired difference of a metric, relative to its mean in the other rows.
 
-    Only seeds with both values are used. It is unknown where all other values are zero.
+    Only seeds with both values are used, as for the difference itself. It is unknown where all other values are zero.
     """
-    values = np.array([(row[name], other[name]) for row, other in pair_rows(rows, others)], float).reshape(-1, 2)
+    pairs = [[metric_value(row, name) for row in pair] for pair in pair_rows(rows, others)]
+    values = np.array(pairs, float).reshape(-1, 2)
     values = values[np.isfinite(values).all(1)]
     if not values[:, 1].any():
         return estimate([])

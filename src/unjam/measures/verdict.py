@@ -19,6 +19,10 @@ Rows = Sequence[dict[str, Any]]
 """a row of metrics for each episode"""
 HIGHER_IS_BETTER = {"mean_speed", "mean_speed_steady", "outflow_veh_per_h", "min_ttc"}
 """metrics that are compared with the baseline, of which lower values are worse; of the others they are better"""
+MAX_RELATIVE_CHANGE = 10.0
+"""change from which it is not shown as a share of the baseline, which is nearly zero then"""
+FEW_SEEDS = 10
+"""number of seeds from which a verdict rarely changes with more of them"""
 NEITHER_IS_BETTER = {"cav_mean_gap"}
 """metrics of which neither direction is better: a larger gap can dissolve a wave, and lets vehicles cut in"""
 
@@ -153,7 +157,8 @@ def _comparison(
     first = next(iter(differences))
     label, seeds = METRICS[first].label.partition(",")[0], format_count(pairs, "paired seed")
     if changes[first] is None:
-        reason = "" if isfinite(differences[first].low) else ", which are too few"
+        too_few = "; more may decide" if isfinite(differences[first].low) else ", which are too few"
+        reason = too_few if pairs < FEW_SEEDS else ""
         return f"{label} undecided compared with {name_of_others}, {seeds}{reason}"
     if not changes[first]:
         return f"{label} worse than that of {name_of_others}, {seeds}"
@@ -163,7 +168,7 @@ def _comparison(
 
 def _difference_text(name: str, difference: Estimate, relative: float) -> str:
     metric = METRICS[name]
-    share = f" ({100 * relative:+.1f} %)" if isfinite(relative) and difference.mean else ""
+    share = f" ({100 * relative:+.1f} %)" if abs(relative) < MAX_RELATIVE_CHANGE and difference.mean else ""
     return f"{estimate_cell(difference, metric.digits, sign='+')} {metric.unit}".strip() + share
 
 

@@ -11,9 +11,16 @@ from unjam.measures.effect import LAG_METRIC, POWER_FUEL_METRIC
 from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, driver_rank, estimate_cell
 from unjam.measures.metrics import METRICS
 from unjam.measures.notes import early_end_notes
-from unjam.measures.statistics import format_difference, gain_verdict, metric_estimate, pair_rows, paired_difference
-from unjam.measures.verdict import Verdict, is_better, road_metrics, verdicts
-from unjam.reports.results import PlotEpisode, Results
+from unjam.measures.statistics import (
+    format_difference,
+    gain_verdict,
+    is_expert_unchanged,
+    metric_estimate,
+    pair_rows,
+    paired_difference,
+)
+from unjam.measures.verdict import Rows, Verdict, is_better, road_metrics, verdicts
+from unjam.reports.results import PlotEpisode, Results, best_step
 from unjam.text import format_count, printable
 
 CLOSE_TIME_GAP = 1.0
@@ -139,12 +146,24 @@ def main_finding(result: Results) -> str:
             f"Return difference to its expert, {expert}, on {format_count(gain.count, 'test seed')}: "
             f"{format_difference(gain)}. {gain_verdict(gain)}"
         )
+        if step := best_step(result.progress):
+            sentences.append(f"The network is that after {step:,} environment steps, the best in validation.")
+        if not is_expert_unchanged(gain):
+            sentences.append(_traffic_finding(rows, experts[expert], expert, road_metrics(result.rows).compared[0]))
     if best != expert:
         gain = paired_difference(rows, experts[best], "return")
         sentences.append(f"Return difference to {best}, the expert with the highest return: {format_difference(gain)}.")
     mean = metric_estimate(rows, "return").mean
     seeds = format_count(len(rows), "test seed")
     return " ".join(sentences) or f"On {seeds} the mean return of the trained controller is {mean:.0f}."
+
+
+def _traffic_finding(rows: Rows, expert_rows: Rows, expert: str, name: str) -> str:
+    """Return whether the metric that decides on this road is better than that of the expert, as a sentence."""
+    metric, change = METRICS[name], paired_difference(rows, expert_rows, name)
+    finding = {None: "no difference is shown", True: "better", False: "worse"}[is_better(name, change)]
+    number = f"{format_difference(change, metric.digits)} {metric.unit}".strip()
+    return f"Difference of {metric.label.partition(',')[0]} to {expert}: {number} ({finding})."
 
 
 def _drive_finding(result: Results) -> str:

@@ -2,6 +2,7 @@
 
 import logging
 import re
+import shlex
 from collections.abc import Collection, Sequence
 from dataclasses import field, replace
 from functools import cache
@@ -209,6 +210,16 @@ class UserNetwork(Scenario):
                 f"the types {_format_types(files, others)} (see --cav-classes)"
             )
         return notes
+
+    def plain_sumo_command(self, seed: int) -> str:
+        """Return the command by which plain SUMO has the same traffic without CAVs; empty with calibrated drivers."""
+        if self.driver_population:
+            return ""
+        files, words = read_sumo_files(Path(self.file)), ["sumo", "-c", self.file, "--seed", str(seed)]
+        begin, end = self._begin(files), self._end(self._begin(files))
+        words += ["--begin", f"{begin:g}"] if self.begin is not None else []
+        words += ["--end", f"{end:g}"] if files.end is None or abs(end - files.end) > self.simulation_step else []
+        return shlex.join(words)
 
     def possible_cav_ids(self) -> tuple[str, ...]:
         """Return names for the maximum number of CAVs: only SUMO knows the ids. Raise `InputError` if there is none."""

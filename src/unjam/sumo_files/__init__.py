@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from unjam import sandbox
 from unjam.child_processes import child_environment, python_command
-from unjam.errors import InputError, invalid_value
+from unjam.errors import InputError, disk_error, invalid_value
 from unjam.sumo_files.reader import ALLOWED_VARIABLES, UNKNOWN_VARIABLE, FileStamp, file_stamp
 from unjam.text import spelling_hint
 
@@ -159,16 +159,22 @@ def read_lanes(path: Path) -> list[LaneShape]:
     return [(edge, *numbers, [(x, y) for x, y in line]) for edge, *numbers, line in _run_reader("lanes", path)]
 
 
-def write_harmless_copy(path: Path, copy: Path, types: Path | None = None) -> None:
-    """Write a copy of a SUMO file without harmful elements, with new attributes of vehicle types from a JSON file."""
-    _run_reader("copy", path, copy, *([types] if types else []))
+def write_harmless_copy(path: Path, copy: Path, driver_count: int = 0, types: Path | None = None) -> None:
+    """Write a copy of a SUMO file without harmful elements, with new attributes of vehicle types from a JSON file.
+
+    Lists of vehicle types also name those of CAVs, and of cars with one of `driver_count` calibrated drivers. Raise
+    `InputError` if the file is broken or too large, `DiskError` if the copy cannot be written.
+    """
+    _run_reader("copy", path, copy, str(driver_count), *([str(types)] if types else []))
 
 
-def _run_reader(command: Literal["configuration", "lanes", "copy"], path: Path, *extra_paths: Path) -> Any:
+def _run_reader(
+    command: Literal["configuration", "lanes", "copy"], path: Path, copy: Path | None = None, *options: str
+) -> Any:
     """Return the answer of the reader process; raise `InputError` if it reports an error, or is lost."""
-    limits = [str(MAX_READER_MEMORY), str(MAX_READER_TIME), str(extra_paths[0].parent) if extra_paths else ""]
+    limits = [str(MAX_READER_MEMORY), str(MAX_READER_TIME), str(copy.parent) if copy else ""]
     program = python_command("-I", "-S", sandbox.__file__, *limits, str(READER_PROGRAM), command)
-    arguments = [*program, str(path), *map(str, extra_paths)]
+    arguments = [*program, str(path), *([str(copy)] if copy else []), *options]
     try:
         process = subprocess.run(arguments, capture_output=True, timeout=MAX_READER_TIME, env=child_environment())
         answer = json.loads(process.stdout)
@@ -177,6 +183,8 @@ def _run_reader(command: Literal["configuration", "lanes", "copy"], path: Path, 
         raise InputError(f"{path.name}: its files cannot be read within {limit}") from None
     if "error" in answer:
         raise InputError(answer["error"])
+    if "disk_error" in answer:
+        raise disk_error(OSError(*answer["disk_error"]), copy)
     return answer["result"]
 
 

@@ -48,8 +48,10 @@ ALLOWED_VARIABLES = ", ".join(f"${{{name}}}" for name in SUBSTITUTED_VARIABLES)
 UNKNOWN_VARIABLE = re.compile(r"\$\{.*?\}")  # a variable that is left after the substitution
 LANE_NAME = re.compile(r"_\d+$")  # end of the id of a lane, and of keys of detectors of traffic lights
 CAV_TYPE_TEMPLATE = "cav_of_{}"  # id of the vehicle type of CAVs that replace vehicles of another type
+CALIBRATED_TYPE_TEMPLATE = "{}_of_driver_{}"  # id of the type of cars of a type with the calibrated driver of a number
 TYPE_LIST, TYPE_LIST_DEFINITIONS = "vTypes", ("vTypeDistribution", "personTrip")
-"""attribute by which rerouters, calibrators and detectors select vehicles, and elements in which it creates vehicles"""
+"""attribute, or parameter of a traffic signal, by which rerouters, calibrators and detectors select vehicles, and
+elements in which it creates vehicles"""
 TYPE_ELEMENTS = "vType", "vTypeDistribution"
 CHECKED_ELEMENTS = {*OUTPUT_ELEMENTS, *TYPE_ELEMENTS, "include", "param"}  # whatever attributes they have
 PLAIN_ENCODINGS = (None, "utf-8", "us-ascii", "ascii", "iso-8859-1")  # SUMO's parser finds the same elements
@@ -80,13 +82,18 @@ def file_stamp(file: Path) -> FileStamp:
 class XmlReader:
     """Reads an XML file of SUMO and the files that it includes in one pass, and writes its harmless parts to `out`.
 
-    Vehicle types get the attributes that `type_changes` has for their ids.
+    Vehicle types get the attributes that `type_changes` has for their ids. Lists of types also name those of their CAVs
+    and of cars with one of `driver_count` calibrated drivers.
     """
 
     def __init__(
-        self, handlers: XmlHandlers, out: IO[str] | None = None, type_changes: dict[str, XmlAttributes] | None = None
+        self,
+        handlers: XmlHandlers,
+        out: IO[str] | None = None,
+        type_changes: dict[str, XmlAttributes] | None = None,
+        driver_count: int = 0,
     ) -> None:
-        self._handlers, self._type_changes = handlers, type_changes or {}
+        self._handlers, self._type_changes, self._driver_count = handlers, type_changes or {}, driver_count
         self._write = out.write if out else None
         self._dropped_depth = 0  # depth of open elements within a dropped one, itself included
         self._open_type = ""  # the outermost open type or distribution of types; empty: none
@@ -239,12 +246,12 @@ class XmlReader:
             file = self._open_files[-1].name
             raise BrokenFileError(f"{file}: emissionClass: {emission_class!r} is not allowed; allowed: {allowed}")
         harmless = dict(attributes)
+        if tag == "param" and attributes.get("key") == TYPE_LIST:
+            harmless["value"] = self._extend_types(attributes.get("value", ""))
         for name in attributes:
             if name == TYPE_LIST:
-                if tag not in TYPE_LIST_DEFINITIONS:  # a CAV counts as the vehicle that it replaces
-                    types = attributes[name].split()
-                    harmless[name] = " ".join([*types, *map(CAV_TYPE_TEMPLATE.format, types)])
-                    self.needs_copy = True
+                if tag not in TYPE_LIST_DEFINITIONS:
+                    harmless[name] = self._extend_types(attributes[name])
             elif is_harmless_attribute(name):
                 self._harmless_names.add(name)
             elif name == "file" and tag.endswith(DETECTOR_SUFFIXES):
@@ -256,6 +263,13 @@ class XmlReader:
                 if name != "file" or tag not in EXTERNAL_ELEMENTS:
                     self._record_dropped(f"{name} of {tag}")
         return harmless
+
+    def _extend_types(self, text: str) -> str:
+        """Return a list of types with those derived from them: a CAV counts as the vehicle that it replaces."""
+        self.needs_copy, types = True, text.split()
+        numbers = range(self._driver_count)
+        types += [CALIBRATED_TYPE_TEMPLATE.format(name, number) for name in types for number in numbers]
+        return " ".join([*types, *map(CAV_TYPE_TEMPLATE.format, types)])
 
     def _record_dropped(self, name: str) -> None:
         self.dropped_items.add(name)

@@ -271,20 +271,22 @@ class _Demand:
         return used
 
 
-def _write_copy(path: Path, copy: Path, types: Path | None = None) -> None:
-    changes = json.loads(types.read_bytes()) if types else {}
+def _write_copy(path: Path, copy: str, driver_count: str, types: str = "") -> None:
+    changes = json.loads(Path(types).read_bytes()) if types else {}
     with open(copy, "w", encoding="utf-8") as out:
-        XmlReader({}, out, changes).read(path)
+        XmlReader({}, out, changes, int(driver_count)).read(path)
 
 
-def _main(command: str, *paths: str) -> None:
+def _main(command: str, path: str, *arguments: str) -> None:
     commands = {"configuration": _read_configuration, "lanes": _read_lanes, "copy": _write_copy}
     try:
-        answer = {"result": commands[command](*map(Path, paths))}
+        answer = {"result": commands[command](Path(path), *arguments)}
     except BrokenFileError as error:
         answer = {"error": str(error)}
+    except OSError as error:  # of the copy: errors of the files that are read have other classes here
+        answer = {"disk_error": [error.errno, error.strerror]}
     except (MemoryError, RecursionError):
-        answer = {"error": f"{Path(paths[0]).name}: its files are too large to be read"}
+        answer = {"error": f"{Path(path).name}: its files are too large to be read"}
     sys.stdout.write(json.dumps(answer))
 
 

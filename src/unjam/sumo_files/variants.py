@@ -37,7 +37,7 @@ def write_variant(files: SumoFiles, types: TypeChanges, scale: float, path: Path
         for option, kind, paths in zip(names, ("add", "rou", "weights"), originals, strict=True):
             for number, original in enumerate(paths):
                 names[option].append(f"{number}.{kind}.xml")
-                write_harmless_copy(original, copy, changes)
+                write_harmless_copy(original, copy, types=changes)
                 atomic_write(folder / names[option][-1], copy.read_bytes())
     values = {
         "net-file": os.path.relpath(files.network.resolve(), folder.resolve()),

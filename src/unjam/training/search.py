@@ -135,6 +135,8 @@ def _restore_study(log: TrialLog, space: SearchSpace) -> Study:
     """Return the study with the trials of earlier calls; some may have been interrupted."""
     proposals = [row["values"] for row in log.rows if "values" in row]
     study = create_study(direction="maximize")
+    if [row.get("proposal") for row in log.rows if "values" in row] != [*range(len(proposals))]:
+        raise InputError(f"out: {TRIALS_FILE} lacks a trial; allowed: a new folder")
     try:
         objectives = {row["trial"]: row["objective"] for row in log.rows if "trial" in row}
         for number, values in enumerate(proposals):
@@ -156,7 +158,7 @@ def _propose_trials(
     for number in range(len(stored), trials):
         study.sampler = TPESampler(seed=seed + 1_000_003 * number)  # an interrupted search proposes the same trials
         values = study.ask(dict(space)).params
-        log.append({"values": values})
+        log.append({"proposal": number, "values": values})
         yield number, values
 
 

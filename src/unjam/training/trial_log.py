@@ -3,6 +3,7 @@
 import json
 from contextlib import suppress
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,9 @@ class TrialLog:
                 stored = json.loads(path.read_text(encoding="utf-8"))
             if not isinstance(stored, dict) or stored.get("request") != request:
                 raise InputError(f"out: {str(folder)!r} was made with other settings; allowed: a new folder")
-            starts = stored.get("starts", [])
+            starts = stored.get("starts")
+            if not isinstance(starts, list) or not all(isinstance(each, dict) for each in starts):
+                raise InputError(f"out: {REQUEST_FILE} in {str(folder)!r} is damaged; allowed: a new folder")
         else:
             make_new_folder(folder, ", or that of the same request")
         current = manifest()
@@ -52,7 +55,10 @@ class TrialLog:
         self.rows = read_json_lines(self._path)
         for row in self.rows:
             with suppress(KeyError, TypeError):
-                self.verdicts[row["first_seed"], row["driver"]] = row["score"], row["verdict"]
+                score, verdict = row["score"], row["verdict"]
+                is_number = isinstance(score, int | float) and not isinstance(score, bool) and isfinite(score)
+                if (score is None or is_number) and isinstance(verdict, str):
+                    self.verdicts[row["first_seed"], row["driver"]] = score, verdict
         if self._path.is_file():  # this removes an incomplete last row
             atomic_write(self._path, "".join(f"{to_json(row)}\n" for row in self.rows))
 

@@ -10,14 +10,17 @@ from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.scenarios.road import BuiltRoad, UserNetworkRoad
 from unjam.scenarios.scenario import MIN_CAV_GAP, SUMO_ACCELERATION, UNLIMITED_ACCELERATION, VEHICLE_LENGTH, Scenario
 from unjam.scenarios.user_network import PASSENGER_CLASS
-from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE, is_harmless_attribute, is_harmless_parameter
+from unjam.sumo_files.reader import (
+    CALIBRATED_TYPE_TEMPLATE,
+    CAV_TYPE_TEMPLATE,
+    is_harmless_attribute,
+    is_harmless_parameter,
+)
 from unjam.worlds.sumo.networks import XMLAttributes, network_file, xml_element
 
 SUMO_CAV_COLOR = "215,38,61"
 W99_ACCELERATION = 2.0
 """SUMO's default of `cc8`, the acceleration from a standstill of its model W99 [m/s2]"""
-CALIBRATED_TYPE_TEMPLATE = "{}_of_driver_{}"
-"""vehicle type of a car of the type `{}` with the calibrated driver of this number"""
 CAR_FOLLOWING_ATTRIBUTES = {"carFollowModel", "tau", "minGap", "sigma", "delta", "stepping"}
 """attributes of a vehicle type that belong to its car-following model: a CAV keeps all others"""
 COLLISION_OPTIONS = ("--collision.mingap-factor", "0", "--collision.check-junctions", "true")
@@ -36,6 +39,8 @@ class SumoInputs(NamedTuple):
     traffic_option: str
     copied_files: Mapping[Path, tuple[Path, ...]] = MappingProxyType({})
     """files that SUMO must only read as a harmless copy, and the files from which the copy is made"""
+    driver_count: int = 0
+    """number of calibrated drivers, whose types belong into lists of vehicle types"""
     records_trips: bool = False
     """whether SUMO records all trips: see `Simulation.end_with_trips`"""
 
@@ -110,7 +115,8 @@ def user_network_inputs(scenario: Scenario, road: UserNetworkRoad) -> SumoInputs
         "--weight-files": files.weight_files,
     }
     types = _user_network_types_xml(scenario, road)
-    return SumoInputs(tuple(options), existing, types, "--additional-files", files.copy_sources, records_trips=True)
+    copies, drivers = files.copy_sources, len(road.drivers)
+    return SumoInputs(tuple(options), existing, types, "--additional-files", copies, drivers, records_trips=True)
 
 
 def _user_network_types_xml(scenario: Scenario, road: UserNetworkRoad) -> str:

@@ -98,7 +98,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         )
         self._stdout_log = folder / "printed.log" if owns_stdout else None
         """SUMO's messages before it has a log"""
-        self._harmless_copies: dict[Path, tuple[list[tuple[int, int]], Path]] = {}
+        self._harmless_copies: dict[tuple[Path, int], tuple[list[tuple[int, int]], Path]] = {}
         """harmless copies of users' files, with the stamps of the files from which they are made"""
         self.episode_lock = Lock()
         if transport == "libsumo":
@@ -187,11 +187,12 @@ class Simulation(AbstractContextManager["Simulation"]):
         if path not in inputs.copied_files:
             return str(path)
         new_copy = Path(self._folder.name) / f"{len(self._harmless_copies)}.xml"
-        before, copy = self._harmless_copies.get(path, ([], new_copy))
+        key = path, inputs.driver_count
+        before, copy = self._harmless_copies.get(key, ([], new_copy))
         if (stamps := list(map(file_stamp, inputs.copied_files[path]))) != before:
-            self._harmless_copies[path] = [], copy
-            write_harmless_copy(path, copy)
-            self._harmless_copies[path] = stamps, copy
+            self._harmless_copies[key] = [], copy
+            write_harmless_copy(path, copy, inputs.driver_count)
+            self._harmless_copies[key] = stamps, copy
         return str(copy)
 
     def allowed_speeds(self, ids: Sequence[str]) -> list[float]:

@@ -17,10 +17,10 @@ from unjam.drivers.roadside import RoadsideMessages
 from unjam.drivers.safety import FollowingState
 from unjam.scenarios.road import UserNetworkRoad
 from unjam.scenarios.user_network import UserNetwork
-from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
+from unjam.sumo_files.reader import CALIBRATED_TYPE_TEMPLATE, CAV_TYPE_TEMPLATE
 from unjam.worlds.open_road_log import TrackedLeader
 from unjam.worlds.record import Episode, Floats
-from unjam.worlds.sumo.inputs import CALIBRATED_TYPE_TEMPLATE, user_network_inputs, vehicle_class_by_type
+from unjam.worlds.sumo.inputs import user_network_inputs, vehicle_class_by_type
 from unjam.worlds.sumo.networks import network_geometry
 from unjam.worlds.sumo.open_road import MultiLaneTraffic
 from unjam.worlds.sumo.outputs import find_slow_entrances
