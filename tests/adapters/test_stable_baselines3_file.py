@@ -65,8 +65,9 @@ def test_features_and_expert_are_given_in_python_and_local_features_by_name(tmp_
 
 def test_actions_are_held_for_the_time_step_of_the_policy(tmp_path: Path) -> None:
     file = save(PPO("MlpPolicy", Space(), seed=1, device="cpu"), tmp_path)
-    for step, decisions in ((None, 5), (0.2, 3)):
-        driver, states = policy_driver(file, policy_time_step=step), random_state(np.random.default_rng(0), 5)
+    held = make_driver(f"{file}:policy_time_step=0.2", 0.1)
+    for driver, decisions in ((policy_driver(file), 5), (policy_driver(file, policy_time_step=0.2), 3), (held, 3)):
+        states = random_state(np.random.default_rng(0), 5)
         memory, commands = driver.initial_memory(1), set[float]()
         for row in range(5):
             acceleration, memory = driver.act(states.select(slice(row, row + 1)), memory)
@@ -74,6 +75,8 @@ def test_actions_are_held_for_the_time_step_of_the_policy(tmp_path: Path) -> Non
         assert len(commands) == decisions
     with pytest.raises(InputError, match=r"time_step: 0\.25 is not allowed; allowed: multiples of the road"):
         policy_driver(file, policy_time_step=0.25)
+    with pytest.raises(InputError, match=r"driver model\.zip: 'step' is not allowed; allowed: policy_time_step"):
+        make_driver(f"{file}:step=0.2", 0.1)
 
 
 class Runs:

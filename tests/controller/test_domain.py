@@ -49,5 +49,6 @@ def test_controllers_on_another_road_and_models_without_their_control_step_get_a
     names = ["pi", "human", "unjam:figure-eight-tuned", "unjam:ring-tuned", "ppo.zip"]
     assert controller_notes(road, names, {}) == [
         "unjam:ring-tuned was tuned on the ring road, not on the figure-eight road",
-        "ppo.zip does not contain its control step: here it acts every 0.1 s, unless policy_driver sets another",
+        "ppo.zip does not contain its control step: here it acts every 0.1 s; "
+        "ppo.zip:policy_time_step=1.0 sets another",
     ]

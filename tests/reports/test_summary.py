@@ -53,7 +53,7 @@ EXPERT = [100.0, 140.0, 180.0, 120.0]
 def test_finding_compares_with_the_expert() -> None:
     finding = main_finding(trained_on_pi([112.0, 148.0, 190.0, 130.0], EXPERT))
     gain = format_difference(estimate([12.0, 8.0, 10.0, 10.0]))
-    assert finding.startswith(f"Return difference to its expert, pi, on 4 test seeds: {gain}. ")
+    assert finding.startswith(f"Return difference to its expert, pi (return 135), on 4 test seeds: {gain}. ")
     assert "The return increases in one training; a verdict on the residual needs 10 trainings. " in finding
     assert finding.endswith("Difference of travel time to pi: +0.0 [+0.0, +0.0] s (no difference is shown).")
 

@@ -19,9 +19,10 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.registry import DRIVERS, driver_from_name
 from unjam.drivers.user_driver import DriverLike, as_driver, is_file_reference
 from unjam.drivers.wrappers import MixedDriver
-from unjam.errors import invalid_value
+from unjam.errors import invalid_value, unknown_name
 from unjam.file_names import split_names
 from unjam.files import PACKAGED_PREFIX, sha256_of
+from unjam.parameters import split_parameters
 
 __all__ = ["controller_bytes", "load_controller", "make_driver", "make_expert", "packaged_file", "packaged_names"]
 
@@ -33,9 +34,9 @@ def make_driver(name: str, time_step: float) -> Driver:
 
     Args:
         name: a name (`pi`), with parameters (`pi:time_constant=1,window=30`), your own (`path.py:name`), a run folder,
-            a `.unjam` file, a `.zip` file of Stable-Baselines3 with a model that observes `local`, an `.onnx` file with
-            a description (`policy.toml`), or a packaged controller (`unjam:ring-best`); or several of them joined by
-            `+`, which CAVs use in turn.
+            a `.unjam` file, a `.zip` file of Stable-Baselines3 with a model that observes `local`, also with its
+            control step (`ppo.zip:policy_time_step=1.0`), an `.onnx` file with a description (`policy.toml`), or a
+            packaged controller (`unjam:ring-best`); or several of them joined by `+`, which CAVs use in turn.
         time_step: control step of the road [s].
     """
     parts = split_names(name)
@@ -44,10 +45,13 @@ def make_driver(name: str, time_step: float) -> Driver:
     if name.startswith(PACKAGED_PREFIX):
         return load_controller(name)
     is_folder = os.path.isdir(name)  # a folder is never a file with code, whatever its name
-    if name.endswith(".zip") and not is_folder:
+    file, parameters = split_parameters(name)
+    if file.endswith(".zip") and not is_folder:
         from unjam.adapters.policies import policy_driver
 
-        return policy_driver(name)
+        if unknown := parameters.keys() - {"policy_time_step"}:
+            raise unknown_name(f"driver {Path(file).name}", min(unknown), ["policy_time_step"])
+        return policy_driver(file, time_step=time_step, **parameters)
     if name.endswith((".onnx", ".toml")) and not is_folder:
         from unjam.adapters.onnx_file import onnx_driver
 

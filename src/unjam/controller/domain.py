@@ -51,7 +51,8 @@ def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[
 def control_step_note(name: str, steps: Iterable[float]) -> str:
     """Return the note for a model of Stable-Baselines3 on roads with these control steps [s]."""
     found = " or ".join(f"{step:g}" for step in sorted(set(steps)))
-    return f"{name} does not contain its control step: here it acts every {found} s, unless policy_driver sets another"
+    other = f"{name}:policy_time_step=1.0"
+    return f"{name} does not contain its control step: here it acts every {found} s; {other} sets another"
 
 
 def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:

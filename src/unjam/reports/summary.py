@@ -142,8 +142,9 @@ def main_finding(result: Results) -> str:
     best = max(returns, key=lambda label: np.nan_to_num(returns[label], nan=-np.inf), default=expert)
     if expert in experts:
         gain = paired_difference(rows, experts[expert], "return")
+        seeds = format_count(gain.count, "test seed")
         sentences.append(
-            f"Return difference to its expert, {expert}, on {format_count(gain.count, 'test seed')}: "
+            f"Return difference to its expert, {expert} (return {returns[expert]:,.0f}), on {seeds}: "
             f"{format_difference(gain)}. {gain_verdict(gain)}"
         )
         if step := best_step(result.progress):
