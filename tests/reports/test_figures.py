@@ -258,6 +258,8 @@ def test_learning_curve_starts_at_step_zero_with_the_expert() -> None:
     assert np.asarray(training.get_xydata()).tolist() == [[12.0, 91.0], [24.0, 92.0], [36.0, 93.0], [48.0, 94.0]]
     assert expert.get_label() == "pi, validation seeds"
     assert set(np.asarray(expert.get_ydata())) == {100.0}
+    (kept,) = axes.collections
+    assert np.asarray(kept.get_offsets()).tolist() == [[48.0, 108.0]]
 
 
 def test_returns_on_test_seeds_have_a_panel_of_their_own() -> None:

@@ -17,7 +17,7 @@ from unjam import __version__
 from unjam.errors import DiskError, InputError
 from unjam.files import to_json
 from unjam.measures.metrics import METRICS, measure
-from unjam.measures.statistics import Estimate
+from unjam.measures.statistics import Estimate, paired_difference
 from unjam.measures.verdict import short_table_metrics
 from unjam.reports.figures import learning_curve_figure
 from unjam.reports.html import REPLAY_STEP, write_report_page
@@ -173,17 +173,17 @@ def test_learning_curve_has_lines_of_drivers_that_do_not_learn(
 ) -> None:
     drawn = []
 
-    def spy(runs: dict[str, Any], experts: dict[str, float], test_returns: dict[str, Estimate]) -> Figure:
-        drawn.append((list(runs), experts, {label: found.mean for label, found in test_returns.items()}))
-        return learning_curve_figure(runs, experts, test_returns)
+    def spy(runs: dict[str, Any], experts: dict[str, float], returns: dict[str, Estimate], expert: str) -> Figure:
+        drawn.append((list(runs), experts, {label: found.mean for label, found in returns.items()}, expert))
+        return learning_curve_figure(runs, experts, returns, expert)
 
     monkeypatch.setattr("unjam.reports.figures.learning_curve_figure", spy)
     write_report_page([run], tmp_path / "page.html")
     found = read_results(run)
-    test_returns = {label: np.mean([row["return"] for row in rows]) for label, rows in found.rows.items()}
+    differences = {"trained": paired_difference(found.rows["trained"], found.rows["pi"], "return").mean}
     # The line of the expert is its return on the validation seeds, where the curve starts.
     experts = {"pi": found.progress[0]["return_expert"]}
-    assert drawn[0] == (["ring-001"], experts, pytest.approx(test_returns))
+    assert drawn[0] == (["ring-001"], experts, pytest.approx(differences), "pi")
 
 
 def test_page_has_its_version_and_the_command_to_reproduce_it(written: tuple[str, Page]) -> None:

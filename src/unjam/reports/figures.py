@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from unjam.measures.statistics import Estimate
-from unjam.reports.results import PlotEpisode, seconds_by_part
+from unjam.reports.results import PlotEpisode, best_step, seconds_by_part
 from unjam.text import one_line, printable
 
 SPEED_COLORMAP = "viridis"
@@ -150,12 +150,16 @@ def _time_series(episode: PlotEpisode, has_cav_panels: bool, has_same_vehicles: 
 
 @rc_context(PLOT_STYLE)
 def learning_curve_figure(
-    runs: dict[str, list[dict[str, Any]]], experts: dict[str, float], test_returns: dict[str, Estimate]
+    runs: dict[str, list[dict[str, Any]]],
+    experts: dict[str, float],
+    test_returns: dict[str, Estimate],
+    expert: str = "",
 ) -> Figure:
     """Draw returns on validation seeds against environment steps; below, those on test seeds after the trainings.
 
-    Above are each run by its label, and as horizontal lines the experts by theirs; below is a mean with its CI for
-    each driver. Returns on different seeds are not comparable.
+    Above are each run by its label, with a ring around the network that was kept, and as horizontal lines the experts
+    by theirs; below is a mean with its CI for each driver, of the differences to an `expert` if there is one. Returns
+    on different seeds are not comparable.
     """
     figure = new_figure(3.8 + (0.6 + 0.22 * len(test_returns) if test_returns else 0.0))
     heights = [3.4, 0.4 + 0.22 * len(test_returns)] if test_returns else [1.0]
@@ -170,6 +174,9 @@ def learning_curve_figure(
         points = np.array([point for point in validations if point[1] is not None], float).reshape(-1, 2)
         label = f"{prefix}validation seeds, deterministic"
         axes.plot(*points.T, color=color, lw=1.8, marker="o", ms=3.5, label=label)
+        if (step := best_step(rows)) and len(runs) == 1:
+            kept = max(found for place, found in points if place == step / 1000)
+            axes.scatter(step / 1000, kept, 110, "none", edgecolors=color, label="network that is kept")
     for (label, value), style in zip(experts.items(), cycle(("--", ":", "-.", (0, (1, 3))))):
         axes.axhline(value, color=TEXT_COLOR, lw=1.1, ls=style, label=f"{label}, validation seeds")
     axes.set(xlabel="environment steps [thousands]", ylabel="return of an episode")
@@ -179,7 +186,11 @@ def learning_curve_figure(
             ends = np.nan_to_num([[found.mean - found.low], [found.high - found.mean]])
             below.errorbar([found.mean], [number], xerr=ends, fmt="o", ms=4, color=TEXT_COLOR, capsize=3)
         below.set_yticks(range(len(test_returns)), list(map(short_label, test_returns)))
-        below.set(xlabel="return on test seeds, after training: mean and 95 % CI", ylim=(len(test_returns) - 0.5, -0.5))
+        if expert:
+            below.axvline(0.0, color=TEXT_COLOR, lw=0.9)
+        quantity = f"return minus that of {expert}" if expert else "return"
+        below.set(xlabel=f"{quantity} on test seeds, after training: mean and 95 % CI")
+        below.set(ylim=(len(test_returns) - 0.5, -0.5))
     figure.legend(loc="outside upper left", ncols=3)
     return figure
 

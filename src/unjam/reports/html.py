@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 
 from unjam import __version__
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, check_parent_folder
-from unjam.measures.metric_table import metric_table
-from unjam.measures.statistics import metric_estimate
+from unjam.measures.metric_table import HUMAN_LABEL, metric_table
+from unjam.measures.statistics import Estimate, metric_estimate, paired_difference
 from unjam.measures.verdict import short_table_metrics
 from unjam.reports import figures, space_time, summary
 from unjam.reports.model import error_figure, example_figure, model_section, rollout_figure, wave_figure
@@ -141,8 +141,9 @@ def _report_figures(
     if panels:
         found["time_series"] = figures.time_series_figure(panels)
     if runs := {name: result.progress for name, result in sources if result.progress}:
-        returns = {column.name: metric_estimate(column.rows, "return") for column in columns}
-        found["learning_curve"] = figures.learning_curve_figure(runs, _expert_returns(sources), returns)
+        found["learning_curve"] = figures.learning_curve_figure(
+            runs, _expert_returns(sources), *_test_returns(sources, columns)
+        )
     if len(sources) == 1 and sources[0][1].progress:
         progress, model = sources[0][1].progress, sources[0][1].model
         found["training_time"] = figures.training_time_figure(progress)
@@ -152,6 +153,21 @@ def _report_figures(
             found |= {"model_examples": example_figure(model), "model_errors": error_figure(model)}
             found["model_rollouts"] = rollout_figure(progress, model)
     return found
+
+
+def _test_returns(
+    sources: Sequence[tuple[str, Results]], columns: Sequence[ReportColumn]
+) -> tuple[dict[str, Estimate], str]:
+    """Return the returns on test seeds by driver, and the expert of a single training, of which they are differences.
+
+    Human drivers are left out then: their returns are often so small that the other differences would not be visible.
+    """
+    rows = {column.name: column.rows for column in columns}
+    expert = sources[0][1].metadata.get("expert", "")
+    if len(sources) > 1 or expert not in rows:
+        return {name: metric_estimate(own, "return") for name, own in rows.items()}, ""
+    others = rows.keys() - {expert, HUMAN_LABEL}
+    return {name: paired_difference(rows[name], rows[expert], "return") for name in rows if name in others}, expert
 
 
 def _expert_returns(sources: Sequence[tuple[str, Results]]) -> dict[str, float]:
