@@ -43,7 +43,7 @@ def test_verdict_is_the_first_violated_limit(changes: dict[str, Any], verdict: s
 def test_hard_human_braking_counts_only_above_the_baseline() -> None:
     row = {**FEASIBLE_ROW, "human_braking_beyond_4_5": 15.0}
     text = "human drivers brake beyond 4.5 m/s2 15 times in a million vehicle-steps"
-    assert feasibility(row) == f"{text} (without CAVs: not compared)"
+    assert feasibility(row) == f"{text} (without CAVs: unknown, -d human measures it)"
     assert overall_feasibility([row, row], [HUMAN]) == FEASIBLE
     assert overall_feasibility([row, {**FEASIBLE_ROW, "human_braking_beyond_4_5": 40.0}], [HUMAN]).startswith(
         "human drivers brake"

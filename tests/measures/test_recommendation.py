@@ -157,6 +157,12 @@ def test_controller_that_changes_nothing_is_reported() -> None:
             "with 20 test seeds, the difference of travel time to ACC vehicles alone is -1.0 [-5.0, +3.0] s",
         ),
         (
+            replace(
+                OPEN, difference_to_acc=between(-8.0, 12.0), effect=replace(GOOD, travel_time=between(-40.0, 24.0))
+            ),
+            "with 20 test seeds, the difference of travel time to ACC vehicles alone is +2.0 [-8.0, +12.0] s",
+        ),
+        (
             replace(OPEN, difference_to_acc=between(-1.0, 1.0, 4)),
             "with 4 test seeds, where a verdict needs 10, "
             "the difference of travel time to ACC vehicles alone is +0.0 [-1.0, +1.0] s",

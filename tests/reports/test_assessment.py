@@ -15,7 +15,13 @@ from unjam.manifest import manifest
 from unjam.measures.metrics import METRICS
 from unjam.measures.recommendation import AccResult, ControllerResult, acc_finding, recommended_result, road_verdict
 from unjam.measures.statistics import Estimate
-from unjam.reports.assessment import ASSESSMENT_FILE, effect_figure, render_assessment, write_assessment
+from unjam.reports.assessment import (
+    ASSESSMENT_FILE,
+    effect_figure,
+    feasibility_text,
+    render_assessment,
+    write_assessment,
+)
 from unjam.scenarios import Motorway, Ring, scenario_recipe
 from unjam.training.evaluate import Evaluation, save_evaluation
 from unjam.worlds.record import Episode
@@ -121,6 +127,22 @@ def test_main_table_has_a_row_per_option_with_differences_to_both_baselines(page
     assert page.index("<details>") > page.index("</table>")
 
 
+@pytest.mark.parametrize(
+    ("feasibility", "more_braking", "text"),
+    [
+        ("feasible", 0.0, "feasible"),
+        ("feasible", 0.2, "feasible, but human drivers brake hard more often"),
+        ("brakes with 9.0 m/s2", 0.2, "brakes with 9.0 m/s2"),
+        ("", 0.0, "–"),
+    ],
+)
+def test_feasibility_says_if_human_drivers_brake_hard_more_often(
+    feasibility: str, more_braking: float, text: str
+) -> None:
+    effect = {"feasibility": feasibility, "hard_braking": Estimate(more_braking, -1.0, 1.0, 3)}
+    assert feasibility_text(effect) == text
+
+
 def test_page_describes_the_acc_of_cavs(tmp_path: Path, page: str) -> None:
     assert "its own ACC" not in page
     folder = assessment_folder(tmp_path, [HELPS])
@@ -150,7 +172,7 @@ def test_page_lists_assumptions_and_works_offline(page: str) -> None:
     for text in (
         "as the vehicle types of its files say",
         "time_gap 1.1",
-        "12 tuning seeds, 20 test seeds; 120 episodes of at most 400 or 30 minutes",
+        "12 tuning seeds, 20 test seeds; 120 episodes (with those of the pictures) of at most 400 or 30 minutes",
         "±2 % of that of the human baseline",
         "time gap of 1 s",
     ):
@@ -163,7 +185,7 @@ def test_page_lists_assumptions_and_works_offline(page: str) -> None:
 def test_page_explains_why_nothing_is_recommended(tmp_path: Path) -> None:
     page = render_assessment(assessment_folder(tmp_path, [HARMS]))
     assert '<p class="badge not-recommended">not recommended</p>' in page
-    assert "its verdict is in the table" in page
+    assert "ACC alone has no panel" in page
     assert "10 % CAVs: no controller is recommended; each was rejected" in page
     assert "The fastest, acc: slower than the human baseline." in page
 

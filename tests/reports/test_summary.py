@@ -13,6 +13,7 @@ from unjam.reports.summary import (
     baseline_differences,
     common_baseline,
     csv_text,
+    first_alternative,
     format_difference,
     key_figures,
     main_finding,
@@ -328,6 +329,15 @@ def test_the_same_driver_on_another_road_has_its_own_column() -> None:
     warm = Results(Path("runs/warm-001"), {**warm.metadata, "scenario": "ring-warm"}, warm.rows, {})
     returns = [column.rows[0]["return"] for column in report_columns([ring, warm]) if "pi" in column.name]
     assert returns == [5.0, 9.0]
+
+
+def test_two_configurations_of_a_network_are_compared_on_the_same_seeds() -> None:
+    plain = drive_results("runs/plain", "a.sumocfg", human=rows_of([1.0, 2.0]))
+    limited = drive_results("runs/limited", "b.sumocfg", human=rows_of([5.0, 7.0]))
+    assert first_alternative([plain, limited]) == "plain: human"
+    others = {"other seeds": drive_results("runs/c", human=rows_of([1.0])), "no humans": drive_results("d", pi=[])}
+    assert [first_alternative([plain, each]) for each in others.values()] == ["", ""]
+    assert first_alternative([plain]) == ""
 
 
 def test_the_baseline_of_several_folders_ran_the_same_episodes() -> None:

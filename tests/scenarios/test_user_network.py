@@ -78,7 +78,8 @@ def test_the_command_for_plain_sumo_has_changed_times_and_no_calibrated_drivers(
     changes: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     road = own(tmp_path, TIMES, penetration_rate=0.1, **changes)
-    assert road.plain_sumo_command(7) == f"sumo -c {road.file} --seed 7{words}"
+    command = f"sumo -c {road.file} --seed 7{words} --tripinfo-output trips.xml --tripinfo-output.write-unfinished"
+    assert road.plain_sumo_command(7) == f"{command} --tripinfo-output.write-undeparted"
     assert replace(road, population="unjam:ngsim").plain_sumo_command(7) == ""
 
 

@@ -97,7 +97,7 @@ def drive_command(
         output.print_notes(result.notes)
         first = next(iter(result.rows.values()))[0]
         if isinstance(road, UserNetwork) and (command := road.plain_sumo_command(first["sumo_seed"])):
-            output.print_notes([f"plain SUMO has the traffic of seed {first['seed']} without CAVs: {command}"])
+            output.print_notes([f"plain SUMO has the traffic of the first episode without CAVs: {command}"])
         if result.report is not None:
             err_console.print(f"report: {result.report}")
         is_drawable = all(len(each.outline) or len(each.poses) for each in result.plot_episodes.values())
@@ -189,7 +189,10 @@ def assess_command(
         ),
     ] = None,
     penetration_rates: Annotated[
-        str, Option(help="Penetration rates among the vehicles of --cav-classes.")
+        str,
+        Option(
+            "--penetration-rates", "--penetration-rate", help="Penetration rates among the vehicles of --cav-classes."
+        ),
     ] = "0.05,0.1,0.2",
     episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Maximum number of episodes.")] = 240,
     minutes: Annotated[float | None, Option(help="Maximum time; checked between batches of episodes.")] = None,
@@ -237,10 +240,11 @@ def assess_command(
     output.print_notes(document["notes"])
     err_console.print(f"report: {assessment.page}", soft_wrap=True)
     if missing := document["missing_budget"]:
-        size = f"{missing['test_seeds']} test seeds at most, about {format_duration(missing['seconds'])}"
+        seeds, duration = missing["min_test_seeds"], format_duration(missing["min_seconds"])
         rest = output.arguments_without("--out", "--driver", "-d", "--episodes", "-n", "--minutes")
         drivers = [word for name in missing["drivers"] for word in ("-d", name)]
-        output.print_next_command(f"for a verdict ({size})", *rest, *drivers, "--episodes", missing["episodes"])
+        command = *rest, *drivers, "--episodes", missing["min_episodes"]
+        output.print_next_command(f"for a verdict ({seeds} test seeds at least, about {duration})", *command)
 
 
 def _parse_rates(text: str) -> list[float]:

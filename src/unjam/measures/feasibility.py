@@ -45,7 +45,7 @@ def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tup
     time_gap, human_braking = row["min_time_gap"], row[HARD_BRAKING_METRIC]
     min_time_gap = MIN_TIME_GAP_WITH_LANES if has_lanes else MIN_TIME_GAP_FRACTION * required
     short, cut_in = (row[name] if has_lanes else 0.0 for name in ("share_short_time_gap", "cut_in_max_braking"))
-    baseline = "not compared" if baseline_braking is None else _rate_text(baseline_braking)
+    baseline = "unknown, -d human measures it" if baseline_braking is None else _rate_text(baseline_braking)
     collided, contacts, braking = row["status"] == "collision", float(row.get("contacts", 0)), row["cav_max_braking"]
     checks = (  # value, largest allowed value, reason
         (collided * (1.0 + row["collisions"]), 0.0, f"{format_count(row['collisions'], 'vehicle')} in contact"),

@@ -17,8 +17,8 @@ MAX_WARNING_KINDS = 10
 MAX_BACKLOG_SHARE = 0.05
 """share of the vehicles in the insertion backlog at the end, above which there is a note"""
 MAX_UNFINISHED_SHARE, MAX_DELAY_SHARE = 0.05, 1 / 3
-"""share of the vehicles that have not arrived at the end, and share of delay in their travel time, above which traffic
-is still congested"""
+"""share of the vehicles that have not arrived at the end, above which there is a note, and share of delay in their
+travel time, above which traffic is still congested"""
 LOST_DEMAND_PATTERN = re.compile(
     "sorted by departure time|no (valid )?route|discard|removing vehicle|not reachable|inserted", re.IGNORECASE
 )
@@ -99,19 +99,23 @@ def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
 
 
 def _congestion_notes(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return a note if traffic is still congested at the end with some drivers, so that travel times are cut off."""
-    shares = dict[str, float]()
+    """Return a note if trips of many vehicles have not ended with some drivers, so that travel times are cut off."""
+    shares, delayed = dict[str, float](), list[str]()
     for label, rows in rows_by_driver.items():
         complete = [row for row in rows if row["status"] == "completed" and "unfinished_trips" in row]
         demand = sum(row["vehicles"] + row["insertion_backlog_veh"] for row in complete)
-        unfinished = sum(row["unfinished_trips"] for row in complete if row["delay_share_at_end"] > MAX_DELAY_SHARE)
+        unfinished = sum(row["unfinished_trips"] for row in complete)
         if unfinished > MAX_UNFINISHED_SHARE * demand:
             shares[label] = unfinished / demand
+            delay_shares = [row["delay_share_at_end"] for row in complete]
+            delayed += [label] if sum(delay_shares) > MAX_DELAY_SHARE * len(delay_shares) else []
     if not shares:
         return []
+    congested = f" (traffic is still congested: {', '.join(delayed)})" if delayed else ""
+    most = 100 * max(shares.values())
     return [
-        f"{', '.join(shares)}: traffic is still congested at the end, with {100 * max(shares.values()):.0f} % of the "
-        "vehicles under way or waiting; their travel time counts until then, and a later --end shows more of it"
+        f"{', '.join(shares)}: up to {most:.0f} % of the vehicles are under way or waiting at the end{congested}; "
+        "their travel time counts until then, and a later --end shows more of it"
     ]
 
 

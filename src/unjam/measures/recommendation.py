@@ -175,9 +175,11 @@ class ControllerResult:
 
     @property
     def open_question(self) -> str:
-        """What is not yet known: the comparison whose interval includes zero, or is wider, as a clause."""
+        """What is not yet known: the comparison that is worse so far, or whose interval includes zero, as a clause."""
         comparisons = (self.difference_to_acc, ACC_BASELINE), (self.effect.travel_time, "the human baseline")
-        change, baseline = max(comparisons, key=lambda each: (each[0].low <= 0 <= each[0].high, each[0].half_width))
+        change, baseline = max(
+            comparisons, key=lambda each: (each[0].mean >= 0, each[0].low <= 0 <= each[0].high, each[0].half_width)
+        )
         seeds = f"with {format_count(change.count, 'test seed')}"
         if change.count < MIN_VERDICT_SEEDS:
             seeds += f", where a verdict needs {MIN_VERDICT_SEEDS}"

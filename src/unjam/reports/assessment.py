@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from math import nan
 from pathlib import Path
@@ -14,6 +15,7 @@ from matplotlib.figure import Figure
 from unjam.errors import InputError
 from unjam.files import atomic_write, check_parent_folder
 from unjam.measures.effect import FLOW_METRIC, MAX_FLOW_LOSS, TIME_METRIC
+from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import estimate_cell
 from unjam.measures.recommendation import MIN_VERDICT_SEEDS
 from unjam.measures.statistics import Estimate, format_difference, format_percent
@@ -57,6 +59,7 @@ def render_assessment(folder: Path) -> str:
     assessment, results = parse_assessment(json.loads(path.read_text())), read_results(folder)
     names = {"human": HUMAN_BASELINE_LABEL}
     panels = [replace(each, driver=names.get(each.driver, each.driver)) for each in results.plot_episodes.values()]
+    plotted = {label: results.rows.get(label, []) for label in results.plot_episodes}
     return render_template(
         "assessment.html",
         assessment=assessment,
@@ -68,7 +71,7 @@ def render_assessment(folder: Path) -> str:
         candidate_rows=[_tuning_row(each) for each in assessment["candidates"]],
         effect_figure=figures.data_uri(effect_figure(assessment)),
         space_time=figures.data_uri(space_time.space_time_figure(panels)) if panels else "",
-        panels=[panel.driver for panel in panels],
+        panels=[f"{names.get(label, label)}, {_first_travel_time(rows)}" for label, rows in plotted.items()],
         has_lane_maps=space_time.has_lane_maps(panels),
         percent=format_percent,
         breakable=breakable_label,
@@ -76,6 +79,11 @@ def render_assessment(folder: Path) -> str:
         min_test_seeds=MIN_VERDICT_SEEDS,
         command=original_command(results),
     )
+
+
+def _first_travel_time(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the travel time of the first episode, which is that of the picture, as text."""
+    return f"{rows[0][TIME_METRIC]:.1f} s" if rows else "not measured"
 
 
 def breakable_label(text: str) -> Markup:
@@ -127,9 +135,16 @@ def option_rows(assessment: dict[str, Any]) -> list[list[str]]:
         effect, to_acc = each["effect"], [each.get(name, MISSING) for name in ACC_DIFFERENCES]
         times = [format_difference(change, 1) for change in (effect["travel_time"], to_acc[0])]
         flows = [format_difference(change) for change in (effect["flow"], to_acc[1])]
-        verdicts = effect["feasibility"] or "–", each.get("verdict", "–")
+        verdicts = feasibility_text(effect), each.get("verdict", "–")
         rows.append([format_percent(each["penetration_rate"]), each["driver"], *times, *flows, *verdicts])
     return rows
+
+
+def feasibility_text(effect: dict[str, Any]) -> str:
+    """Return whether the CAVs are feasible, and whether human drivers brake hard more often; a dash if unknown."""
+    if effect["feasibility"] == FEASIBLE and effect["hard_braking"].mean > 0:
+        return f"{FEASIBLE}, but human drivers brake hard more often"
+    return effect["feasibility"] or "–"
 
 
 def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
@@ -148,7 +163,7 @@ def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
     baseline_contacts = f"{baseline['collisions'].mean * baseline['collisions'].count:.0f}"
     rows = (
         ("verdict", "", "", verdicts),
-        ("feasibility", "", "", [each["feasibility"] or "–" for each in effects]),
+        ("feasibility", "", "", [feasibility_text(each) for each in effects]),
         time,
         ("travel time, relative to the human baseline", "%", "", relative),
         ("travel time, compared with ACC vehicles", "s", "", acc),

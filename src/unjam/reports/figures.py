@@ -112,11 +112,12 @@ def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     """Draw quantities over time, a line per driver.
 
     On closed and recorded roads: the CAV's speed and gap, or without CAVs the mean speed, and the std of speed across
-    all vehicles; on other open roads: the mean speed, the std, and the insertion backlog.
+    all vehicles; on other open roads: the mean speed, the std, and the insertion backlog if there is any.
     """
     has_same_vehicles = all(episode.has_same_vehicles for episode in episodes)
     has_cav_panels = has_same_vehicles and any(episode.controlled_columns for episode in episodes)
-    all_series = [_time_series(episode, has_cav_panels, has_same_vehicles) for episode in episodes]
+    has_no_backlog = has_same_vehicles or not any(np.any(episode.backlog) for episode in episodes)
+    all_series = [_time_series(episode, has_cav_panels, has_no_backlog) for episode in episodes]
     figure = new_figure(0.2 + 2.0 * len(all_series[0]))
     panels = figure.subplots(len(all_series[0]), 1, sharex=True)
     for episode, series, color in zip(episodes, all_series, LINE_COLORS, strict=False):
@@ -136,7 +137,7 @@ def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     return figure
 
 
-def _time_series(episode: PlotEpisode, has_cav_panels: bool, has_same_vehicles: bool) -> dict[str, np.ndarray]:
+def _time_series(episode: PlotEpisode, has_cav_panels: bool, has_no_backlog: bool) -> dict[str, np.ndarray]:
     """Return the quantities of `time_series_figure` by label; each of shape (T + 1,)."""
     speeds = np.where(np.isnan(episode.speeds).all(axis=1, keepdims=True), 0.0, episode.speeds)
     waves = {"speed std across\nvehicles [m/s]": np.nanstd(speeds, axis=1)}
@@ -144,7 +145,7 @@ def _time_series(episode: PlotEpisode, has_cav_panels: bool, has_same_vehicles: 
         cav = episode.cav_columns[0]
         return {"CAV's speed [m/s]": episode.speeds[:, cav], "CAV's gap [m]": episode.gaps[:, cav], **waves}
     backlog = episode.backlog if len(episode.backlog) else np.zeros(len(speeds))
-    backlogs = {} if has_same_vehicles else {"insertion backlog\n[vehicles]": backlog}
+    backlogs = {} if has_no_backlog else {"insertion backlog\n[vehicles]": backlog}
     return {"mean speed [m/s]": np.nanmean(speeds, axis=1), **waves, **backlogs}
 
 

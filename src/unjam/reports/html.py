@@ -99,6 +99,10 @@ def render_report(results: Sequence[Results]) -> str:
     sources = list(zip(summary.folder_names(results), results, strict=True))
     counts = [len(column.rows) for column in columns]
     rows, baseline = {column.name: column.rows for column in columns}, summary.common_baseline(results)
+    first = "" if baseline else summary.first_alternative(results)
+    if first in rows:
+        others = {column.name: rows[first] if column.name != first else None for column in columns}
+        columns = [replace(column, baseline_rows=others[column.name]) for column in columns]
     headings, table = metric_table(rows, baseline)
     roads = (", ".join(format_drawn_values(episode.drawn_values)) for episode in panels)
     return render_template(
@@ -106,7 +110,7 @@ def render_report(results: Sequence[Results]) -> str:
         title=summary.report_title(results),
         single=single is not None,
         verdicts=[column.verdict for column in columns if column.verdict is not None],
-        baseline_name=summary.name_baselines(results),
+        baseline_name=first if first in rows else summary.name_baselines(results),
         findings=[(name, finding) for name, result in sources if (finding := summary.main_finding(result))],
         warning=summary.mismatch_warning(results),
         notes=[(name, note) for name, result in sources for note in summary.report_notes(result)],

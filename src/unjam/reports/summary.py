@@ -76,6 +76,17 @@ def common_baseline(results: Sequence[Results]) -> str:
     return first if all(other == first for other in others) and is_same and not is_own else ""
 
 
+def first_alternative(results: Sequence[Results]) -> str:
+    """Return the column of human drivers in the first of several folders with the same seeds; empty without it.
+
+    So two configurations of a network are compared, such as with and without a speed limit.
+    """
+    seeds = {str([row["seed"] for row in result.rows.get(HUMAN_LABEL, [])]) for result in results}
+    has_humans = all(HUMAN_LABEL in result.rows and result.trained_label is None for result in results)
+    is_comparison = len(results) > 1 and has_humans and len(seeds) == 1
+    return f"{folder_names(results)[0]}: {HUMAN_LABEL}" if is_comparison else ""
+
+
 def _episode_keys(rows: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
     """Return a key for each episode of a driver; the keys differ between different roads."""
     return [(str(row["seed"]), str(row["return"])) for row in rows]

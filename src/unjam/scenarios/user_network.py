@@ -212,14 +212,18 @@ class UserNetwork(Scenario):
         return notes
 
     def plain_sumo_command(self, seed: int) -> str:
-        """Return the command by which plain SUMO has the same traffic without CAVs; empty with calibrated drivers."""
+        """Return the command by which plain SUMO has the same traffic without CAVs; empty with calibrated drivers.
+
+        Its trips are those of the travel time: also of vehicles that are under way or waiting at the end.
+        """
         if self.driver_population:
             return ""
         files, words = read_sumo_files(Path(self.file)), ["sumo", "-c", self.file, "--seed", str(seed)]
         begin, end = self._begin(files), self._end(self._begin(files))
         words += ["--begin", f"{begin:g}"] if self.begin is not None else []
         words += ["--end", f"{end:g}"] if files.end is None or abs(end - files.end) > self.simulation_step else []
-        return shlex.join(words)
+        unfinished = ("--tripinfo-output.write-unfinished", "--tripinfo-output.write-undeparted")
+        return shlex.join([*words, "--tripinfo-output", "trips.xml", *unfinished])
 
     def possible_cav_ids(self) -> tuple[str, ...]:
         """Return names for the maximum number of CAVs: only SUMO knows the ids. Raise `InputError` if there is none."""

@@ -284,6 +284,8 @@ def budget_lines(request: AssessmentRequest, budget: EpisodeBudget) -> list[str]
             f"an answer takes longer than {request.minutes:g} min: about {format_duration(seconds)}, "
             "as each option is simulated at least once"
         )
+    elif request.minutes and budget.estimate_seconds(needed) > 60.0 * request.minutes:
+        lines.append(f"{request.minutes:g} min are too short for a verdict")
     small = request.smallest_question
     if len(request.options) > 1:
         (option,) = small.options
@@ -312,6 +314,7 @@ def missing_budget(request: AssessmentRequest, findings: AssessmentFindings, bud
         "episodes": episodes,
         "min_episodes": fewest,
         "seconds": budget.estimate_seconds(episodes),
+        "min_seconds": budget.estimate_seconds(fewest),
         "drivers": drivers,
     }
 
