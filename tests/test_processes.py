@@ -122,6 +122,18 @@ def test_a_process_ends_at_once_if_its_parent_has_already_ended() -> None:
     assert done.returncode == -signal.SIGKILL
 
 
+@linux
+def test_a_process_ends_at_once_if_its_parent_has_ended_without_being_waited_for() -> None:
+    with subprocess.Popen([sys.executable, "-c", "print('done')"], stdout=subprocess.PIPE) as ended:
+        assert ended.stdout is not None
+        ended.stdout.read()
+        while Path(f"/proc/{ended.pid}/stat").read_text().rpartition(") ")[2][0] != "Z":
+            time.sleep(0.01)
+        environment = {**os.environ, PARENT_VARIABLE: str(ended.pid)}
+        done = subprocess.run([sys.executable, "-c", CHILD], env=environment, timeout=60)
+    assert done.returncode == -signal.SIGKILL
+
+
 def test_a_process_without_the_variable_is_not_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(PARENT_VARIABLE, raising=False)
     exit_with_parent(signal.SIGKILL)

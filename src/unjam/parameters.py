@@ -289,6 +289,8 @@ def nest_keys(changes: dict[str, Any]) -> dict[str, Any]:
     """Return changes with dotted keys as nested tables: `trpo.gamma` becomes `gamma` of the table `trpo`."""
     tables: dict[str, Any] = {}
     for key, value in changes.items():
+        if not isinstance(key, str):
+            raise invalid_value("key", key, "a text")
         for part in reversed(key.split(".")):
             value = {part: value}
         tables = merge_changes(tables, value)

@@ -77,10 +77,17 @@ def exit_with_parent(signum: int) -> None:
         return
     with suppress(OSError, AttributeError):  # a C library without it
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signum, 0, 0, 0)
-    try:
-        os.kill(int(parent), 0)
-    except ProcessLookupError:  # it ended before
+    if _has_ended(int(parent)):  # before this process asked for the signal
         os.kill(os.getpid(), signum)
+
+
+def _has_ended(process: int) -> bool:
+    """Return whether a process has ended, even if its own parent has not yet asked for its exit code."""
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2][:1]
+    except OSError:
+        return True
+    return state in ("Z", "X")
 
 
 def follow_parent(parent: int) -> None:

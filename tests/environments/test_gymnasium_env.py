@@ -395,6 +395,7 @@ def test_options_of_a_reset_change_the_scenario_for_this_episode() -> None:
     ("options", "words"),
     [
         ({"lenght": 230}, "lenght: unknown name; did you mean 'length'?"),
+        ({1: 230}, "key: 1 is not allowed; allowed: a text"),
         ({"cavs": 2}, "reset: options: cavs: 2 is not allowed; allowed: 1, as in the constructor"),
         ({"action_limit": 3}, "reset: options: action_limit: 3.0 is not allowed; allowed: 1.0, as in the constructor"),
         ([230], "reset: options: [230] is not allowed; allowed: a dict of parameters"),
@@ -408,6 +409,12 @@ def test_options_that_are_not_parameters_of_this_road_are_refused(options: Any, 
         with pytest.raises(InputError, match=re.escape(words)):
             environment.reset(options=options)
         environment.step(np.zeros(1))  # the episode goes on
+
+
+@pytest.mark.parametrize("seed", [np.int64(3), np.array(3)])
+def test_integers_of_numpy_are_seeds(seed: Any) -> None:
+    with closing(RoadEnv("ring", **SHORT)) as environment:
+        assert environment.reset(seed=seed)[1] == environment.reset(seed=3)[1]
 
 
 @pytest.mark.parametrize("seed", ["1", 0.5, -1, True, [1, 2], np.zeros(2)])

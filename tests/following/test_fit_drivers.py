@@ -143,6 +143,14 @@ def test_invalid_input_is_refused(data: Path, changes: dict, more: dict, words: 
         fit_drivers_from_files([data], {**CHANGES, **changes}, **more)
 
 
+@pytest.mark.parametrize("name", ["drivers.json", "drivers.safetensors"])
+def test_existing_files_are_not_overwritten(name: str, data: Path, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(InputError, match=rf"out: .*{name}' exists; allowed: a new file"):
+        fit_drivers_from_files([data], CHANGES, out=tmp_path / "drivers.json")
+    assert (tmp_path / name).read_text() == "mine"
+
+
 def test_missing_output_folder_is_refused_before_the_calibration(data: Path, tmp_path: Path) -> None:
     with pytest.raises(DiskError):
         fit_drivers_from_files([data], CHANGES, out=tmp_path / "gone" / "drivers.json")

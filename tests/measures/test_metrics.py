@@ -15,7 +15,7 @@ from unjam.measures.metrics import METRICS, measure
 from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.worlds.audit import Audit, BrakingStatistics, FollowingStatistics, following_statistics
 from unjam.worlds.ordered_road import loop_neighbors, loop_state
-from unjam.worlds.record import Episode, Floats, Trajectory, failed_episode
+from unjam.worlds.record import Episode, Floats, Trajectory, Trips, failed_episode
 from unjam.worlds.reward import episode_reward_terms
 
 LENGTH = 200.0
@@ -463,6 +463,13 @@ def test_fuel_by_power_does_not_depend_on_when_a_vehicle_enters() -> None:
     late[:4, 1] = np.nan
     steady, entering = (metric("fuel_by_power", open_episode(speeds)) for speeds in (np.full((11, 2), 20.0), late))
     assert entering == pytest.approx(steady)
+
+
+def test_fuel_by_power_on_a_users_network_is_that_of_motor_vehicles() -> None:
+    speeds, zeros = np.array([[20.0, 5.0]] * 11), np.zeros(2)
+    trips = Trips(("human_0", "human_1"), ("passenger", "bicycle"), zeros, zeros, zeros, np.zeros(2, bool))
+    with_bicycle = metric("fuel_by_power", open_episode(speeds, trips=trips))
+    assert with_bicycle == metric("fuel_by_power", open_episode(speeds[:, :1]))
 
 
 def test_outflow_and_backlog_of_an_open_road() -> None:

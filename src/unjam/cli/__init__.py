@@ -126,7 +126,6 @@ def main() -> None:
         signum = getattr(signal, name, None)
         if signum is not None and signal.getsignal(signum) != signal.SIG_IGN:
             signal.signal(signum, _terminate)
-    exit_with_parent(signal.SIGTERM)
     isolate_children()
     isolate_matplotlib()
     sys.exit(_run_app())
@@ -134,6 +133,7 @@ def main() -> None:
 
 def _run_app() -> int:
     try:
+        exit_with_parent(signal.SIGTERM)
         for text in sys.argv[1:]:
             if any("\ud800" <= letter <= "\udfff" for letter in text):  # bytes that are not UTF-8
                 raise invalid_value("arguments", text, "text in UTF-8")

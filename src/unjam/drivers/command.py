@@ -49,7 +49,7 @@ def as_numbers(
     """Return the answer of a user's code as an array, made by `to_array`; raise `InputError` unless it is numbers."""
     try:
         return to_array(answer)
-    except (TypeError, ValueError, RuntimeError):  # the last for tensors with a gradient
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last for tensors with a gradient
         reason = f"{label} is not numbers: {one_line(repr(answer), 60)}"
         raise InputError(f"{reason}; allowed: {allowed}" if allowed else reason) from None
 

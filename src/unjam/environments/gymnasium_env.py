@@ -357,7 +357,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         `reset(options={"length": 230})`. The number of CAVs and the action limit stay.
         """
         observations = self._road.reset(seed, self.np_random, options)
-        super().reset(seed=seed)
+        super().reset(seed=None if seed is None else int(seed))  # Gymnasium takes no integers of NumPy
         world = self._road.world
         return observations[0], {"drawn_values": dict(world.road.drawn_values), "control_steps": world.control_steps}
 

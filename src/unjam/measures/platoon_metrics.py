@@ -8,7 +8,7 @@ import numpy as np
 
 from unjam.measures.averages import mean_over_cavs, row_chunks
 from unjam.physics.fuel import fuel_rate
-from unjam.worlds.record import Episode, Floats
+from unjam.worlds.record import VEHICLE_GROUPS, Episode, Floats
 
 MIN_WAVE_STD = 0.05
 """standard deviation of the recorded speed below which there are no waves that could be amplified [m/s]"""
@@ -17,7 +17,8 @@ MIN_WAVE_STD = 0.05
 def fuel_by_power(episode: Episode) -> float:
     """Fuel of all vehicles by the power that a mid-size petrol car needs [ml/km], with 0.9 l/h at standstill.
 
-    Treiber and Kesting 2013, Traffic Flow Dynamics, section 20.4.
+    On a user's network it counts cars, trucks and buses, each as such a car. Treiber and Kesting 2013, Traffic Flow
+    Dynamics, section 20.4.
     """
     return _fuel_by_power(episode, np.s_[:])
 
@@ -37,6 +38,10 @@ def _fuel_by_power(episode: Episode, columns: Any) -> float:
 
     The step in which a vehicle enters has no acceleration, so that neither its fuel nor its distance counts.
     """
+    if episode.trips.vehicle_ids:
+        with_engine = episode.trips.vehicles_of(*VEHICLE_GROUPS)
+        is_counted = np.array([name in with_engine for name in episode.vehicle_ids], bool)
+        columns = np.flatnonzero(is_counted & np.isin(np.arange(len(is_counted)), np.arange(len(is_counted))[columns]))
     speeds, fuel, distance = episode.speeds[:, columns], 0.0, 0.0
     for before, after in zip(row_chunks(speeds[:-1]), row_chunks(speeds[1:]), strict=True):
         fuel += float(np.nansum(fuel_rate(after, (after - before) / episode.control_step)))

@@ -27,6 +27,7 @@ from unjam.physics.idm import IDM_PARAMETER_NAMES, IDMParameters
 PACKAGED_POPULATIONS = Path(str(files("unjam") / "scenarios/populations"))
 """folder of the packaged populations, in which each driver has five individual parameters"""
 POPULATION_FORMAT = 1
+WEIGHTS_SUFFIX = ".safetensors"  # of the file with the residual of a population, next to it
 RESIDUAL_INPUTS = ("speed", "leader's speed minus own", "gap")
 """inputs of the residual [m/s, m/s, m]"""
 MAX_POPULATION_BYTES = 64 * 2**20
@@ -96,7 +97,7 @@ def write_population(path: Path, population: Population) -> None:
     residual = None
     if population.residual is not None:
         weights = save(network_weights(population.residual))
-        weights_file = path.with_suffix(".safetensors")
+        weights_file = path.with_suffix(WEIGHTS_SUFFIX)
         sha256 = sha256_of(weights)
         residual = {"file": weights_file.name, "sha256": sha256, "authority": population.residual.authority}
         atomic_write(weights_file, weights)

@@ -284,6 +284,11 @@ def notes_on_files(files: SumoFiles, max_names: int = MAX_NOTED_NAMES) -> list[s
         map(DROPPED_DEVICE_SHARE.fullmatch, files.dropped_items)
     ):
         notes.append(f"{files.path.name}: without the devices left out, SUMO equips other vehicles with the rest")
+    if float(files.options.get("lateral-resolution", 0.0)) > 0.0:
+        notes.append(
+            f"{files.path.name}: with lateral-resolution, SUMO reports the leader of a CAV in its lane even if that is "
+            "beside it, and not vehicles that protrude from other lanes: time gaps and controllers are unreliable"
+        )
     if files.has_bicycle_lanes:
         notes.append(
             f"{files.path.name}: has bicycle lanes, where SUMO repeats an episode only in a new process: travel "

@@ -148,7 +148,7 @@ def following_statistics(
     `is_overridden` are the commands that SUMO changed, `is_yielding` those near a crossing; `in_recovery` moments do
     not count for time gaps. Sources: TTC after Hayward 1972; DRAC after Almqvist et al. 1991; SAE J2944.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         is_moving, closing = speed > MIN_TIME_GAP_SPEED, speed - leader_speed
         time_gaps = (gap / speed)[is_moving & ~np.asarray(in_recovery, bool)]
         is_closing = (closing > 0) & (gap > 0)

@@ -145,6 +145,12 @@ class Trips:
         values = {"unfinished_trips": int(unfinished.sum()), "delay_share_at_end": delay / spent if spent else 0.0}
         return values if self.vehicle_ids else {}
 
+    def vehicles_of(self, *groups: str) -> set[str]:
+        """Return the ids of the vehicles of some `VEHICLE_GROUPS`."""
+        classes = {each for group in groups for each in VEHICLE_GROUPS[group]}
+        pairs = zip(self.vehicle_ids, self.vehicle_classes, strict=True)
+        return {name for name, vehicle_class in pairs if vehicle_class in classes}
+
     def mean_travel_time(self, group: str) -> float:
         """Return the mean travel time of a group of `VEHICLE_GROUPS` [s]; NaN if it has no vehicles."""
         is_in_group = np.isin(self.vehicle_classes, VEHICLE_GROUPS[group])
