@@ -184,7 +184,7 @@ def training_curves(study_folder: StudyFolder, road: str, variants: Sequence[str
     def resample(progress: Table, name: str) -> list[float]:
         known = [(row["environment_steps"], row[name]) for row in progress if row[name] is not None]
         steps, values = np.array(known, float).T
-        return np.interp(grid, steps, values).round(4).tolist()
+        return [float(f"{value:.5g}") for value in np.interp(grid, steps, values)]
 
     curves: dict[str, Any] = {}
     reward = PlannedRun(road, variants[0], 0).config.reward
