@@ -9,7 +9,7 @@ from unjam.reports.space_time import space_time_figure
 
 TITLES = {
     "human": "22 vehicles: human",
-    "pi": "an expert: PI with saturation",
+    "unjam:ring-jammed-tuned": "tuned expert",
     "unjam:ring-jammed-best": "expert and learned residual",
 }
 """title of the panel of each driver"""
