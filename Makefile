@@ -1,6 +1,6 @@
 # make demo   sets everything up, trains a residual in a jam, and compares drivers with human drivers there: a minute or two after
 #             the installation
-# make test   fifteen tests of sixteen, in minutes, as .ci/run does; make test-all adds the long and the slow ones
+# make test   six tests of seven, in minutes, as .ci/run does; make test-all adds the long and the slow ones
 # make check  lint, format, types; make docs builds the site; make bench measures speed
 #
 # On a machine where pip would fetch a CUDA build of torch, the CPU build is a tenth of the size:

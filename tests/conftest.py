@@ -37,8 +37,16 @@ settings.load_profile("unjam")
 LONGEST_FOLDERS = ("system", "training", "paper", "reports", "worlds")
 
 
+LONG_TESTS = {*(Path(__file__).parent / "long_tests.txt").read_text().splitlines()}
+"""tests that took more than 1.2 s on two cores, measured by `pytest --durations=0`; those of trust and of drift are left out"""
+
+
+@pytest.hookimpl(tryfirst=True)  # before tests are selected by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the folders that take longest first, so that both processes end at about the same time."""
+    """Mark long tests, and put the folders that take longest first, so that both processes end at about one time."""
+    for item in items:
+        if item.nodeid in LONG_TESTS:
+            item.add_marker("long")
     ranks = {name: rank for rank, name in enumerate(LONGEST_FOLDERS)}
     tests = Path(__file__).parent
     items.sort(key=lambda item: ranks.get(item.path.relative_to(tests).parts[0], len(ranks)))

@@ -66,7 +66,7 @@ def test_step_and_horizon_are_those_of_the_configuration_unless_set(
 
 def test_a_note_names_the_sublane_model(tmp_path: Path) -> None:
     found = own(tmp_path, '<processing><lateral-resolution value="0.8"/></processing>').notes
-    words = "with lateral-resolution, SUMO reports the leader of a CAV in its lane even if that is beside it"
+    words = "with lateral-resolution, SUMO reports the leader of a CAV in its lane even if that is alongside"
     assert sum(words in note for note in found) == 1
     assert not any(words in note for note in own(tmp_path).notes)
 

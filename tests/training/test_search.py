@@ -229,7 +229,7 @@ def test_a_log_without_one_of_its_trials_is_refused(tmp_path: Path, trainings: T
     search(BASE, SPACE, 2, tmp_path, 1)
     rows = (tmp_path / TRIALS_FILE).read_text().splitlines(keepends=True)
     (tmp_path / TRIALS_FILE).write_text("".join(row for row in rows if '"proposal": 0' not in row))
-    with pytest.raises(InputError, match=r"^out: trials\.jsonl lacks a trial"):
+    with pytest.raises(InputError, match=r"^out: trials\.jsonl does not have all trials"):
         search(BASE, SPACE, 3, tmp_path, 1)
 
 

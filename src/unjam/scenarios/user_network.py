@@ -287,7 +287,7 @@ def notes_on_files(files: SumoFiles, max_names: int = MAX_NOTED_NAMES) -> list[s
     if float(files.options.get("lateral-resolution", 0.0)) > 0.0:
         notes.append(
             f"{files.path.name}: with lateral-resolution, SUMO reports the leader of a CAV in its lane even if that is "
-            "beside it, and not vehicles that protrude from other lanes: time gaps and controllers are unreliable"
+            "alongside, and not vehicles that protrude from other lanes: time gaps and controllers are unreliable"
         )
     if files.has_bicycle_lanes:
         notes.append(

@@ -136,7 +136,7 @@ def _restore_study(log: TrialLog, space: SearchSpace) -> Study:
     proposals = [row["values"] for row in log.rows if "values" in row]
     study = create_study(direction="maximize")
     if [row.get("proposal") for row in log.rows if "values" in row] != [*range(len(proposals))]:
-        raise InputError(f"out: {TRIALS_FILE} lacks a trial; allowed: a new folder")
+        raise InputError(f"out: {TRIALS_FILE} does not have all trials; allowed: a new folder")
     try:
         objectives = {row["trial"]: row["objective"] for row in log.rows if "trial" in row}
         for number, values in enumerate(proposals):

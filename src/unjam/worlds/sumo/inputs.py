@@ -40,7 +40,7 @@ class SumoInputs(NamedTuple):
     copied_files: Mapping[Path, tuple[Path, ...]] = MappingProxyType({})
     """files that SUMO must only read as a harmless copy, and the files from which the copy is made"""
     driver_count: int = 0
-    """number of calibrated drivers, whose types belong into lists of vehicle types"""
+    """number of calibrated drivers: lists of vehicle types also name their types"""
     records_trips: bool = False
     """whether SUMO records all trips: see `Simulation.end_with_trips`"""
 
