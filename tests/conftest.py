@@ -38,7 +38,7 @@ LONGEST_FOLDERS = ("system", "training", "paper", "reports", "worlds")
 
 
 LONG_TESTS = {*(Path(__file__).parent / "long_tests.txt").read_text().splitlines()}
-"""tests that took more than 1.2 s on two cores, measured by `pytest --durations=0`; those of trust and of drift are left out"""
+"""tests that took more than 1.2 s on two cores, by `pytest --durations=0`, without those of trust and of drift"""
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are selected by their marks
