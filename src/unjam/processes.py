@@ -84,10 +84,13 @@ def exit_with_parent(signum: int) -> None:
 def _has_ended(process: int) -> bool:
     """Return whether a process has ended, even if its own parent has not yet asked for its exit code."""
     try:
-        state = Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2][:1]
-    except OSError:
+        with suppress(PermissionError):  # it is of another user
+            os.kill(process, 0)
+        return Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2][:1] in ("Z", "X")
+    except (ProcessLookupError, OverflowError):
         return True
-    return state in ("Z", "X")
+    except OSError:  # a system without /proc
+        return False
 
 
 def follow_parent(parent: int) -> None:
@@ -222,11 +225,8 @@ def _recent_owner(descriptor: int) -> list[str]:
 def _check_this_machine(descriptor: int, target: str) -> None:
     """Raise `InputError` if a living process of this machine has named itself in a file that cannot be locked."""
     owner = _recent_owner(descriptor)
-    if len(owner) == 2 and owner[0] == platform.node() and owner[1].isdecimal():
-        with suppress(ProcessLookupError, OverflowError):
-            with suppress(PermissionError):  # it is of another user
-                os.kill(int(owner[1]), 0)
-            raise InputError(f"{target} is being written by another process; allowed: one at a time")
+    if len(owner) == 2 and owner[0] == platform.node() and owner[1].isdecimal() and not _has_ended(int(owner[1])):
+        raise InputError(f"{target} is being written by another process; allowed: one at a time")
 
 
 def check_owner(owner: int, name: str) -> None:

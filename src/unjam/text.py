@@ -1,5 +1,6 @@
 """Text for users: counts, durations, lists of names, and texts of strangers without hidden characters."""
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
 from unicodedata import category
@@ -41,6 +42,11 @@ def shorten_list(names: Iterable[str]) -> str:
     known = list(names)
     more = len(known) - MAX_LISTED_NAMES
     return ", ".join(known[:MAX_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")
+
+
+def split_label(label: str) -> list[str]:
+    """Return the parts of a name between which a line may break besides spaces: after punctuation."""
+    return re.split(r"(?<=[:,=/_-])", label)
 
 
 def spelling_hint(value: object, names: Iterable[str], similarity: float = 0.6) -> str:

@@ -335,8 +335,12 @@ def test_two_configurations_of_a_network_are_compared_on_the_same_seeds() -> Non
     plain = drive_results("runs/plain", "a.sumocfg", human=rows_of([1.0, 2.0]))
     limited = drive_results("runs/limited", "b.sumocfg", human=rows_of([5.0, 7.0]))
     assert first_alternative([plain, limited]) == "plain: human"
-    others = {"other seeds": drive_results("runs/c", human=rows_of([1.0])), "no humans": drive_results("d", pi=[])}
-    assert [first_alternative([plain, each]) for each in others.values()] == ["", ""]
+    others = {
+        "other seeds": drive_results("runs/c", "c.sumocfg", human=rows_of([1.0])),
+        "no humans": drive_results("d", "d.sumocfg", pi=[]),
+        "a built-in road": drive_results("e", "ring", human=rows_of([5.0, 7.0])),
+    }
+    assert [first_alternative([plain, each]) for each in others.values()] == [""] * 3
     assert first_alternative([plain]) == ""
 
 

@@ -208,7 +208,9 @@ def test_document_equals_the_file_and_has_all_results(answer: Assessment) -> Non
     assert (written["recommended"] is None) == bool(found.reasons)
     assert written["baseline"]["travel_time"]["count"] == written["seeds"]["test"] >= 5
     assert written["manifest"]["packages"]["libsumo"]
-    assert written["notes"] == ["straight.sumocfg: replaced by values of unjam: seed"]
+    unfinished, replaced = written["notes"]
+    assert unfinished.startswith("human, cruise, 50 %, acc, 50 %: up to 62 % of the vehicles are under way or waiting")
+    assert replaced == "straight.sumocfg: replaced by values of unjam: seed"
     page = render_assessment(answer.page.parent)
     lifted = "acc, 50 %: SUMO lifted 3 vehicles"
     (answer.page.parent / "assessment.json").write_text(json.dumps({**written, "notes": [lifted]}))

@@ -20,7 +20,7 @@ from unjam.measures.notes import episode_notes
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
+from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.text import format_duration
 from unjam.training.evaluate import drive, raise_failure, raise_failures
 from unjam.training.run_folder import lock_new_folder
@@ -96,7 +96,7 @@ def drive_command(
         output.print_results(result.rows, show_all, result.baseline)
         output.print_notes(result.notes)
         first = next(iter(result.rows.values()))[0]
-        if isinstance(road, UserNetwork) and (command := road.plain_sumo_command(first["sumo_seed"])):
+        if command := road.plain_sumo_command(first["sumo_seed"]):
             output.print_notes([f"plain SUMO has the traffic of the first episode without CAVs: {command}"])
         if result.report is not None:
             err_console.print(f"report: {result.report}")

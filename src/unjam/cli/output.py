@@ -1,7 +1,6 @@
 """Output of the command line: tables, one JSON document, progress on standard error, and suggested next commands."""
 
 import json
-import re
 import shlex
 import sys
 import time
@@ -9,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from shutil import get_terminal_size
-from textwrap import fill
+from textwrap import fill, wrap
 from typing import Any, Self, TextIO
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -27,7 +26,7 @@ from unjam.measures.metric_table import RowsByDriver, TableCell, choose_baseline
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, is_expert_unchanged
 from unjam.measures.verdict import short_table_metrics, verdicts
-from unjam.text import format_duration, printable
+from unjam.text import format_duration, printable, split_label
 
 PROGRESS_LINE_SECONDS = 5.0
 """time between two plain lines of progress without a terminal"""
@@ -142,7 +141,7 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
 def break_label(label: str, width: int) -> str:
     """Return the name of a driver in lines of at most `width` characters, broken after punctuation where possible."""
     lines = [""]
-    for part in re.split(r"(?<=[\s:,=/_-])", label):
+    for part in (piece for word in split_label(label) for piece in wrap(word, width, drop_whitespace=False)):
         lines[-1:] = [lines[-1] + part] if len(lines[-1] + part) <= width else [lines[-1], part]
     return "\n".join(filter(None, lines))
 

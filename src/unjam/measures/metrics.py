@@ -440,7 +440,7 @@ def measure(episode: Episode) -> dict[str, Any]:
         "warnings": [asdict(each) for each in episode.warnings],
         **({"slow_entrances": [*map(asdict, episode.slow_entrances)]} if episode.slow_entrances else {}),
         "vehicles": len(episode.vehicle_ids),
-        **episode.trips.at_end,
+        **episode.trips.values_at_end,
         **episode.drawn_values,
         "required_time_gap": episode.audit.required_time_gap,
         "has_lanes": episode.audit.has_lanes,

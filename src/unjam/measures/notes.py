@@ -28,7 +28,14 @@ LOST_DEMAND_PATTERN = re.compile(
 def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return all notes on the episodes of several drivers, the most serious first."""
     lost, others = warning_notes(rows_by_driver)
-    kinds = early_end_notes, _backlog_notes, _congestion_notes, _entrance_notes, teleport_notes, _repeated_drive_notes
+    kinds = (
+        early_end_notes,
+        _backlog_notes,
+        _unfinished_trip_notes,
+        _entrance_notes,
+        teleport_notes,
+        _repeated_drive_notes,
+    )
     notes = (note(rows_by_driver) for note in kinds)
     return [*lost, *(each for group in notes for each in group), *others]
 
@@ -98,7 +105,7 @@ def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
     return notes
 
 
-def _congestion_notes(rows_by_driver: RowsByDriver) -> list[str]:
+def _unfinished_trip_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note if trips of many vehicles have not ended with some drivers, so that travel times are cut off."""
     shares, delayed = dict[str, float](), list[str]()
     for label, rows in rows_by_driver.items():

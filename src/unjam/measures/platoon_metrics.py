@@ -39,9 +39,10 @@ def _fuel_by_power(episode: Episode, columns: Any) -> float:
     The step in which a vehicle enters has no acceleration, so that neither its fuel nor its distance counts.
     """
     if episode.trips.vehicle_ids:
-        with_engine = episode.trips.vehicles_of(*VEHICLE_GROUPS)
-        is_counted = np.array([name in with_engine for name in episode.vehicle_ids], bool)
-        columns = np.flatnonzero(is_counted & np.isin(np.arange(len(is_counted)), np.arange(len(is_counted))[columns]))
+        counted = episode.trips.vehicles_of(*VEHICLE_GROUPS)
+        is_counted = np.array([name in counted for name in episode.vehicle_ids], bool)
+        numbers = np.arange(len(is_counted))[columns]
+        columns = numbers[is_counted[numbers]]
     speeds, fuel, distance = episode.speeds[:, columns], 0.0, 0.0
     for before, after in zip(row_chunks(speeds[:-1]), row_chunks(speeds[1:]), strict=True):
         fuel += float(np.nansum(fuel_rate(after, (after - before) / episode.control_step)))

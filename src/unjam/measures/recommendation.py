@@ -175,7 +175,7 @@ class ControllerResult:
 
     @property
     def open_question(self) -> str:
-        """What is not yet known: the comparison that is worse so far, or whose interval includes zero, as a clause."""
+        """What is not yet known: the comparison that is worse so far, or has an interval with zero, as a clause."""
         comparisons = (self.difference_to_acc, ACC_BASELINE), (self.effect.travel_time, "the human baseline")
         change, baseline = max(
             comparisons, key=lambda each: (each[0].mean >= 0, each[0].low <= 0 <= each[0].high, each[0].half_width)

@@ -1,7 +1,6 @@
 """The page of an assessment: effects of ACC vehicles and controllers on a road, and the recommendation."""
 
 import json
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from math import nan
@@ -22,6 +21,7 @@ from unjam.measures.statistics import Estimate, format_difference, format_percen
 from unjam.reports import figures, space_time
 from unjam.reports.html import render_template
 from unjam.reports.results import original_command, read_results, replace_null
+from unjam.text import split_label
 
 ASSESSMENT_FILE, ASSESSMENT_PAGE = "assessment.json", "assessment.html"
 EFFECT_METRICS = (
@@ -88,7 +88,7 @@ def _first_travel_time(rows: Sequence[dict[str, Any]]) -> str:
 
 def breakable_label(text: str) -> Markup:
     """Return the name of a driver, with line breaks allowed after punctuation, because it may be long."""
-    return Markup("<wbr>").join(re.split(r"(?<=[:,=_])", text))
+    return Markup("<wbr>").join(split_label(text))
 
 
 def _option_label(option: dict[str, Any]) -> str:

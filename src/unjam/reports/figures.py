@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from unjam.measures.statistics import Estimate
-from unjam.reports.results import PlotEpisode, best_step, seconds_by_part
+from unjam.reports.results import PlotEpisode, kept_row, seconds_by_part
 from unjam.text import one_line, printable
 
 SPEED_COLORMAP = "viridis"
@@ -175,9 +175,9 @@ def learning_curve_figure(
         points = np.array([point for point in validations if point[1] is not None], float).reshape(-1, 2)
         label = f"{prefix}validation seeds, deterministic"
         axes.plot(*points.T, color=color, lw=1.8, marker="o", ms=3.5, label=label)
-        if (step := best_step(rows)) and len(runs) == 1:
-            kept = max(found for place, found in points if place == step / 1000)
-            axes.scatter(step / 1000, kept, 110, "none", edgecolors=color, label="network that is kept")
+        if (kept := kept_row(rows)) and len(runs) == 1:
+            place = kept["environment_steps"] / 1000, kept["return_validation"]
+            axes.scatter(*place, 110, "none", edgecolors=color, label="network that is kept")
     for (label, value), style in zip(experts.items(), cycle(("--", ":", "-.", (0, (1, 3))))):
         axes.axhline(value, color=TEXT_COLOR, lw=1.1, ls=style, label=f"{label}, validation seeds")
     axes.set(xlabel="environment steps [thousands]", ylabel="return of an episode")

@@ -100,9 +100,9 @@ def render_report(results: Sequence[Results]) -> str:
     counts = [len(column.rows) for column in columns]
     rows, baseline = {column.name: column.rows for column in columns}, summary.common_baseline(results)
     first = "" if baseline else summary.first_alternative(results)
-    if first in rows:
-        others = {column.name: rows[first] if column.name != first else None for column in columns}
-        columns = [replace(column, baseline_rows=others[column.name]) for column in columns]
+    is_alternative = {each.name: each.name.endswith(f": {HUMAN_LABEL}") and each.name != first for each in columns}
+    if first in rows:  # drivers of CAVs are compared with human drivers of their own folder
+        columns = [replace(each, baseline_rows=rows[first]) if is_alternative[each.name] else each for each in columns]
     headings, table = metric_table(rows, baseline)
     roads = (", ".join(format_drawn_values(episode.drawn_values)) for episode in panels)
     return render_template(
@@ -110,7 +110,8 @@ def render_report(results: Sequence[Results]) -> str:
         title=summary.report_title(results),
         single=single is not None,
         verdicts=[column.verdict for column in columns if column.verdict is not None],
-        baseline_name=first if first in rows else summary.name_baselines(results),
+        baseline_name=summary.name_baselines(results),
+        first_alternative=first if first in rows else "",
         findings=[(name, finding) for name, result in sources if (finding := summary.main_finding(result))],
         warning=summary.mismatch_warning(results),
         notes=[(name, note) for name, result in sources for note in summary.report_notes(result)],

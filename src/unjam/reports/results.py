@@ -230,12 +230,12 @@ def validation_gains(progress: Sequence[dict[str, Any]]) -> tuple[float, float] 
     return (max(returns) - expert, returns[-1] - expert) if returns else None
 
 
-def best_step(progress: Sequence[dict[str, Any]]) -> int | None:
-    """Return the environment steps after which the best network in validation was saved; None: none was better."""
+def kept_row(progress: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """Return the row of progress after which the best network in validation was saved; None: none was better."""
     rows = [row for row in progress if row["return_validation"] is not None]
     best = max(rows, key=lambda row: row["return_validation"], default=None)
     is_better = best is not None and best["return_validation"] > (progress[0]["return_expert"] or 0.0)
-    return best["environment_steps"] if best is not None and is_better else None
+    return best if is_better else None
 
 
 def seconds_by_part(progress: Sequence[dict[str, Any]]) -> dict[str, float]:

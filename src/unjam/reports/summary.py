@@ -20,7 +20,7 @@ from unjam.measures.statistics import (
     paired_difference,
 )
 from unjam.measures.verdict import Rows, Verdict, is_better, road_metrics, verdicts
-from unjam.reports.results import PlotEpisode, Results, best_step
+from unjam.reports.results import PlotEpisode, Results, kept_row
 from unjam.text import format_count, printable
 
 CLOSE_TIME_GAP = 1.0
@@ -77,13 +77,14 @@ def common_baseline(results: Sequence[Results]) -> str:
 
 
 def first_alternative(results: Sequence[Results]) -> str:
-    """Return the column of human drivers in the first of several folders with the same seeds; empty without it.
+    """Return the column of human drivers in the first of several folders of users' networks; empty without it.
 
-    So two configurations of a network are compared, such as with and without a speed limit.
+    Those of the others, on the same seeds, are compared with it: a network with a speed limit with one without, say.
     """
     seeds = {str([row["seed"] for row in result.rows.get(HUMAN_LABEL, [])]) for result in results}
     has_humans = all(HUMAN_LABEL in result.rows and result.trained_label is None for result in results)
-    is_comparison = len(results) > 1 and has_humans and len(seeds) == 1
+    are_networks = all(result.metadata["scenario"].endswith(".sumocfg") for result in results)
+    is_comparison = len(results) > 1 and has_humans and are_networks and len(seeds) == 1
     return f"{folder_names(results)[0]}: {HUMAN_LABEL}" if is_comparison else ""
 
 
@@ -158,8 +159,9 @@ def main_finding(result: Results) -> str:
             f"Return difference to its expert, {expert} (return {returns[expert]:,.0f}), on {seeds}: "
             f"{format_difference(gain)}. {gain_verdict(gain)}"
         )
-        if step := best_step(result.progress):
-            sentences.append(f"The network is that after {step:,} environment steps, the best in validation.")
+        if row := kept_row(result.progress):
+            steps = f"{row['environment_steps']:,} environment steps"
+            sentences.append(f"The network is that after {steps}, the best in validation.")
         if not is_expert_unchanged(gain):
             sentences.append(_traffic_finding(rows, experts[expert], expert, road_metrics(result.rows).compared[0]))
     if best != expert:

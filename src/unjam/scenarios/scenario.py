@@ -256,6 +256,10 @@ class Scenario(Subclassable):
         fields = frozenset(self.provided_fields)
         return RoadInterface(self.title, self.is_closed, self.has_coordinate, fields, self.control_step)
 
+    def plain_sumo_command(self, seed: int) -> str:
+        """Return the command by which plain SUMO has the same traffic without CAVs; empty on built-in roads."""
+        return ""
+
     @property
     def notes(self) -> list[str]:
         """What a user must know about this road in addition to the results."""

@@ -26,6 +26,10 @@ PASSENGER_CLASS = "passenger"
 """the vehicle class of calibrated human drivers: SUMO's default"""
 PASSENGER_CAR_CLASSES = (PASSENGER_CLASS, "private", "hov", "taxi", "evehicle")
 """SUMO's vehicle classes that are passenger cars"""
+UNFINISHED_TRIPS_OPTIONS = "--tripinfo-output.write-unfinished", "--tripinfo-output.write-undeparted"
+"""options by which SUMO also writes the trips of vehicles that are under way or waiting at the end"""
+SUBLANE_RESOLUTION = re.compile(r"(?!\s*-).*[1-9].*")
+"""a value of `lateral-resolution` above 0, by which SUMO uses its sublane model"""
 NON_ROAD_CLASSES = ("rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car")
 NON_ROAD_CLASSES += ("ship", "aircraft", "drone", "pedestrian", "wheelchair", "container")
 """SUMO's vehicle classes that are not road vehicles"""
@@ -222,8 +226,7 @@ class UserNetwork(Scenario):
         begin, end = self._begin(files), self._end(self._begin(files))
         words += ["--begin", f"{begin:g}"] if self.begin is not None else []
         words += ["--end", f"{end:g}"] if files.end is None or abs(end - files.end) > self.simulation_step else []
-        unfinished = ("--tripinfo-output.write-unfinished", "--tripinfo-output.write-undeparted")
-        return shlex.join([*words, "--tripinfo-output", "trips.xml", *unfinished])
+        return shlex.join([*words, "--tripinfo-output", "trips.xml", *UNFINISHED_TRIPS_OPTIONS])
 
     def possible_cav_ids(self) -> tuple[str, ...]:
         """Return names for the maximum number of CAVs: only SUMO knows the ids. Raise `InputError` if there is none."""
@@ -284,7 +287,7 @@ def notes_on_files(files: SumoFiles, max_names: int = MAX_NOTED_NAMES) -> list[s
         map(DROPPED_DEVICE_SHARE.fullmatch, files.dropped_items)
     ):
         notes.append(f"{files.path.name}: without the devices left out, SUMO equips other vehicles with the rest")
-    if float(files.options.get("lateral-resolution", 0.0)) > 0.0:
+    if SUBLANE_RESOLUTION.fullmatch(files.options.get("lateral-resolution", "0")):
         notes.append(
             f"{files.path.name}: with lateral-resolution, SUMO reports the leader of a CAV in its lane even if that is "
             "alongside, and not vehicles that protrude from other lanes: time gaps and controllers are unreliable"

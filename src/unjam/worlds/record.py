@@ -138,7 +138,7 @@ class Trips:
         return self.duration + self.depart_delay
 
     @property
-    def at_end(self) -> dict[str, float]:
+    def values_at_end(self) -> dict[str, float]:
         """Number of vehicles that have not arrived, and share of delay in their travel time; empty without trips."""
         unfinished = ~self.has_arrived
         delay, spent = (float(each[unfinished].sum()) for each in (self.delay, self.travel_time))

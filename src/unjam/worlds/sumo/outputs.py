@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from unjam.errors import DiskError, EpisodeError
+from unjam.scenarios.user_network import UNFINISHED_TRIPS_OPTIONS
 from unjam.worlds.record import SlowEntrance, SumoWarning, Trips
 from unjam.worlds.sumo.networks import MESSAGE_TOTAL_MARKER
 
@@ -37,8 +38,8 @@ SEPARATELY_COUNTED = re.compile(
 
 def trip_options(path: Path) -> list[str]:
     """Return the options by which SUMO writes all trips to a file, including those that have not ended."""
-    unfinished = ("--tripinfo-output.write-unfinished", "--tripinfo-output.write-undeparted")
-    return ["--tripinfo-output", str(path), *(word for option in unfinished for word in (option, "true"))]
+    unfinished = (word for option in UNFINISHED_TRIPS_OPTIONS for word in (option, "true"))
+    return ["--tripinfo-output", str(path), *unfinished]
 
 
 def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
