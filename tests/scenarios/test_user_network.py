@@ -65,15 +65,6 @@ def test_step_and_horizon_are_those_of_the_configuration_unless_set(
 
 
 @pytest.mark.parametrize(
-    ("value", "is_noted"), [("0.8", True), ("2", True), ("0", False), ("0.0", False), ("-1", False), ("abc", False)]
-)
-def test_a_note_names_the_sublane_model(value: str, is_noted: bool, tmp_path: Path) -> None:
-    found = own(tmp_path, f'<processing><lateral-resolution value="{value}"/></processing>').notes
-    words = "with lateral-resolution, SUMO reports the leader of a CAV in its lane even if that is alongside"
-    assert sum(words in note for note in found) == is_noted
-
-
-@pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({}, ""),

@@ -28,8 +28,6 @@ PASSENGER_CAR_CLASSES = (PASSENGER_CLASS, "private", "hov", "taxi", "evehicle")
 """SUMO's vehicle classes that are passenger cars"""
 UNFINISHED_TRIPS_OPTIONS = "--tripinfo-output.write-unfinished", "--tripinfo-output.write-undeparted"
 """options by which SUMO also writes the trips of vehicles that are under way or waiting at the end"""
-SUBLANE_RESOLUTION = re.compile(r"(?!\s*-).*[1-9].*")
-"""a value of `lateral-resolution` above 0, by which SUMO uses its sublane model"""
 NON_ROAD_CLASSES = ("rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car")
 NON_ROAD_CLASSES += ("ship", "aircraft", "drone", "pedestrian", "wheelchair", "container")
 """SUMO's vehicle classes that are not road vehicles"""
@@ -287,11 +285,6 @@ def notes_on_files(files: SumoFiles, max_names: int = MAX_NOTED_NAMES) -> list[s
         map(DROPPED_DEVICE_SHARE.fullmatch, files.dropped_items)
     ):
         notes.append(f"{files.path.name}: without the devices left out, SUMO equips other vehicles with the rest")
-    if SUBLANE_RESOLUTION.fullmatch(files.options.get("lateral-resolution", "0")):
-        notes.append(
-            f"{files.path.name}: with lateral-resolution, SUMO reports the leader of a CAV in its lane even if that is "
-            "alongside, and not vehicles that protrude from other lanes: time gaps and controllers are unreliable"
-        )
     if files.has_bicycle_lanes:
         notes.append(
             f"{files.path.name}: has bicycle lanes, where SUMO repeats an episode only in a new process: travel "

@@ -90,6 +90,7 @@ class SumoFiles(NamedTuple):
     """nested `<param>` elements of the types: values by key, by the type's id"""
     used_types: frozenset[str]  # ids
     has_bicycle_lanes: bool  # for bicycles only
+    has_opposite_lanes: bool  # on which vehicles may overtake
 
 
 _read_files: dict[Path, tuple[dict[Path, FileStamp], SumoFiles]] = {}

@@ -46,7 +46,7 @@ _MODELS = """
 Krauss KraussOrig1 KraussPS KraussX IDM IDMM EIDM SmartSK Daniel1 PWagner2009 BKerner Wiedemann W99 ACC CACC CC Rail
 """
 READ_ELEMENTS = (
-    *(*DEMAND_ELEMENTS, "lane", "param", "person", "personFlow", "personTrip", "calibrator"),
+    *(*DEMAND_ELEMENTS, "lane", "neigh", "param", "person", "personFlow", "personTrip", "calibrator"),
     *("vType", "/vType", "vTypeDistribution", "/vTypeDistribution"),
     *(f"{xml.FOLLOWING_MODEL_PREFIX}{name}" for name in _MODELS.split()),  # nested in types of older files
 )
@@ -103,6 +103,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
         "step": _read_seconds(path, options, "step-length", 1.0) or 1.0,
         "used_types": sorted(demand.used_types()),
         "has_bicycle_lanes": demand.has_bicycle_lanes,
+        "has_opposite_lanes": demand.has_opposite_lanes,
         "types": demand.types,
         "type_parameters": demand.type_parameters,
         "stamps": {str(file): stamps[file] for file in [path, *files, *sorted(stamps.keys() - {path, *files})]},
@@ -198,7 +199,7 @@ class _Demand:
         self.type_parameters: dict[str, XmlAttributes] = {}  # values of the parameters of each type, by key
         self.used_names: set[str] = set()  # types and distributions that vehicles have
         self.first_departure: float | None = inf  # departure of the first vehicle [s]; None: unknown
-        self.has_bicycle_lanes = False
+        self.has_bicycle_lanes = self.has_opposite_lanes = False
         self.calibrates = False  # SUMO's number of expected vehicles excludes those that calibrators will add
         self.last_end = 0.0  # latest end that a flow names, in calibrators and elsewhere [s]
         self._distributions: dict[str, set[str]] = {}  # types of each; other files than the defining one can use it
@@ -215,6 +216,8 @@ class _Demand:
                 self._add_vehicles(attributes, DEMAND_ELEMENTS[tag])
             case "lane":
                 self.has_bicycle_lanes |= attributes.get("allow") == "bicycle"
+            case "neigh":
+                self.has_opposite_lanes = True
             case "param":
                 if self._current_type:
                     self.type_parameters[self._current_type][attributes.get("key", "")] = attributes.get("value", "")

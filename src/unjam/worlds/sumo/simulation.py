@@ -23,6 +23,7 @@ from unjam.worlds.record import SumoWarning, Trips
 from unjam.worlds.sumo.inputs import SumoInputs
 from unjam.worlds.sumo.networks import UNCONTROLLED_LINK_STATES, NetworkLane, last_error_message, sumo_program
 from unjam.worlds.sumo.outputs import MAX_EXAMPLES_OPTION, read_trips, read_warnings, trip_options
+from unjam.worlds.sumo.sublane import INTERNAL_EDGE_PREFIX, find_lateral_neighbors
 from unjam.worlds.sumo.transports import Libsumo, NeighborStates, Traci, Transport, sumo_function
 
 MIN_CONTACT_OVERLAP = 0.01
@@ -174,6 +175,7 @@ class Simulation(AbstractContextManager["Simulation"]):
                     self._library.start([program, *options, *self._gui_options], self._error_log)
                     if self.transport != "libsumo":  # over TraCI each start makes another connection
                         self._bind()
+                self._has_sublanes = float(self._sumo.simulation.getOption("lateral-resolution")) > 0.0
                 self.step()  # the first step inserts the vehicles and moves none
         except Exception as error:
             self._library.end()  # then SUMO's message is in its log, and the next episode can start
@@ -243,20 +245,27 @@ class Simulation(AbstractContextManager["Simulation"]):
         """Return the vehicles' desired speeds over the speed limit, and their maximum speeds [m/s]."""
         return list(zip(map(self._sumo.vehicle.getSpeedFactor, ids), map(self.max_speed, ids), strict=True))
 
-    def neighbors(self, ids: Sequence[str], max_distance: float) -> list[NeighborStates]:
-        """Return the vehicles' neighbors as SUMO sees them; beyond `max_distance` [m], this gap and their own speed."""
-        return [self._neighbors_of(name, max_distance) for name in ids]
-
-    def _neighbors_of(self, name: str, max_distance: float) -> NeighborStates:
+    def neighbors(self, name: str, max_distance: float) -> NeighborStates:
+        """Return a vehicle's neighbors as SUMO sees them; beyond `max_distance` [m], this gap and its own speed."""
         vehicle, speed = self._sumo.vehicle, self._get_speed(name)
-        leader, leader_gap = vehicle.getLeader(name, max_distance) or ("", 0.0)
-        follower, follower_gap = vehicle.getFollower(name, max_distance)
-        values: list[float] = []
-        for other, sumo_gap, rear in ((leader, leader_gap, name), (follower, follower_gap, follower)):
+        if self._has_sublanes:
+            leader, leader_gap, follower, follower_gap = find_lateral_neighbors(self._sumo, name, max_distance)
+        else:
+            leader, leader_gap = vehicle.getLeader(name, max_distance) or ("", 0.0)
+            follower, follower_gap = vehicle.getFollower(name, max_distance)
             # SUMO's gap does not include the minimum gap of the vehicle behind.
-            gap = sumo_gap + vehicle.getMinGap(rear) if other else max_distance
+            leader_gap += vehicle.getMinGap(name)
+            follower_gap += vehicle.getMinGap(follower) if follower else 0.0
+        values: list[float] = []
+        for other, net_gap in ((leader, leader_gap), (follower, follower_gap)):
+            gap = net_gap if other else max_distance
             values += [self._get_speed(other) if gap < max_distance else speed, min(max(gap, 0.0), max_distance)]
         return NeighborStates(leader if values[1] < max_distance else "", *values)
+
+    def is_on_opposite_lane(self, name: str) -> bool:
+        """Return whether a vehicle drives on a lane of the opposite direction, to overtake."""
+        edge = self._sumo.lane.getEdgeID(lane) if (lane := self._get_lane(name)) else ""
+        return bool(edge) and edge[0] != INTERNAL_EDGE_PREFIX and edge not in self.remaining_routes([name])[0][:1]
 
     def is_in_contact(self, name: str, leader: str) -> bool:
         """Return whether a vehicle overlaps with the leader on its lane, longitudinally and laterally."""
