@@ -4,6 +4,7 @@ import ast
 import inspect
 import re
 import textwrap
+from collections.abc import Mapping
 from dataclasses import asdict, is_dataclass
 from io import BytesIO
 from itertools import pairwise
@@ -13,7 +14,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from unjam.cli.options import JsonOption
-from unjam.cli.output import console, new_table, print_json
+from unjam.cli.output import console, new_table, print_json, print_wrapped
 from unjam.controller import PACKAGED_PREFIX, packaged_names
 from unjam.controller.file import read_controller
 from unjam.drivers.observation import FEATURES
@@ -28,6 +29,8 @@ from unjam.worlds.backend import WorldOptions
 from unjam.worlds.sumo.backend import SumoBackend
 
 FAMILY_GROUP = FAMILY_PREFIX.rstrip("/")  # argument that lists the roads of the family
+MIN_TABLE_WIDTH = 100
+"""width from which the list of scenarios is a table [characters]"""
 PICTURE_SECONDS = 60.0  # simulated time after which an open road is drawn [s]; at the start it is almost empty
 
 
@@ -52,13 +55,7 @@ def scenarios_command(
         if json:
             print_json({key: scenario_recipe(scenario) for key, scenario in scenarios.items()})
             return
-        columns = ("road", "vehicles", "limit")
-        table = new_table(("scenario", *columns, "control steps", "warm-up"))
-        for key, scenario in scenarios.items():
-            facts = dict(scenario.facts())
-            warmup = f"{scenario.warmup * scenario.simulation_step:g} s"
-            table.add_row(key, *(facts[column] for column in columns), f"{scenario.horizon:,}", warmup)
-        console.print(table)
+        _print_scenarios(scenarios)
         if name is None:
             console.print(f"{len(FAMILY_SCENARIOS)} roads of `unjam benchmark`: unjam scenarios {FAMILY_GROUP}")
         return
@@ -74,7 +71,24 @@ def scenarios_command(
     for fact in facts:
         table.add_row(*fact)
     console.print(table)
-    console.print(_parameter_table(parameter_entries(scenario), "parameter (--set key=value)"))
+    _print_parameters(parameter_entries(scenario), "parameters (--set key=value)")
+
+
+def _print_scenarios(scenarios: Mapping[str, Any]) -> None:
+    """Print the main facts on scenarios as a table, in a narrow terminal as a list."""
+    columns = ("road", "vehicles", "limit")
+    table = new_table(("scenario", *columns, "control steps", "warm-up"))
+    is_narrow = console.width < MIN_TABLE_WIDTH
+    for key, scenario in scenarios.items():
+        facts, steps = dict(scenario.facts()), f"{scenario.horizon:,}"
+        warmup = f"{scenario.warmup * scenario.simulation_step:g} s"
+        if is_narrow:
+            console.print(key, style="bold")
+            values = (*(f"{column}: {facts[column]}" for column in columns), f"control steps: {steps}")
+            print_wrapped("  " + "; ".join((*values, f"warm-up: {warmup}")))
+        table.add_row(key, *map(facts.__getitem__, columns), steps, warmup)
+    if not is_narrow:
+        console.print(table)
 
 
 def _draw_scenario(scenario: Any, name: str, path: Path) -> None:
@@ -141,7 +155,7 @@ def drivers_command(
         console.print(f"[bold]{name}[/bold]", markup=True)
         console.print(re.sub(r"(?<!\n)\n(?!\n)", " ", descriptions[name]))  # paragraphs of any width
         if rows := [row for row in parameters[name] if row["name"] != "time_step"]:
-            console.print(_parameter_table(rows, f"parameter (--driver {name}:parameter=value)"))
+            _print_parameters(rows, f"parameters (--driver {name}:parameter=value)")
 
 
 def _packaged_summary(name: str, is_brief: bool) -> str:
@@ -187,13 +201,19 @@ def _field_docstrings(kind: type) -> dict[str, str]:
     return texts
 
 
-def _parameter_table(rows: list[dict[str, Any]], title: str) -> Any:
-    table = new_table(("", "default", "meaning"), style="dim")
-    table.title, table.title_style, table.title_justify = title, "dim", "left"
+def _print_parameters(rows: list[dict[str, Any]], title: str) -> None:
+    """Print the name, default and meaning of each parameter, wrapped."""
+    console.print(f"{title}, their defaults and meanings", style="dim", soft_wrap=True)
     for row in rows:
-        value = row["default"]
-        if isinstance(value, dict):
-            texts = {k: f"{v:g}" if type(v) in (int, float) else str(v).lower() for k, v in value.items()}
-            value = ", ".join(f"{key}={text}" for key, text in texts.items())
-        table.add_row(f"  {row['name']}", str(value), " ".join(row["description"].split()))
-    return table
+        name, value = row["name"], row["default"]
+        values = {f"{name}.{key}": each for key, each in value.items()} if isinstance(value, dict) else {name: value}
+        defaults = " ".join(f"{key}={_setting_text(each)}" for key, each in values.items())
+        meaning = " ".join(row["description"].split())
+        print_wrapped(f"  {defaults}" + (f": {meaning}" if meaning else ""))
+
+
+def _setting_text(value: Any) -> str:
+    """Return a value as `--set` reads it."""
+    if type(value) in (int, float):
+        return f"{value:.12g}"
+    return str(value).lower() if isinstance(value, bool) or value is None else str(value) or '""'

@@ -188,6 +188,7 @@ def fuel_ml_per_km(episode: Episode) -> float:
 
     SUMO's emission model, where it was recorded: https://sumo.dlr.de/docs/Models/Emissions.html. HBEFA4 burns 2.2 l/h
     at standstill: on closed roads most of this is time, so that less of it is no evidence of smoother driving.
+    On a user's network it is measured once per second, and diesel counts with the density of gasoline.
     """
     if episode.fuel.size == 0:
         return nan
