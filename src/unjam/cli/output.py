@@ -246,7 +246,7 @@ def suggest_after_drive(
         print_next_command("train on an expert", *command, *options)
     elif is_drawable:
         command = "watch", scenario, "-d", controllers[-1], "--video", f"{Path(scenario).stem}.gif"
-        print_next_command("watch it", *command, *setting_options(changes, backend=backend))
+        print_next_command(f"watch {controllers[-1]}", *command, *setting_options(changes, backend=backend))
 
 
 def setting_options(
