@@ -26,6 +26,7 @@ from unjam.training.assess import (
     missing_budget,
     sensing_notes,
 )
+from unjam.training.episode_log import EPISODES_FILE, EpisodeLog
 from unjam.training.selection import (
     ACC_DRIVER,
     HUMAN_BASELINE,
@@ -219,14 +220,60 @@ def test_document_equals_the_file_and_has_all_results(answer: Assessment) -> Non
     (answer.page.parent / "assessment.json").write_text(json.dumps(written))
 
 
-@pytest.mark.slow
-def test_result_does_not_depend_on_the_number_of_workers(
+@pytest.mark.long
+def test_an_interrupted_assessment_resumes_with_the_same_result_on_any_number_of_workers(
     example_request: AssessmentRequest, answer: Assessment, tmp_path: Path
 ) -> None:
+    stages: list[list[str]] = [[], []]
+
+    def interrupt_in_the_test(name: str, steps: int) -> None:
+        stages[0].append(name)
+        if "test seed" in name:
+            raise KeyboardInterrupt
+
     with WorkerPool(1) as workers:
-        again = assess(example_request, tmp_path / "again", workers)
-    assert repr(again.controller_results) == repr(answer.controller_results)  # NaN, of what is not known, is not itself
-    assert again.document["candidates"] == answer.document["candidates"]
+        with pytest.raises(KeyboardInterrupt):
+            assess(example_request, tmp_path / "out", workers, on_stage=interrupt_in_the_test)
+        resumed = assess(example_request, tmp_path / "out", workers, on_stage=lambda name, _: stages[1].append(name))
+    assert sum("tuning" in name for name in stages[0]) > 0
+    assert not any("tuning" in name for name in stages[1])
+    assert repr(resumed.controller_results) == repr(answer.controller_results)  # NaN is not equal to itself
+    for name in ("candidates", "episodes", "seeds", "baseline", "notes"):
+        assert resumed.document[name] == answer.document[name]
+    for part in (Path(), Path(SELECTION_FOLDER)):
+        assert repr(read_rows(tmp_path / "out" / part)) == repr(read_rows(answer.page.parent / part))
+
+
+@pytest.mark.long
+def test_an_assessment_continues_with_other_controllers_and_more_episodes(file: str, tmp_path: Path) -> None:
+    folder, stages = tmp_path / "out", list[str]()
+    with WorkerPool(2) as workers:
+        assess(make_request(file, [0.5], 13, 0.02, None, ["acc"], HELD), folder, workers)
+        more = make_request(file, [0.5], 20, 0.02, None, ["acc"], HELD)
+        assess(more, folder, workers, on_stage=lambda name, _: stages.append(name))
+        fresh = assess(more, tmp_path / "fresh", workers)
+        assert repr(read_rows(folder)) == repr(read_rows(fresh.page.parent))
+        assert stages[1].startswith("simulating test seed")
+        assert not stages[1].startswith("simulating test seeds 1 ")
+        other = make_request(file, [0.5], 20, 0.02, None, ["acc"], {**HELD, "horizon": 140})
+        with pytest.raises(InputError, match="was made with other settings; allowed: a new folder"):
+            assess(other, folder, workers)
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        *({}, {"setup": "a", "seed": 1, "row": {}}, {"setup": "a", "seed": [1], "row": 3}),
+        *({"setup": [], "seed": [1], "row": {}}, {"setup": "a", "seed": [1], "row": {"mean_speed": "fast"}}),
+    ],
+)
+def test_a_damaged_log_of_episodes_is_refused(
+    entry: dict[str, Any], example_request: AssessmentRequest, tmp_path: Path
+) -> None:
+    EpisodeLog(tmp_path / "out", example_request.network)
+    (tmp_path / "out" / EPISODES_FILE).write_text(json.dumps(entry) + "\n")
+    with pytest.raises(InputError, match=r"out: episodes.jsonl in .* is damaged; allowed: a new folder"):
+        EpisodeLog(tmp_path / "out", example_request.network)
 
 
 @pytest.mark.slow

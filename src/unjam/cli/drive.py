@@ -24,6 +24,7 @@ from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.text import format_duration
 from unjam.training.evaluate import drive, raise_failure, raise_failures
 from unjam.training.run_folder import lock_new_folder
+from unjam.training.trial_log import REQUEST_FILE
 from unjam.worlds.backend import backend_notes, check_support, open_backend
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
@@ -220,12 +221,14 @@ def assess_command(
     """
     from unjam.reports.assessment import OPTION_HEADINGS, option_rows, parse_assessment
     from unjam.training.assess import DEFAULT_CONTROLLERS, assess, make_request
+    from unjam.training.episode_log import EPISODES_FILE
 
     drivers, changes = driver or DEFAULT_CONTROLLERS, opt.merge_settings(changes, opt.parse_settings(settings))
     request = make_request(scenario, _parse_rates(penetration_rates), episodes, precision, minutes, drivers, changes)
     folder = opt.new_folder(out, f"assess-{Path(scenario).stem}")
     progress = output.ProgressReporter("assessing", "steps")
-    with lock_new_folder(folder), progress, WorkerPool(workers) as pool:
+    resume = output.suggest_resume(folder / EPISODES_FILE, *output.arguments_without("--out"), "--out", folder)
+    with lock_new_folder(folder, resumable_file=REQUEST_FILE), resume, progress, WorkerPool(workers) as pool:
         on_message = (lambda line: None) if json else partial(err_console.print, soft_wrap=True)
         assessment = assess(request, folder, pool, progress.update, on_message, progress.begin)
     document = assessment.document
@@ -243,7 +246,7 @@ def assess_command(
         seeds, duration = missing["min_test_seeds"], format_duration(missing["min_seconds"])
         rest = output.arguments_without("--out", "--driver", "-d", "--episodes", "-n", "--minutes")
         drivers = [word for name in missing["drivers"] for word in ("-d", name)]
-        command = *rest, *drivers, "--episodes", missing["min_episodes"]
+        command = *rest, *drivers, "--episodes", missing["min_episodes"], "--out", folder
         output.print_next_command(f"for a verdict ({seeds} test seeds at least, about {duration})", *command)
 
 

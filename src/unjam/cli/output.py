@@ -291,11 +291,11 @@ def suggest_after_training(folder: Path, gain: "Estimate | None", steps: int, ru
 
 
 @contextmanager
-def suggest_resume(folder: Path, *command: object) -> Iterator[None]:
-    """Print the command that resumes a training or a search if the body raises an error."""
+def suggest_resume(file: Path, *command: object) -> Iterator[None]:
+    """Print the command that resumes some work if the body raises an error, and the file that it needs is there."""
     try:
         yield
     except BaseException as error:
-        if not isinstance(error, InputError | MissingPartError) and (folder / "config.toml").is_file():
+        if not isinstance(error, InputError | MissingPartError) and file.is_file():
             print_next_command("resume with", *command)
         raise

@@ -87,7 +87,7 @@ def train_command(
     write_curves = tensorboard_writer(folder) if tensorboard else None
     progress = nullcontext() if json else _TrainingProgress(config, folder)
     same_workers = [] if workers == opt.DEFAULT_WORKERS else ["--workers", workers]
-    with output.suggest_resume(folder, "train", "--resume", folder, *same_workers), progress as display:
+    with output.suggest_resume(folder / "config.toml", "train", "--resume", folder, *same_workers), progress as display:
 
         def on_row(row: dict[str, Any]) -> None:
             for callback in (write_curves, display and display.show_iteration):
@@ -227,7 +227,7 @@ def search_command(
     if not json:
         plan = f"{format_count(trials, 'training')}, {workers} at once: {_plan_text(base)} each, into {folder}"
         err_console.print(f"searching {', '.join(space)} in {plan}", soft_wrap=True)
-    resume = output.suggest_resume(folder, *output.arguments_without("--out"), "--out", folder)
+    resume = output.suggest_resume(folder / REQUEST_FILE, *output.arguments_without("--out"), "--out", folder)
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), resume:
         found = search(base, space, trials, folder, workers, executor, on_message)
     best = folder / BEST_CONFIG_FILE

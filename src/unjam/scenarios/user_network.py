@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Collection, Sequence
 from dataclasses import field, replace
 from functools import cache
+from math import ceil
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
@@ -223,7 +224,9 @@ class UserNetwork(Scenario):
         files, words = read_sumo_files(Path(self.file)), ["sumo", "-c", self.file, "--seed", str(seed)]
         begin, end = self._begin(files), self._end(self._begin(files))
         words += ["--begin", f"{begin:g}"] if self.begin is not None else []
-        words += ["--end", f"{end:g}"] if files.end is None or abs(end - files.end) > self.simulation_step else []
+        # SUMO ends with the first step that reaches its end.
+        has_same_end = files.end is not None and -1e-6 < end - files.end < self.simulation_step - 1e-6
+        words += [] if has_same_end else ["--end", f"{end:.10g}"]
         return shlex.join([*words, "--tripinfo-output", "trips.xml", *UNFINISHED_TRIPS_OPTIONS])
 
     def possible_cav_ids(self) -> tuple[str, ...]:
@@ -269,7 +272,8 @@ def _control_steps_until_end(files: SumoFiles, scenario: UserNetwork) -> int:
     if duration <= 0:
         first = f"> {begin + scenario._time_before_control:g} s, the first step after begin"
         raise invalid_value("end", end, first + (" and the warm-up" if scenario.warmup else ""))
-    return max(1, int(duration / scenario.control_step + 1e-9))
+    steps = ceil(duration / scenario.simulation_step - 1e-9)  # SUMO's last step may pass its end
+    return max(1, steps // scenario.steps_per_control_step)
 
 
 def _format_time(time: float) -> str:

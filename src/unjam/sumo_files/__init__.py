@@ -89,6 +89,7 @@ class SumoFiles(NamedTuple):
     type_parameters: dict[str, dict[str, str]]
     """nested `<param>` elements of the types: values by key, by the type's id"""
     used_types: frozenset[str]  # ids
+    removes_jammed_vehicles: bool  # instead of teleporting them
     has_bicycle_lanes: bool  # for bicycles only
     has_opposite_lanes: bool  # on which vehicles may overtake
 

@@ -102,6 +102,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
         "calibrated_until": demand.last_end if demand.calibrates else 0.0,
         "step": _read_seconds(path, options, "step-length", 1.0) or 1.0,
         "used_types": sorted(demand.used_types()),
+        "removes_jammed_vehicles": options.get("time-to-teleport.remove", "").lower() in TRUE_VALUES,
         "has_bicycle_lanes": demand.has_bicycle_lanes,
         "has_opposite_lanes": demand.has_opposite_lanes,
         "types": demand.types,

@@ -14,7 +14,7 @@ from typing import Any, cast
 
 from unjam.controller import DEFAULT_DRIVER, make_driver
 from unjam.drivers.driver import Driver
-from unjam.drivers.registry import driver_recipe
+from unjam.drivers.registry import driver_recipe, is_serializable
 from unjam.errors import InputError, NoCavError, invalid_value
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
@@ -37,9 +37,9 @@ from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
 from unjam.seeds import held_out_seeds
 from unjam.text import format_count, format_duration
+from unjam.training.episode_log import EpisodeLog, setup_hash
 from unjam.training.evaluate import Evaluation, evaluate_on_roads, raise_failure, save_evaluation
 from unjam.training.executors import MessageCallback
-from unjam.training.run_folder import make_new_folder
 from unjam.training.selection import (
     ACC_DRIVER,
     HUMAN_BASELINE,
@@ -189,13 +189,15 @@ def assess(
     on_message: MessageCallback = lambda line: None,
     on_stage: StageCallback = lambda name, steps: None,
 ) -> Assessment:
-    """Run an assessment, and write rows, `assessment.json` and the page into a new folder, at its end.
+    """Run an assessment, and write rows, `assessment.json` and the page into a folder, at its end.
 
-    Without `minutes`, the result does not depend on the number of workers. `progress` is called with the control steps
-    of an episode, `on_stage` when a batch of episodes begins, and `on_message` with a line about its result. Raise
-    `InputError` if the folder is not empty, or no driver can drive on this road.
+    Finished batches are in a log: in the same folder an assessment of the same road and files resumes, or continues
+    with other controllers, penetration rates and budgets. Without `minutes`, the result does not depend on the number
+    of workers. `progress` is called with the control steps of an episode, `on_stage` when a batch of episodes begins,
+    and `on_message` with a line about its result. Raise `InputError` if the folder has something else, or no driver can
+    drive on this road.
     """
-    make_new_folder(folder)
+    log = EpisodeLog(folder, request.network)
     budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
 
     def evaluate_options(
@@ -209,28 +211,36 @@ def assess(
             if progress is not None:
                 progress((batch, *episode), steps)
 
-        evaluation = evaluate_on_roads(setups, seeds, workers, progress=report_progress, with_plots=with_plots)
-        budget.spend(len(options) * len(seeds))
-        return evaluation
+        return evaluate_on_roads(setups, seeds, workers, progress=report_progress, with_plots=with_plots)
 
     def run_options(kind: str, options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
-        first, last = seeds[0][-1] + 1, seeds[-1][-1] + 1
-        numbers = f"seeds {first} to {last}" if first < last else f"seed {first}"
-        stage = f"simulating {kind} {numbers} of {format_count(len(options), 'option')}"
-        rows = evaluate_options(stage, options, seeds).rows
-        human_rows = rows[HUMAN_BASELINE.label]
+        hashes = {option: setup_hash(*request.make_setup(option)) for option in options}
+        missing = [(option, seed) for option in options for seed in seeds if (hashes[option], seed) not in log.episodes]
+        new_options, new_seeds = dict.fromkeys(option for option, _ in missing), sorted({seed for _, seed in missing})
+        if missing:
+            first, last = new_seeds[0][-1] + 1, new_seeds[-1][-1] + 1
+            numbers = f"seeds {first} to {last}" if first < last else f"seed {first}"
+            stage = f"simulating {kind} {numbers} of {format_count(len(new_options), 'option')}"
+            for option, new_rows in zip(
+                new_options, evaluate_options(stage, [*new_options], new_seeds).rows.values(), strict=True
+            ):
+                log.add(hashes[option], new_seeds, new_rows)
+        budget.spend(len(options) * len(seeds), len(new_options) * len(new_seeds))
+        rows = {option: [log.episodes[hashes[option], seed] for seed in seeds] for option in options}
+        human_rows = rows[HUMAN_BASELINE]
         baseline.extend(human_rows)
         check_baseline(baseline, MIN_BASELINE_EPISODES)
         # If a low penetration rate selects no vehicle for a seed, the traffic is the human baseline.
         return {
             option: [
                 human if row["error"] == NoCavError.__name__ else row
-                for row, human in zip(rows[option.label], human_rows, strict=True)
+                for row, human in zip(rows[option], human_rows, strict=True)
             ]
             for option in options
         }
 
     first = evaluate_options("simulating the human baseline, seed 1 of 1", [HUMAN_BASELINE], held_out_seeds(1), True)
+    budget.spend(1)
     raise_failure(first.rows[HUMAN_BASELINE.label])
     for line in budget_lines(request, budget):
         on_message(line)
@@ -250,6 +260,7 @@ def assess(
     plotted = Option(best.penetration_rate, best.driver) if best else Option(rates[-1], ACC_DRIVER)
     plot_episodes = first.plot_episodes
     plot_episodes |= evaluate_options("simulating the pictures", [plotted], held_out_seeds(1), True).plot_episodes
+    budget.spend(1)
 
     metadata = {"scenario": Path(request.file).name, "reward": request.network.reward, "manifest": manifest()}
     selection_rows = {option.label: rows for option, rows in selection.rows.items()}
@@ -377,7 +388,10 @@ def _assessment_document(
         "baseline": {name: asdict(metric_estimate(baseline_rows, name)) for name in BASELINE_METRICS},
         "road": {**scenario_recipe(request.network), "file": request.file},
         "human_drivers": request.network.human_description,
-        "drivers": {name: driver_recipe(driver)[0] for name, driver in request.drivers.items()},
+        "drivers": {
+            name: driver_recipe(driver)[0] if is_serializable(driver) else driver.describe()
+            for name, driver in request.drivers.items()
+        },
         "penetration_rates": request.penetration_rates,
         "precision": request.precision,
         "budget": {"episodes": request.episodes, "minutes": request.minutes},

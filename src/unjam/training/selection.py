@@ -60,10 +60,10 @@ class EpisodeBudget:
         self.episodes, self.minutes, self.used_episodes = episodes, minutes, 0
         self._workers, self._completed_rounds, self._clock, self._start_time = workers, 0, clock, clock()
 
-    def spend(self, count: int) -> None:
-        """Count episodes that have run in parallel."""
+    def spend(self, count: int, simulated_count: int | None = None) -> None:
+        """Count episodes, of which `simulated_count` (all if None) have run in parallel and the rest were known."""
         self.used_episodes += count
-        self._completed_rounds += ceil(count / self._workers)
+        self._completed_rounds += ceil((count if simulated_count is None else simulated_count) / self._workers)
 
     @property
     def elapsed_seconds(self) -> float:

@@ -1,4 +1,4 @@
-"""Log of the trials of a search, tuning or calibration, with which it resumes after an interruption."""
+"""Logs with which a search, tuning, calibration or assessment resumes after an interruption."""
 
 import json
 from contextlib import suppress
@@ -29,10 +29,10 @@ class TuningTrial:
     verdict: str
 
 
-class TrialLog:
-    """Rows about trials, including those of earlier calls, and verdicts by the first of their seeds."""
+class RowLog:
+    """Rows in the folder of a request, including those of earlier calls."""
 
-    def __init__(self, folder: Path, request: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, request: dict[str, Any], file_name: str) -> None:
         """Begin in a new folder, or resume in that of the same request; raise `InputError` for other folders."""
         request, path, starts = json.loads(to_json(request)), folder / REQUEST_FILE, list[dict[str, Any]]()
         if path.is_file():
@@ -49,25 +49,33 @@ class TrialLog:
         current = manifest()
         self.starts = [*starts, {"commit": current["commit"], "started": current["started"]}]
         atomic_write(path, to_json({"request": request, "starts": self.starts}, indent=1))
-        self._path = folder / TRIALS_FILE
+        self._path = folder / file_name
+        self.rows = read_json_lines(self._path)
+        if self._path.is_file():  # this removes an incomplete last row
+            atomic_write(self._path, "".join(f"{to_json(row)}\n" for row in self.rows))
+
+    def append(self, row: dict[str, Any]) -> None:
+        """Add a row; it is on the disk when this returns."""
+        self.rows.append(row)
+        append_line(self._path, to_json(row))
+
+
+class TrialLog(RowLog):
+    """Rows about trials, and verdicts by the first of their seeds."""
+
+    def __init__(self, folder: Path, request: dict[str, Any]) -> None:
+        """Begin or resume as `RowLog`."""
+        super().__init__(folder, request, TRIALS_FILE)
         self.verdicts: dict[tuple[int, str], TrialVerdict] = {}
         """verdicts by first seed and driver, without damaged rows"""
-        self.rows = read_json_lines(self._path)
         for row in self.rows:
             with suppress(KeyError, TypeError):
                 score, verdict = row["score"], row["verdict"]
                 is_number = isinstance(score, int | float) and not isinstance(score, bool) and isfinite(score)
                 if (score is None or is_number) and isinstance(verdict, str):
                     self.verdicts[row["first_seed"], row["driver"]] = score, verdict
-        if self._path.is_file():  # this removes an incomplete last row
-            atomic_write(self._path, "".join(f"{to_json(row)}\n" for row in self.rows))
 
     def add(self, first_seed: int, driver: str, verdict: TrialVerdict) -> None:
         """Add a verdict; it is on the disk when this returns."""
         self.verdicts[first_seed, driver] = verdict
         self.append({"first_seed": first_seed, "driver": driver, "score": verdict[0], "verdict": verdict[1]})
-
-    def append(self, row: dict[str, Any]) -> None:
-        """Add a row; it is on the disk when this returns."""
-        self.rows.append(row)
-        append_line(self._path, to_json(row))

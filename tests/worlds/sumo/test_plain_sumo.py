@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +136,17 @@ def test_flows_without_an_end_have_as_many_vehicles_as_in_plain_sumo(tmp_path: P
         episode, _ = human_baseline(path, simulation, **changes)
         assert len(episode.trips.vehicle_ids) == (len(plain.vehicle_ids) if end is None else 20)
     assert len(plain.vehicle_ids) == 40
+
+
+@pytest.mark.parametrize(("step", "end"), [(0.3, 50.0), (0.7, 41.0), (0.4, 40.0)])
+def test_the_last_step_is_that_of_plain_sumo(step: float, end: float, tmp_path: Path, simulation: Simulation) -> None:
+    path = straight(tmp_path, '<flow id="f" type="car" route="along" period="3" end="40"/>', end=end, step=step)
+    episode, sumo_seed = human_baseline(path, simulation)
+    check_same_trips(episode.trips, trips_of_plain_sumo(path, sumo_seed, end))
+    scenario = make_scenario(str(path), {"penetration_rate": 0.2})
+    assert "--end" not in scenario.plain_sumo_command(1)
+    longer = replace(scenario, steps_per_control_step=4, horizon=scenario.horizon // 4)
+    assert "--end" in longer.plain_sumo_command(1)
 
 
 def test_trips_of_any_type_have_its_class(tmp_path: Path, simulation: Simulation) -> None:

@@ -4,17 +4,20 @@ import re
 import subprocess
 from collections import Counter
 from pathlib import Path
+from xml.etree import ElementTree
 
 import libsumo
 import numpy as np
 import pytest
 
 import unjam
+from unjam.controller import make_driver
 from unjam.drivers.command import Command
 from unjam.measures.metrics import measure
 from unjam.scenarios import make_scenario
+from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
-from unjam.worlds.sumo.backend import make_traffic
+from unjam.worlds.sumo.backend import SumoBackend, make_traffic
 from unjam.worlds.sumo.networks import sumo_program
 from unjam.worlds.sumo.open_road import OpenTraffic
 from unjam.worlds.sumo.simulation import Simulation
@@ -94,6 +97,31 @@ def test_a_reinserted_cav_is_driven_again(blocked_network: Path, simulation: Sim
         assert first.start_step + len(first.applied_acceleration) < last.start_step
         is_commanded += np.isclose(np.diff(last.states.speed), 0.15).tolist()
     assert sum(is_commanded) > 100, "with 0.3 m/s2 for half a second, without a leader"
+
+
+@pytest.mark.parametrize("driver", ["human", "acc"])
+def test_vehicles_that_sumo_removes_from_a_jam_have_not_arrived(
+    driver: str, blocked_network: Path, tmp_path: Path, simulation: Simulation
+) -> None:
+    option = '<time-to-teleport value="5"/>'
+    removing = blocked_network.with_name("removing.sumocfg")
+    text = blocked_network.read_text().replace(option, f'{option}<time-to-teleport.remove value="true"/>')
+    removing.write_text(text.replace("</configuration>", '<max-num-teleports value="100"/></configuration>'))
+    scenario = make_scenario(str(removing), {"penetration_rate": 1e-9 if driver == "human" else 1.0})
+    episode = run_episode(scenario, make_driver(driver, 0.5), 1, backend=SumoBackend(simulation))
+    trips = tmp_path / "trips.xml"
+    command = [sumo_program("sumo"), "-c", str(removing), "--tripinfo-output", str(trips)]
+    subprocess.run([*command, "--tripinfo-output.write-unfinished"], check=True, capture_output=True)
+    reasons = Counter(trip.get("vaporized", "") for trip in ElementTree.parse(trips).iter("tripinfo"))
+    if driver == "human":
+        assert episode.teleports == reasons["teleport"] > 3
+    assert episode.teleports > 3
+    assert episode.arrivals == episode.trips.has_arrived.sum() == len(episode.vehicle_ids) - episode.teleports
+    whole, _ = drive_network(simulation, blocked_network, 1e-9)
+    assert measure(episode)["outflow_veh_per_h"] < measure(whole)["outflow_veh_per_h"]
+    removing.write_text(text.replace("</configuration>", '<max-num-teleports value="2"/></configuration>'))
+    stopped = run_episode(scenario, make_driver(driver, 0.5), 1, backend=SumoBackend(simulation))
+    assert (stopped.status, stopped.teleports) == ("teleports", 3)
 
 
 def test_teleports_are_reported(blocked_network: Path, tmp_path: Path) -> None:

@@ -18,6 +18,8 @@ from unjam.worlds.sumo.networks import MESSAGE_TOTAL_MARKER
 NOT_ARRIVED = -1.0
 TRIP_ATTRIBUTES = "departDelay", "duration", "timeLoss", "arrival", "departSpeed"
 """attributes of a trip that are read [s, m/s]"""
+REMOVAL_REASONS = "teleport", "collision"
+"""values of `vaporized` of vehicles that SUMO removes from a jam or a collision instead of teleporting them"""
 MIN_NOTED_DELAY, MIN_NOTED_VEHICLES = 2.0, 10
 """mean insertion delay [s] and number of vehicles from which an entrance is slow"""
 FREE_SPEED_SHARE = 0.8
@@ -45,12 +47,16 @@ def trip_options(path: Path) -> list[str]:
 def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
     """Return the trips in a file that SUMO has closed, except those that ended by `warmup_end` [s] or depart later.
 
-    `vehicle_classes` has the vehicle class of each vehicle type. Raise `DiskError` if the file is not complete.
+    A vehicle that SUMO removed has not arrived: its trip counts until the last one in the file ends. `vehicle_classes`
+    has the vehicle class of each vehicle type. Raise `DiskError` if the file is not complete.
     """
     ids, kinds, entrances, times = list[str](), list[str](), list[str](), list[list[float]]()
+    end, removed = 0.0, list[bool]()
     try:
         for _, element in ElementTree.iterparse(path):
             trip = element.attrib
+            if element.tag == "tripinfo":
+                end = max(end, float(trip["depart"]) + float(trip["duration"]))
             if element.tag != "tripinfo" or NOT_ARRIVED < float(trip["arrival"]) <= warmup_end:
                 continue
             if float(trip["depart"]) >= 0.0 or float(trip["departDelay"]) > 0.0:
@@ -58,11 +64,14 @@ def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -
                 kinds.append(_vehicle_class(trip["vType"], vehicle_classes))
                 entrances.append(trip["departLane"].rpartition("_")[0])
                 times.append([float(trip[name]) for name in TRIP_ATTRIBUTES])
+                removed.append(trip.get("vaporized") in REMOVAL_REASONS)
             element.clear()
     except ElementTree.ParseError:
         raise DiskError(f"SUMO has not written {path.name} whole; allowed: space in {path.parent}") from None
     delay, duration, time_loss, arrival, speed = np.array(times, np.float64).reshape(-1, len(TRIP_ATTRIBUTES)).T
-    has_arrived = arrival != NOT_ARRIVED
+    is_removed = np.array(removed, bool)
+    rest = np.where(is_removed, end - arrival, 0.0)
+    duration, time_loss, has_arrived = duration + rest, time_loss + rest, (arrival != NOT_ARRIVED) & ~is_removed
     return Trips(tuple(ids), tuple(kinds), delay, duration, time_loss, has_arrived, tuple(entrances), speed)
 
 

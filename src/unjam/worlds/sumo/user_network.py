@@ -50,6 +50,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         self._edge_numbers: dict[str, int] = {}
         self._allowed_speed_sum, self._allowed_speed_count = 0.0, 0
         self._contact_cavs = set[str]()
+        self._teleport_total = 0
         self._entered_vehicle_count, self._selected_cav_count = 0, 0
         self._limits_of_vehicle: dict[str, VehicleLimits] = {}
         self._hidden_time_loss: dict[str, float] = {}
@@ -94,6 +95,12 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         before = self._vehicles.teleports
         super()._update_active_vehicles()
         road, simulation = self.road, self._simulation
+        if road.files.removes_jammed_vehicles:  # SUMO lists them with the arrivals only
+            total = simulation.teleport_count()
+            removed = total - self._teleport_total - (self._vehicles.teleports - before)
+            self._teleport_total = total
+            self._vehicles.arrivals -= removed
+            self._vehicles.teleports += removed
         max_teleports = int(road.files.options.get("max-num-teleports", -1))
         if self._vehicles.teleports > before and 0 <= max_teleports < simulation.teleport_count():
             self.stop_reason = f"more than {max_teleports} teleports (max-num-teleports)"

@@ -1,0 +1,51 @@
+"""Log of the episodes of an assessment, with which it resumes, or continues with more episodes."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from safetensors.numpy import save
+
+from unjam.drivers.driver import Driver
+from unjam.drivers.registry import driver_recipe, is_serializable
+from unjam.errors import InputError
+from unjam.files import INVALID_DATA_ERRORS, sha256_of, to_json
+from unjam.measures.metrics import METRICS
+from unjam.reports.results import replace_null
+from unjam.scenarios import scenario_recipe
+from unjam.scenarios.scenario import Scenario
+from unjam.training.fingerprint import file_hashes
+from unjam.training.trial_log import RowLog
+
+EPISODES_FILE = "episodes.jsonl"
+
+
+class EpisodeLog(RowLog):
+    """Rows of metrics by scenario and driver, and by seed."""
+
+    def __init__(self, folder: Path, scenario: Scenario) -> None:
+        """Begin in a new folder, or resume in one with the same scenario and files; `InputError` for other folders."""
+        request = {"scenario": scenario_recipe(scenario), "files": file_hashes((), scenario)}
+        super().__init__(folder, request, EPISODES_FILE)
+        self.episodes: dict[tuple[str, tuple[int, ...]], dict[str, Any]] = {}
+        """rows by the hash of a setup and the seed"""
+        for entry in self.rows:
+            try:
+                row = replace_null(entry["row"])
+                if not all(isinstance(row[name], int | float) for name in METRICS):
+                    raise TypeError("a metric is no number")
+                self.episodes[entry["setup"], tuple(entry["seed"])] = row
+            except INVALID_DATA_ERRORS:
+                raise InputError(f"out: {EPISODES_FILE} in {str(folder)!r} is damaged; allowed: a new folder") from None
+
+    def add(self, setup: str, seeds: Iterable[tuple[int, ...]], rows: Iterable[dict[str, Any]]) -> None:
+        """Add the rows of the episodes of a setup; they are on the disk when this returns."""
+        for seed, row in zip(seeds, rows, strict=True):
+            self.episodes[setup, seed] = row
+            self.append({"setup": setup, "seed": seed, "row": row})
+
+
+def setup_hash(scenario: Scenario, driver: Driver) -> str:
+    """Return the SHA-256 of a scenario, a driver and its weights; a driver of this process alone counts by its name."""
+    recipe, arrays = driver_recipe(driver) if is_serializable(driver) else (driver.describe(), {})
+    return sha256_of(to_json([scenario_recipe(scenario), recipe]).encode() + save(arrays))
