@@ -11,6 +11,7 @@ from unjam.following.calibration import CalibrationSettings, MultiStepSettings
 from unjam.following.fit_drivers import FitDriversSettings, fit_drivers, fit_drivers_from_files
 from unjam.physics.idm import IDMParameters
 from unjam.recordings.trajectories import FollowingTrajectory
+from unjam.scenarios.population import Population, reserve_population
 
 HEADWAYS = (0.9, 1.1, 1.3, 1.5, 1.7)
 QUICK = CalibrationSettings(generations=15)
@@ -69,6 +70,7 @@ def test_unsupported_data_and_settings_are_refused(trajectories: list[FollowingT
         fit_drivers(trajectories, FitDriversSettings(individual=("exponent",)))
 
 
+ONE_DRIVER = Population(IDMParameters(), (IDMParameters(),), (-5.0, 2.0))
 CHANGES = {"calibration.generations": 2, "residual": False}
 
 
@@ -135,7 +137,6 @@ def test_drivers_of_several_files_have_different_names(data: Path, tmp_path: Pat
         ({"calibration.speed": 2}, {}, "calibration.speed: unknown name"),
         ({}, {"filters": {"kind": "robot"}}, "no trajectory has the kind 'robot'; available: ACC, human"),
         ({}, {"filters": {"color": "red"}}, "select: 'color' is not allowed"),
-        ({}, {"out": Path("drivers.toml")}, "out: 'drivers.toml' is not allowed"),
     ],
 )
 def test_invalid_input_is_refused(data: Path, changes: dict, more: dict, words: str) -> None:
@@ -144,16 +145,31 @@ def test_invalid_input_is_refused(data: Path, changes: dict, more: dict, words: 
 
 
 @pytest.mark.parametrize("name", ["drivers.json", "drivers.safetensors"])
-def test_existing_files_are_not_overwritten(name: str, data: Path, tmp_path: Path) -> None:
-    (tmp_path / name).write_text("mine")
-    with pytest.raises(InputError, match=rf"out: .*{name}' exists; allowed: a new file"):
-        fit_drivers_from_files([data], CHANGES, out=tmp_path / "drivers.json")
-    assert (tmp_path / name).read_text() == "mine"
+def test_existing_files_are_not_overwritten_even_if_they_appear_during_the_calibration(
+    name: str, tmp_path: Path
+) -> None:
+    with reserve_population(tmp_path / "drivers.json") as write:
+        (tmp_path / name).write_text("mine")
+        with pytest.raises(InputError, match=rf"out: .*{name}' exists; allowed: a new file"):
+            write(ONE_DRIVER)
+    with pytest.raises(InputError, match="exists"), reserve_population(tmp_path / "drivers.json"):
+        pass
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine")]
 
 
-def test_missing_output_folder_is_refused_before_the_calibration(data: Path, tmp_path: Path) -> None:
-    with pytest.raises(DiskError):
-        fit_drivers_from_files([data], CHANGES, out=tmp_path / "gone" / "drivers.json")
+def test_two_calibrations_cannot_have_the_same_output(tmp_path: Path) -> None:
+    out = tmp_path / "drivers.json"
+    with reserve_population(out) as write:
+        with pytest.raises(InputError, match="is being written by another process"), reserve_population(out):
+            pass
+        write(ONE_DRIVER)
+    assert [path.name for path in tmp_path.iterdir()] == ["drivers.json"]
+
+
+@pytest.mark.parametrize(("name", "error"), [("gone/drivers.json", DiskError), ("drivers.csv", InputError)])
+def test_a_wrong_output_is_refused_before_the_calibration(name: str, error: type[Exception], tmp_path: Path) -> None:
+    with pytest.raises(error), reserve_population(tmp_path / name):
+        pass
 
 
 @pytest.mark.slow

@@ -62,7 +62,7 @@ class BenchmarkResult:
     driver: Annotated[StrictStr, Field(min_length=1, max_length=MAX_LABEL_CHARACTERS)]
     sha256: StrictStr | None
     """hash of the driver: its controller file, or else its parameters, code and weights; None: a Python object"""
-    training_steps: StrictInt | None
+    training_steps: Annotated[StrictInt, Field(ge=0)] | None
     """control steps in the simulator of its training or tuning, as its file or its author says; None: unknown"""
     manifest: dict[str, Any] = field(repr=False)
     """versions of unjam and SUMO, machine, command"""

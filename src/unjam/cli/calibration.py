@@ -13,7 +13,7 @@ from unjam.errors import InputError
 from unjam.road_family import FAMILY, ROAD_GROUPS
 from unjam.scenarios import make_scenario
 from unjam.scenarios.family import family_scenarios
-from unjam.scenarios.population import write_population
+from unjam.scenarios.population import reserve_population
 from unjam.training.run_folder import lock_new_folder
 from unjam.training.trial_log import REQUEST_FILE
 from unjam.worlds.reward import make_reward
@@ -218,9 +218,9 @@ def fit_drivers_command(
     changes: dict[str, Any] = {"residual": residual, "seed": seed, **opt.parse_settings(settings)}
     columns = tuple(name for name in driver.split(",") if name)
     filters = {name: str(value) for name, value in opt.parse_settings(select, "--select").items()}
-    with output.ProgressReporter("calibrating drivers") as reporter:
-        fit = fit_drivers_from_files(data, changes, format, drop_bad_rows, columns, filters, out, reporter)
-    write_population(out, fit.population)
+    with reserve_population(out) as write, output.ProgressReporter("calibrating drivers") as reporter:
+        fit = fit_drivers_from_files(data, changes, format, drop_bad_rows, columns, filters, reporter)
+        write(fit.population)
     if json:
         print_json({"population": str(out), "read": fit.notes, **fit.facts()})
         return

@@ -12,7 +12,6 @@ from pydantic import Field
 
 from unjam.drivers.network import Network
 from unjam.errors import InputError, invalid_value, unknown_name
-from unjam.files import check_parent_folder
 from unjam.following.calibration import (
     CALIBRATED_PARAMETERS,
     CalibratedIDM,
@@ -26,7 +25,7 @@ from unjam.parameters import STRICT, NonNegativeInt, PositiveInt, build_dataclas
 from unjam.physics.idm import IDMParameters
 from unjam.recordings.loaders import ReadOptions, read_trajectories
 from unjam.recordings.trajectories import FollowingTrajectory, select_splits, split_by_driver
-from unjam.scenarios.population import WEIGHTS_SUFFIX, Population
+from unjam.scenarios.population import Population
 from unjam.text import format_count, shorten_list
 
 DriverProgress = Callable[[int, int], object]
@@ -101,21 +100,13 @@ def fit_drivers_from_files(
     drop_bad_rows: bool = False,
     driver_columns: tuple[str, ...] = (),
     filters: dict[str, str] | None = None,
-    out: Path | None = None,
     on_progress: DriverProgress = lambda *done: None,
 ) -> FittedDrivers:
     """Calibrate a population to the trajectories in files, with `overrides` of `FitDriversSettings`.
 
     `format`, `drop_bad_rows` and `driver_columns` are those of `read_trajectories`; `filters` values of `kind`, `split`
-    or `driver`. Name and folder of `out` are checked first. Raise `InputError` if a file, a row or a setting is wrong,
-    `out` or its weights exist, or no trajectory is selected, `DiskError` if the folder of `out` does not exist.
+    or `driver`. Raise `InputError` if a file, a row or a setting is wrong, or no trajectory is selected.
     """
-    if out is not None:
-        if out.suffix != ".json":
-            raise invalid_value("out", str(out), "a .json file")
-        check_parent_folder(out)
-        if used := [str(file) for file in (out, out.with_suffix(WEIGHTS_SUFFIX)) if os.path.lexists(file)]:
-            raise InputError(f"out: {used[0]!r} exists; allowed: a new file")
     settings = build_dataclass(FitDriversSettings, nest_keys(overrides), "")
     trajectories: list[FollowingTrajectory] = []
     notes = []

@@ -6,6 +6,8 @@ Nothing in it is ever executed.
 
 import json
 import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from importlib.resources import files
@@ -19,10 +21,11 @@ from safetensors.numpy import load, save
 from unjam import __version__
 from unjam.drivers.network import Network, network_weights
 from unjam.errors import InputError, invalid_value, unknown_name
-from unjam.files import INVALID_DATA_ERRORS, PACKAGED_PREFIX, atomic_write, sha256_of, to_json
+from unjam.files import INVALID_DATA_ERRORS, PACKAGED_PREFIX, atomic_write, check_parent_folder, sha256_of, to_json
 from unjam.parameters import build_dataclass
 from unjam.physics.arrays import Array, clip, namespace
 from unjam.physics.idm import IDM_PARAMETER_NAMES, IDMParameters
+from unjam.processes import lock_file
 
 PACKAGED_POPULATIONS = Path(str(files("unjam") / "scenarios/populations"))
 """folder of the packaged populations, in which each driver has five individual parameters"""
@@ -90,6 +93,31 @@ def apply_population(
     if population.residual is not None:
         acceleration = acceleration + population.residual(residual_inputs(speed, leader_speed, gap))
     return clip(acceleration, *population.limits)
+
+
+@contextmanager
+def reserve_population(path: Path) -> Iterator[Callable[[Population], None]]:
+    """Lock the name of a new population for this process, and yield the function that writes it.
+
+    Raise `InputError` if the file or that of its residual exists, now or when it is written, or another process has
+    locked the name, `DiskError` if its folder does not exist.
+    """
+
+    def check() -> None:
+        if used := [str(file) for file in (path, path.with_suffix(WEIGHTS_SUFFIX)) if os.path.lexists(file)]:
+            raise InputError(f"out: {used[0]!r} exists; allowed: a new file")
+
+    def write(population: Population) -> None:
+        check()
+        write_population(path, population)
+
+    if path.suffix != ".json":
+        raise invalid_value("out", str(path), "a .json file")
+    check_parent_folder(path)
+    check()
+    with lock_file(path.with_name(f".{path.name}.lock"), f"out: {str(path)!r}"):
+        check()
+        yield write
 
 
 def write_population(path: Path, population: Population) -> None:
