@@ -72,6 +72,15 @@ def test_a_verdict_on_fuel_names_the_other_model_if_it_disagrees() -> None:
     assert ", but less flow and more fuel by emission model, " in verdict
 
 
+def test_more_teleports_are_the_price_of_a_better_metric() -> None:
+    found = {"human": episodes(teleports=1), "pi": episodes(mean_speed=30.0, teleports=3)}
+    (verdict,) = verdicts(found)
+    assert verdict.comparison.endswith(", but 8 more vehicles teleported or removed, 4 paired seeds")
+    assert verdict.is_better is None
+    (verdict,) = verdicts(found | {"human": episodes(teleports=3)})
+    assert (verdict.is_better, "teleported" in verdict.comparison) == (True, False)
+
+
 def test_few_seeds_decide_nothing() -> None:
     verdict = lines_of(human=episodes(count=1), pi=episodes(count=1, mean_speed=30.0))[0]
     assert verdict == "pi: feasible; mean speed undecided compared with human drivers, 1 paired seed, which are too few"

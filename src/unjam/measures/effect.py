@@ -11,6 +11,7 @@ from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, overall_fe
 from unjam.measures.statistics import (
     CONFIDENCE,
     Estimate,
+    count_teleports,
     estimate,
     format_difference,
     format_share,
@@ -133,7 +134,7 @@ def effect_of(
     fuel_metric = POWER_FUEL_METRIC if is_measured(ran, LAG_METRIC) else FUEL_METRIC
     metrics = TIME_METRIC, FLOW_METRIC, fuel_metric, HARD_BRAKING_METRIC
     differences = (paired_difference(rows, baseline, name, confidence) for name in metrics)
-    teleports, baseline_teleports = (sum(row.get("teleports", 0) for row in each) for each in (rows, baseline))
+    teleports, baseline_teleports = map(count_teleports, (rows, baseline))
     return Effect(
         *differences,
         collisions=float(sum(row["collisions"] for row in ran) - sum(row["collisions"] for row in baseline_ran)),

@@ -231,7 +231,7 @@ def mean_travel_time(episode: Episode) -> float:
     if not len(episode.backlog):
         return nan
     under_way = (~np.isnan(episode.speeds)).sum(axis=1) + episode.backlog
-    demand = len(episode.vehicle_ids) + episode.backlog[-1] - episode.teleported
+    demand = len(episode.vehicle_ids) + episode.backlog[-1] - episode.teleported - episode.removed
     remaining = episode.planned_duration - episode.control_steps * episode.control_step
     lost = max(0.0, remaining) if collided else 0.0
     return float((under_way[1:].sum() * episode.control_step + under_way[-1] * lost) / (demand or np.nan))

@@ -7,7 +7,7 @@ from typing import Any
 
 from unjam.errors import InputError
 from unjam.measures.metric_table import RowsByDriver
-from unjam.measures.statistics import has_ended_early
+from unjam.measures.statistics import count_teleports, has_ended_early
 from unjam.text import format_count
 
 MAX_EARLY_END_SHARE = 0.05
@@ -74,7 +74,7 @@ def check_baseline(rows: Sequence[dict[str, Any]], planned_episodes: int = 0) ->
 
 def teleport_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note for each driver with teleports, which do not exist in real traffic."""
-    counts = {label: sum(row["teleports"] for row in rows) for label, rows in rows_by_driver.items()}
+    counts = {label: count_teleports(rows) for label, rows in rows_by_driver.items()}
     return [
         f"{label}: SUMO teleported or removed {format_count(count, 'vehicle')}, which had waited longer than "
         "time-to-teleport or collided"

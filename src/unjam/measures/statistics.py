@@ -92,6 +92,11 @@ def display_digits(value: Estimate, digits: int) -> int:
     return digits + 2 if value.mean and not round(value.mean, digits) else digits
 
 
+def count_teleports(rows: Sequence[dict[str, Any]]) -> int:
+    """Return the number of vehicles that SUMO teleported or removed in all episodes together."""
+    return sum(row.get("teleports", 0) for row in rows)
+
+
 def has_ended_early(row: dict[str, Any]) -> bool:
     """Return whether an episode ran but ended early, from its row of `measure`."""
     return row.get("status", "completed") not in ("completed", "failed")

@@ -9,7 +9,7 @@ from unjam.measures.effect import FLOW_METRIC, FUEL_METRIC, LAG_METRIC, POWER_FU
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import HUMAN_LABEL, RowsByDriver, estimate_cell, metric_table
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import Estimate, paired_difference, relative_difference
+from unjam.measures.statistics import Estimate, count_teleports, pair_rows, paired_difference, relative_difference
 from unjam.text import format_count
 
 if TYPE_CHECKING:  # imported late, so that commands start quickly
@@ -146,14 +146,20 @@ def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible:
         for name, difference in differences.items()
         if difference.count and name in names
     )
-    comparison = _comparison(differences, changes, pairs, name_of_others)
-    return Verdict(label, feasible, comparison, changes[names[0]], (*texts,))
+    prices = [text for name, text in PRICES.items() if changes.get(name) is False]
+    own, paired = zip(*pair_rows(rows, others), strict=True)
+    if (teleports := count_teleports(own) - count_teleports(paired)) > 0:
+        prices.append(f"{format_count(teleports, 'more vehicle')} teleported or removed")
+    comparison = _comparison(differences, changes, pairs, name_of_others, " and ".join(prices))
+    # A vehicle that SUMO moves on, or takes off the road, makes traffic look better.
+    verdict = None if changes[names[0]] and teleports > 0 else changes[names[0]]
+    return Verdict(label, feasible, comparison, verdict, (*texts,))
 
 
 def _comparison(
-    differences: dict[str, Estimate], changes: dict[str, bool | None], pairs: int, name_of_others: str
+    differences: dict[str, Estimate], changes: dict[str, bool | None], pairs: int, name_of_others: str, price: str
 ) -> str:
-    """Return whether the first metric is shown to be better or worse, and what is shown to be worse then."""
+    """Return whether the first metric is shown to be better or worse, and the price of what is better."""
     first = next(iter(differences))
     label, seeds = METRICS[first].label.partition(",")[0], format_count(pairs, "paired seed")
     if changes[first] is None:
@@ -162,7 +168,6 @@ def _comparison(
         return f"{label} undecided compared with {name_of_others}, {seeds}{reason}"
     if not changes[first]:
         return f"{label} worse than that of {name_of_others}, {seeds}"
-    price = " and ".join(text for name, text in PRICES.items() if changes.get(name) is False)
     return f"{label} better than that of {name_of_others}{price and f', but {price}'}, {seeds}"
 
 

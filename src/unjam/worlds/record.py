@@ -235,9 +235,11 @@ class Episode:
     free_flow_time: float = float("nan")
     """mean travel time in free flow [s]; NaN if unknown"""
     backlog: Floats = field(default_factory=lambda: np.zeros(0))
-    """insertion backlog, including teleported vehicles, shape (T + 1,); (0,) on a closed road"""
+    """insertion backlog, including teleported and removed vehicles, shape (T + 1,); (0,) on a closed road"""
     teleported: int = 0
     """vehicles of the backlog at the end that were teleported and not reinserted"""
+    removed: int = 0
+    """vehicles of the backlog at the end that SUMO has removed for good, from a jam or a collision"""
     lane_lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))
     """lanes of a road with ends: rows (x, y) [m], a row of NaN between two; (0, 2) if not recorded"""
     poses: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)))

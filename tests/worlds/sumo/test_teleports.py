@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 import unjam
+from tests.worlds.sumo.user_networks import straight
 from unjam.controller import make_driver
+from unjam.drivers import Human
+from unjam.drivers.car_following import Constant
 from unjam.drivers.command import Command
 from unjam.measures.metrics import measure
 from unjam.scenarios import make_scenario
@@ -122,6 +125,32 @@ def test_vehicles_that_sumo_removes_from_a_jam_have_not_arrived(
     removing.write_text(text.replace("</configuration>", '<max-num-teleports value="2"/></configuration>'))
     stopped = run_episode(scenario, make_driver(driver, 0.5), 1, backend=SumoBackend(simulation))
     assert (stopped.status, stopped.teleports) == ("teleports", 3)
+
+
+def test_a_driver_that_lets_sumo_remove_all_vehicles_has_a_worse_travel_time_and_return(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    flow = '<flow id="f" type="car" route="along" begin="0" number="8" period="4"/>'
+    options = '<time-to-teleport value="5"/><time-to-teleport.remove value="true"/>'
+    path = straight(tmp_path, flow, end=200.0, step=0.5, options=options)
+    human, stop = (
+        run_episode(
+            make_scenario(str(path), {"penetration_rate": 1.0, "safety.active": False}),
+            driver,
+            1,
+            backend=SumoBackend(simulation),
+        )
+        for driver in (Human(), Constant(-1.0))
+    )
+    assert human.arrivals == len(human.vehicle_ids) == 8
+    assert stop.arrivals == 0
+    assert stop.removed == stop.teleports >= 1
+    found, expected = measure(stop), measure(human)
+    assert found["travel_time"] > expected["travel_time"] + 50.0
+    assert found["delay"] > expected["delay"] + 50.0
+    assert found["return"] < expected["return"]
+    assert found["mean_speed"] < expected["mean_speed"]
+    assert stop.control_steps * 0.5 == pytest.approx(200.0, abs=1.0)
 
 
 def test_teleports_are_reported(blocked_network: Path, tmp_path: Path) -> None:

@@ -49,6 +49,8 @@ class ActiveVehicles:
         """the same for vehicles that SUMO has teleported and not yet reinserted"""
         self.collided = set[str]()
         self.arrivals = self.teleports = 0
+        self.removed_count = 0
+        """vehicles that SUMO removed for good, among the teleports: they never arrive"""
 
     def update(self, simulation: Simulation, is_cav: Callable[[str], bool]) -> tuple[list[str], Sequence[str]]:
         """Update after a step, and return the vehicles that left and that entered, which `is_cav` judges."""
@@ -73,8 +75,13 @@ class ActiveVehicles:
         self.collided.update(colliding)
         removed = set(colliding).intersection(simulation.arrived_vehicles())
         removed -= set(simulation.teleporting_vehicles())  # one that is teleported to its end has arrived
-        self.arrivals -= len(removed)
-        self.teleports += len(removed)
+        self.add_removals(len(removed))
+
+    def add_removals(self, count: int) -> None:
+        """Count vehicles that SUMO has removed, and lists as arrived."""
+        self.arrivals -= count
+        self.teleports += count
+        self.removed_count += count
 
 
 class OpenTraffic(Traffic[OpenRoadT]):
@@ -149,7 +156,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
 
     @property
     def backlog(self) -> int:
-        """The insertion backlog now, including teleported vehicles."""
+        """The insertion backlog now, including teleported and removed vehicles."""
         return self._log.backlog[-1]
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
@@ -256,7 +263,13 @@ class OpenTraffic(Traffic[OpenRoadT]):
             log.traffic.add_snapshot({**self._snapshot(names), **poses})
         log.trips.cav_ids.append(self.cav_ids)
         log.trips.states.append(states)
-        log.backlog.append(len(simulation.pending_vehicles()) + len(self._vehicles.teleported))
+        waiting = len(simulation.pending_vehicles()) + len(self._vehicles.teleported)
+        log.backlog.append(waiting + self._waiting_removed_count)
+
+    @property
+    def _waiting_removed_count(self) -> int:
+        """Number of removed vehicles that count until the end; zero where a removal ends the episode."""
+        return 0
 
     def _make_record(self, driver_log: DriverLog) -> Episode:
         log, vehicles, details = self._log, self._vehicles, self.options.record_details
@@ -269,6 +282,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
             "fuel": np.repeat(log.fuel, self._fuel_interval)[: self.control_steps] if details else np.zeros((0, 0)),
             "arrivals": vehicles.arrivals,
             "teleports": vehicles.teleports,
+            "removed": self._waiting_removed_count,
             "collisions": len(vehicles.collided),
             "planned_duration": self.scenario.horizon * self.scenario.control_step,
             "lane_lines": network_geometry(self._network_file()).lane_lines if details else np.zeros((0, 2)),

@@ -44,14 +44,14 @@ def trip_options(path: Path) -> list[str]:
     return ["--tripinfo-output", str(path), *unfinished]
 
 
-def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
+def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float, end: float = 0.0) -> Trips:
     """Return the trips in a file that SUMO has closed, except those that ended by `warmup_end` [s] or depart later.
 
-    A vehicle that SUMO removed has not arrived: its trip counts until the last one in the file ends. `vehicle_classes`
-    has the vehicle class of each vehicle type. Raise `DiskError` if the file is not complete.
+    A vehicle that SUMO removed has not arrived: its trip counts until `end` [s], or that of the last one in the file.
+    `vehicle_classes` has the vehicle class of each vehicle type. Raise `DiskError` if the file is not complete.
     """
     ids, kinds, entrances, times = list[str](), list[str](), list[str](), list[list[float]]()
-    end, removed = 0.0, list[bool]()
+    removed = list[bool]()
     try:
         for _, element in ElementTree.iterparse(path):
             trip = element.attrib

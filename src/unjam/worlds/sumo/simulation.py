@@ -382,8 +382,9 @@ class Simulation(AbstractContextManager["Simulation"]):
 
     def end_with_trips(self, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
         """End the episode, so that SUMO writes its last records, and return the trips as `read_trips` does."""
+        end = self.now()
         self._library.end()
-        return read_trips(self._trip_file, vehicle_classes, warmup_end)
+        return read_trips(self._trip_file, vehicle_classes, warmup_end, end)
 
     @property
     def is_lost(self) -> bool:

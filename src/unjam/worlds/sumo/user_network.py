@@ -67,6 +67,10 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         """Whether a CAV may still enter: as long as vehicles may enter, since only SUMO knows which."""
         return not self.is_finished and self._may_add_cav()
 
+    @property
+    def _waiting_removed_count(self) -> int:
+        return self._vehicles.removed_count
+
     def _may_add_cav(self) -> bool:
         return self.road.cavs is None or self._selected_cav_count < self.road.cavs
 
@@ -97,10 +101,8 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         road, simulation = self.road, self._simulation
         if road.files.removes_jammed_vehicles:  # SUMO lists them with the arrivals only
             total = simulation.teleport_count()
-            removed = total - self._teleport_total - (self._vehicles.teleports - before)
+            self._vehicles.add_removals(total - self._teleport_total - (self._vehicles.teleports - before))
             self._teleport_total = total
-            self._vehicles.arrivals -= removed
-            self._vehicles.teleports += removed
         max_teleports = int(road.files.options.get("max-num-teleports", -1))
         if self._vehicles.teleports > before and 0 <= max_teleports < simulation.teleport_count():
             self.stop_reason = f"more than {max_teleports} teleports (max-num-teleports)"
@@ -217,6 +219,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
 
     def _simulate(self, cav_speeds: dict[str, float]) -> None:
         super()._simulate(cav_speeds)
+        self.is_finished = self.is_finished and not self._vehicles.removed_count  # they count until the end
         capped = [name for name in self._speed_caps.own_max_speeds if name in self._vehicles.is_cav]
         if not capped:
             return
