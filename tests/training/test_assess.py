@@ -8,10 +8,12 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.measures.test_recommendation import OPEN
 from tests.worlds.sumo.user_networks import SPARSE, network, straight
+from unjam.adapters import policy_driver
 from unjam.errors import InputError
 from unjam.reports.assessment import render_assessment
 from unjam.reports.results import read_results, read_rows
@@ -258,6 +260,22 @@ def test_an_assessment_continues_with_other_controllers_and_more_episodes(file: 
         other = make_request(file, [0.5], 20, 0.02, None, ["acc"], {**HELD, "horizon": 140})
         with pytest.raises(InputError, match="was made with other settings; allowed: a new folder"):
             assess(other, folder, workers)
+
+
+@pytest.mark.long
+def test_a_policy_of_this_process_is_assessed_and_never_taken_from_the_log(file: str, tmp_path: Path) -> None:
+    request, times = make_request(file, [0.5], 13, 0.02, None, ["acc"], HELD), list[float]()
+
+    def assess_policy(acceleration: float) -> Assessment:
+        policy = policy_driver(lambda observations: np.full(len(observations), acceleration))
+        with WorkerPool(1) as workers:
+            return assess(replace(request, drivers={"mine": policy}), tmp_path / "out", workers)
+
+    for acceleration in (0.5, -0.5):
+        (found,) = assess_policy(acceleration).controller_results
+        times.append(found.effect.travel_time.mean)
+        assert "mine" in render_assessment(tmp_path / "out")
+    assert times[1] > times[0] + 0.1
 
 
 @pytest.mark.parametrize(

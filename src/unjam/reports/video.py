@@ -32,6 +32,8 @@ MAX_TITLE_WIDTH = 36
 """maximum length of a line of the title, which must fit into a ring [characters]"""
 MIN_EMPTY_CENTER = 0.15
 """empty radius around the center that a caption there needs, relative to the size of the road"""
+LEGEND_WIDTH, LEGEND_HEIGHT = 110, 10
+"""size of the scale of speeds [pixels]"""
 FRAMES_PER_SECOND = 20
 VIDEO_FORMATS = (".gif", ".webp", ".mp4")
 
@@ -77,7 +79,22 @@ def draw_road(scene: RoadScene, max_speed: float, caption: str) -> Image.Image:
         align="center" if is_centered else "left",
         spacing=12,
     )
+    _draw_legend(pen, max_speed, pixels)
     return image.reduce(OVERSAMPLING)
+
+
+def _draw_legend(pen: ImageDraw.ImageDraw, max_speed: float, pixels: int) -> None:
+    """Draw the scale of speeds into the bottom right corner, which the roads of the package leave empty."""
+    colors, font = color_table(), ImageFont.load_default(14 * OVERSAMPLING)
+    width, bottom = LEGEND_WIDTH * OVERSAMPLING, 0.97 * pixels
+    left = bottom - width
+    top = bottom - LEGEND_HEIGHT * OVERSAMPLING
+    for number, color in enumerate(colors):
+        start, end = (left + width * each / len(colors) for each in (number, number + 1))
+        pen.rectangle((start, top, end, bottom), fill=color)
+    for x, anchor, text in ((left, "ld", "0"), (left + width, "rd", f"{max_speed:.0f} m/s")):
+        pen.text((x, top - 4 * OVERSAMPLING), text, fill=TEXT_COLOR, font=font, anchor=anchor)
+    pen.text((left - 8 * OVERSAMPLING, bottom), "red: CAV", fill=TEXT_COLOR, font=font, anchor="rs")
 
 
 def split_lines(lines: np.ndarray) -> list[np.ndarray]:

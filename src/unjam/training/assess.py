@@ -37,7 +37,7 @@ from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
 from unjam.seeds import held_out_seeds
 from unjam.text import format_count, format_duration
-from unjam.training.episode_log import EpisodeLog, setup_hash
+from unjam.training.episode_log import EpisodeLog
 from unjam.training.evaluate import Evaluation, evaluate_on_roads, raise_failure, save_evaluation
 from unjam.training.executors import MessageCallback
 from unjam.training.selection import (
@@ -214,7 +214,7 @@ def assess(
         return evaluate_on_roads(setups, seeds, workers, progress=report_progress, with_plots=with_plots)
 
     def run_options(kind: str, options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
-        hashes = {option: setup_hash(*request.make_setup(option)) for option in options}
+        hashes = {option: log.setup_hash(*request.make_setup(option)) for option in options}
         missing = [(option, seed) for option in options for seed in seeds if (hashes[option], seed) not in log.episodes]
         new_options, new_seeds = dict.fromkeys(option for option, _ in missing), sorted({seed for _, seed in missing})
         if missing:
@@ -389,7 +389,7 @@ def _assessment_document(
         "road": {**scenario_recipe(request.network), "file": request.file},
         "human_drivers": request.network.human_description,
         "drivers": {
-            name: driver_recipe(driver)[0] if is_serializable(driver) else driver.describe()
+            name: driver_recipe(driver)[0] if is_serializable(driver) else {"policy": driver.describe()}
             for name, driver in request.drivers.items()
         },
         "penetration_rates": request.penetration_rates,

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from secrets import token_hex
 from typing import Any
 
 from safetensors.numpy import save
@@ -27,6 +28,7 @@ class EpisodeLog(RowLog):
         """Begin in a new folder, or resume in one with the same scenario and files; `InputError` for other folders."""
         request = {"scenario": scenario_recipe(scenario), "files": file_hashes((), scenario)}
         super().__init__(folder, request, EPISODES_FILE)
+        self._call = token_hex(16)
         self.episodes: dict[tuple[str, tuple[int, ...]], dict[str, Any]] = {}
         """rows by the hash of a setup and the seed"""
         for entry in self.rows:
@@ -38,14 +40,17 @@ class EpisodeLog(RowLog):
             except INVALID_DATA_ERRORS:
                 raise InputError(f"out: {EPISODES_FILE} in {str(folder)!r} is damaged; allowed: a new folder") from None
 
+    def setup_hash(self, scenario: Scenario, driver: Driver) -> str:
+        """Return the SHA-256 of a scenario, a driver and its weights.
+
+        That of a driver of this process alone, whose content is unknown, is another one in each call.
+        """
+        is_known = is_serializable(driver)
+        recipe, arrays = driver_recipe(driver) if is_known else (f"{driver.describe()} {self._call} {id(driver)}", {})
+        return sha256_of(to_json([scenario_recipe(scenario), recipe]).encode() + save(arrays))
+
     def add(self, setup: str, seeds: Iterable[tuple[int, ...]], rows: Iterable[dict[str, Any]]) -> None:
         """Add the rows of the episodes of a setup; they are on the disk when this returns."""
         for seed, row in zip(seeds, rows, strict=True):
             self.episodes[setup, seed] = row
             self.append({"setup": setup, "seed": seed, "row": row})
-
-
-def setup_hash(scenario: Scenario, driver: Driver) -> str:
-    """Return the SHA-256 of a scenario, a driver and its weights; a driver of this process alone counts by its name."""
-    recipe, arrays = driver_recipe(driver) if is_serializable(driver) else (driver.describe(), {})
-    return sha256_of(to_json([scenario_recipe(scenario), recipe]).encode() + save(arrays))
