@@ -314,7 +314,7 @@ def yield_share(episode: Episode) -> float:
 
 def insertion_backlog_veh(episode: Episode) -> float:
     """Vehicles in the insertion backlog at the end; zero on a closed road."""
-    return float(episode.backlog[-1]) if len(episode.backlog) else 0.0
+    return float(episode.backlog[-1] - episode.removed) if len(episode.backlog) else 0.0
 
 
 def travel_time_metric(group: str) -> EpisodeFunction:

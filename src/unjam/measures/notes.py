@@ -110,7 +110,8 @@ def _unfinished_trip_notes(rows_by_driver: RowsByDriver) -> list[str]:
     shares, delayed = dict[str, float](), list[str]()
     for label, rows in rows_by_driver.items():
         complete = [row for row in rows if row["status"] == "completed" and "unfinished_trips" in row]
-        demand = sum(row["vehicles"] + row["insertion_backlog_veh"] for row in complete)
+        # Vehicles that wait for persons are not in the backlog.
+        demand = sum(max(row["vehicles"] + row["insertion_backlog_veh"], row["unfinished_trips"]) for row in complete)
         unfinished = sum(row["unfinished_trips"] for row in complete)
         if unfinished > MAX_UNFINISHED_SHARE * demand:
             shares[label] = unfinished / demand

@@ -149,6 +149,19 @@ def test_the_last_step_is_that_of_plain_sumo(step: float, end: float, tmp_path: 
     assert "--end" in longer.plain_sumo_command(1)
 
 
+def test_vehicles_that_wait_for_persons_who_never_come_wait_until_the_end(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    waiting = '<vehicle id="waiting" type="car" route="along" depart="triggered"/>'
+    flow = '<flow id="f" type="car" route="along" period="5" number="3"/>'
+    path = straight(tmp_path, flow + waiting, end=300.0, step=0.5)
+    episode, sumo_seed = human_baseline(path, simulation)
+    assert episode.control_steps < 300
+    plain = trips_of_plain_sumo(path, sumo_seed, 300.0)
+    check_same_trips(episode.trips, plain)
+    assert plain.depart_delay.max() == 300.0
+
+
 def test_trips_of_any_type_have_its_class(tmp_path: Path, simulation: Simulation) -> None:
     vehicles = "".join(
         f'<vType id="{kind}" vClass="{name}"/><vehicle id="{kind}-v@1" type="{kind}" route="along" depart="{n}"/>'

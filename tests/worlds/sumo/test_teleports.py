@@ -127,6 +127,23 @@ def test_vehicles_that_sumo_removes_from_a_jam_have_not_arrived(
     assert (stopped.status, stopped.teleports) == ("teleports", 3)
 
 
+@pytest.mark.parametrize("removes", [False, True])
+def test_jumps_from_stop_to_stop_are_neither_teleports_nor_arrivals(
+    removes: bool, tmp_path: Path, simulation: Simulation
+) -> None:
+    stops = '<stop lane="road_0" endPos="100" duration="1" jump="1"/><stop lane="road_0" endPos="600" duration="1"/>'
+    vehicles = "".join(
+        f'<vehicle id="{number}" type="car" route="along" depart="{10 * number}">{stops}</vehicle>'
+        for number in range(5)
+    )
+    options = f'<time-to-teleport value="50"/><time-to-teleport.remove value="{str(removes).lower()}"/>'
+    path = straight(tmp_path, vehicles, end=300.0, step=0.5, options=options)
+    scenario = make_scenario(str(path), {"penetration_rate": 0.5})
+    episode = run_episode(scenario, Human(), 1, backend=SumoBackend(simulation))
+    assert (episode.arrivals, episode.teleports, episode.removed) == (5, 0, 0)
+    assert measure(episode)["travel_time"] < 60.0
+
+
 def test_a_driver_that_lets_sumo_remove_all_vehicles_has_a_worse_travel_time_and_return(
     tmp_path: Path, simulation: Simulation
 ) -> None:

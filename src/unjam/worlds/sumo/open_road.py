@@ -75,12 +75,12 @@ class ActiveVehicles:
         self.collided.update(colliding)
         removed = set(colliding).intersection(simulation.arrived_vehicles())
         removed -= set(simulation.teleporting_vehicles())  # one that is teleported to its end has arrived
+        self.teleports += len(removed)
         self.add_removals(len(removed))
 
     def add_removals(self, count: int) -> None:
-        """Count vehicles that SUMO has removed, and lists as arrived."""
+        """Count vehicles that SUMO has removed, and lists as arrived; they are counted as teleports, too."""
         self.arrivals -= count
-        self.teleports += count
         self.removed_count += count
 
 

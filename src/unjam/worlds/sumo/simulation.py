@@ -276,8 +276,13 @@ class Simulation(AbstractContextManager["Simulation"]):
         return self._get_lane(name) == self._get_lane(leader) and gap < -MIN_CONTACT_OVERLAP and overlaps
 
     def teleport_count(self) -> int:
-        """Return SUMO's number of teleports since its start."""
+        """Return SUMO's number of teleports since its start, without intended jumps from stop to stop."""
         return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
+
+    def jam_teleport_count(self) -> int:
+        """Return SUMO's number of teleports since its start that are no consequence of a collision."""
+        get = self._sumo.simulation.getParameter
+        return sum(int(get("", f"stats.teleports.{reason}")) for reason in ("jam", "yield", "wrongLane"))
 
     def command_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
         """Command the vehicles' speeds after the next step [m/s]: plain floats."""

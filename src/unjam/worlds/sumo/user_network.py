@@ -50,7 +50,8 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         self._edge_numbers: dict[str, int] = {}
         self._allowed_speed_sum, self._allowed_speed_count = 0.0, 0
         self._contact_cavs = set[str]()
-        self._teleport_total = 0
+        self._teleport_totals = 0, 0
+        """SUMO's numbers of teleports so far: all, and those from jams"""
         self._entered_vehicle_count, self._selected_cav_count = 0, 0
         self._limits_of_vehicle: dict[str, VehicleLimits] = {}
         self._hidden_time_loss: dict[str, float] = {}
@@ -99,10 +100,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         before = self._vehicles.teleports
         super()._update_active_vehicles()
         road, simulation = self.road, self._simulation
-        if road.files.removes_jammed_vehicles:  # SUMO lists them with the arrivals only
-            total = simulation.teleport_count()
-            self._vehicles.add_removals(total - self._teleport_total - (self._vehicles.teleports - before))
-            self._teleport_total = total
+        self._correct_teleports(before)
         max_teleports = int(road.files.options.get("max-num-teleports", -1))
         if self._vehicles.teleports > before and 0 <= max_teleports < simulation.teleport_count():
             self.stop_reason = f"more than {max_teleports} teleports (max-num-teleports)"
@@ -111,6 +109,17 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
             if kind in road.calibrated_types:
                 number = self._hash_number(f"driver of {name}") % len(road.drivers)
                 simulation.change_type(name, CALIBRATED_TYPE_TEMPLATE.format(kind, number))
+
+    def _correct_teleports(self, before: int) -> None:
+        """Correct counts of the last step: SUMO lists jumps from stop to stop as teleports, removals as arrivals."""
+        vehicles, removes = self._vehicles, self.road.files.removes_jammed_vehicles
+        if vehicles.teleports == before and not removes:
+            return
+        total, jam_total = self._teleport_totals
+        self._teleport_totals = self._simulation.teleport_count(), self._simulation.jam_teleport_count()
+        vehicles.teleports = before + self._teleport_totals[0] - total
+        if removes:
+            vehicles.add_removals(self._teleport_totals[1] - jam_total)
 
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
         # SUMO does not expect the vehicles that calibrators will add.
@@ -262,7 +271,10 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         start = self.road.files.begin + self.scenario.warmup * self.scenario.simulation_step
         trips = self._simulation.end_with_trips(vehicle_class_by_type(self.road), start)
         hidden = [self._hidden_time_loss.get(name, 0.0) for name in trips.vehicle_ids]
-        trips = replace(trips, time_loss=trips.time_loss + hidden)
+        # After the last arrival, vehicles that wait for persons go on waiting.
+        rest = (self.scenario.horizon - self.control_steps) * self.scenario.control_step
+        waiting = rest * np.array([not edge for edge in trips.entrances], np.float64)
+        trips = replace(trips, time_loss=trips.time_loss + hidden, depart_delay=trips.depart_delay + waiting)
         slow = find_slow_entrances(trips, network_geometry(self.road.files.network).speed_limits)
         return replace(episode, trips=trips, contacts=len(self._contact_cavs), slow_entrances=slow)
 
