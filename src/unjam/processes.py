@@ -53,21 +53,19 @@ def redirect_user_output() -> AbstractContextManager[object]:
     return redirect_stdout(sys.stderr) if _is_command_line else nullcontext()
 
 
-@contextmanager
-def ending_forks() -> Iterator[None]:
-    """End a fork that users' code makes within the block, where it would go on with the episode of this process."""
-    process, code = os.getpid(), 0
-    try:
-        yield
-    except BaseException as error:
-        own = error.code if isinstance(error, SystemExit) else 1
-        code = own if isinstance(own, int) else int(own is not None)
-        raise
-    finally:
-        if os.getpid() != process:
-            for stream in (sys.stdout, sys.stderr):
-                stream.flush()
-            os._exit(code)
+class ForkGuard(AbstractContextManager[None]):
+    """Ends a fork that users' code makes within the block, where it would go on with the episode of this process."""
+
+    def __enter__(self) -> None:
+        self._process = os.getpid()
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        if os.getpid() == self._process:
+            return
+        code = error.code if isinstance(error, SystemExit) else int(error is not None)
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        os._exit(code if isinstance(code, int) else int(code is not None))
 
 
 def exit_with_parent(signum: int) -> None:

@@ -22,7 +22,7 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.requirements import Requirements, RoadInterface
 from unjam.errors import InputError, invalid_value
 from unjam.physics.arrays import Array
-from unjam.processes import ending_forks, redirect_user_output
+from unjam.processes import ForkGuard, redirect_user_output
 from unjam.tree import map_leaves
 from unjam.trust import check_code_unchanged, remember_trusted, resolve_code_path
 from unjam.user_code import UserCode, read_code
@@ -73,7 +73,7 @@ class UserFunction:
     def __call__(self, *arguments: Any) -> Any:
         """Return the result of the function; raise `InputError` with its last executed line if it fails."""
         try:
-            with ending_forks():
+            with ForkGuard():
                 return self.function(*arguments)
         except (Exception, SystemExit) as error:
             line = last_line(error, self.file)

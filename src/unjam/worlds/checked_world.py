@@ -13,7 +13,7 @@ from unjam.drivers.command import Command
 from unjam.drivers.local_state import COMMON_FIELDS, FIELD_SIZES, LocalState
 from unjam.drivers.user_driver import object_reference
 from unjam.errors import InputError, UnjamError
-from unjam.processes import ending_forks
+from unjam.processes import ForkGuard
 from unjam.scenarios.scenario import Scenario
 from unjam.user_code import USER_MODULE_PREFIX
 from unjam.worlds.audit import OVERRIDE_TOLERANCE
@@ -40,7 +40,7 @@ def backend_label(backend: Any) -> str:
 def call_backend(label: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """Return the result of a user's backend; raise errors of unjam, and others as `InputError` with their last line."""
     try:
-        with ending_forks():
+        with ForkGuard():
             return function(*arguments)
     except UnjamError:
         raise

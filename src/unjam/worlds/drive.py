@@ -9,7 +9,7 @@ import numpy as np
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler, carry_over_memory, scalar_memory
 from unjam.drivers.residual import EXPERT_KEY
 from unjam.errors import InputError, RowError
-from unjam.processes import ending_forks
+from unjam.processes import ForkGuard
 from unjam.tree import map_leaves
 from unjam.worlds.world import DriverLog, ProgressCallback, RecordT, World
 
@@ -54,7 +54,7 @@ class DriveLoop:
                     advance(None)
                 else:
                     state = local_state()
-                    with ending_forks():
+                    with ForkGuard():
                         decision = decide(state, self.memory, noise)
                     self.memory = decision.memory
                     advance(decision.command)

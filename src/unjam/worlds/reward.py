@@ -72,8 +72,10 @@ def _nan_mean(values: Array) -> Array:
     """Mean over the last axis without NaN; 0 if all are NaN."""
     if type(values) is float:
         return _nan_sum(values)
-    if namespace(values) is np and not np.isnan(total := np.add.reduce(values, -1)).any():
-        return total / max(values.shape[-1], 1)  # no vehicle is absent; the way below takes several times as long
+    if namespace(values) is np:
+        total = np.add.reduce(values, -1)  # NaN if a vehicle is absent
+        if total == total if values.ndim == 1 else not np.isnan(total).any():
+            return total / max(values.shape[-1], 1)  # the way below takes several times as long
     return _nan_sum(values) / clamp_min((~namespace(values).isnan(values)).sum(-1), 1)
 
 
