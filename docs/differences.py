@@ -296,7 +296,10 @@ LEARNING = (
         exact_effect,
     ),
     Difference(
-        "trainings of each learner", "3 (4.2.1)", (), "5 on the ring, 3 of Figures 9 and 10 and on the other roads"
+        "trainings of each learner",
+        "3 (4.2.1)",
+        (),
+        "5, ten of TRPO and the method, 3 on the merge; with the filter 5 on the ring, else 3",
     ),
     Difference(
         "which checkpoint counts",

@@ -55,7 +55,9 @@ def compare(
     for other, difference in differences.items():
         low, high = _margin(difference, larger)
         margins[other] = high if verdict == NOT_HELD else low
-    decisive = min(others, key=margins.__getitem__)
+    if verdict == UNDECIDED:  # a difference without interval decides only if none has one that includes zero
+        margins = {other: low for other, low in margins.items() if -inf < low <= 0.0} or margins
+    decisive = min(margins, key=margins.__getitem__)
     means = list_values({each: float(found.mean()) for each, found in values.items()}, digits)
     difference = interval_text(asdict(differences[decisive]), digits, "+,")
     to = f" to {decisive}" if len(others) > 1 else ""
