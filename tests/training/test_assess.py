@@ -14,7 +14,8 @@ import pytest
 from tests.measures.test_recommendation import OPEN
 from tests.worlds.sumo.user_networks import SPARSE, network, straight
 from unjam.adapters import policy_driver
-from unjam.errors import InputError
+from unjam.errors import InputError, UnjamError
+from unjam.measures.metrics import METRICS
 from unjam.reports.assessment import render_assessment
 from unjam.reports.results import read_results, read_rows
 from unjam.training.assess import (
@@ -276,6 +277,31 @@ def test_a_policy_of_this_process_is_assessed_and_never_taken_from_the_log(file:
         times.append(found.effect.travel_time.mean)
         assert "mine" in render_assessment(tmp_path / "out")
     assert times[1] > times[0] + 0.1
+
+
+def test_failed_episodes_are_tried_again(example_request: AssessmentRequest, tmp_path: Path) -> None:
+    row = {**dict.fromkeys(METRICS, 1.0), "status": "completed", "error": ""}
+    rows = [
+        row,
+        {**row, "status": "failed", "error": "MemoryError"},
+        {**row, "status": "failed", "error": "NoCavError"},
+    ]
+    first = EpisodeLog(tmp_path / "out", example_request.network)
+    first.add("setup", [(1,), (2,), (3,)], rows)
+    assert len(first.episodes) == 3
+    assert [*EpisodeLog(tmp_path / "out", example_request.network).episodes] == [("setup", (1,)), ("setup", (3,))]
+
+
+@pytest.mark.long
+def test_a_controller_whose_every_episode_fails_ends_the_assessment(file: str, tmp_path: Path) -> None:
+    def fail(observations: Any) -> Any:
+        if observations.any():  # an actual episode
+            raise RuntimeError("no weights")
+        return observations[:, 0]
+
+    request = replace(make_request(file, [0.5], 13, 0.02, None, ["acc"], HELD), drivers={"mine": policy_driver(fail)})
+    with WorkerPool(1) as workers, pytest.raises(UnjamError, match="no weights"):
+        assess(request, tmp_path / "out", workers)
 
 
 @pytest.mark.parametrize(

@@ -198,6 +198,9 @@ def assess(
     drive on this road.
     """
     log = EpisodeLog(folder, request.network)
+    if log.episodes:
+        known = f"{format_count(len(log.episodes), 'episode')} of earlier calls in {folder}"
+        on_message(f"{known}: not simulated again for the same controllers; data that their code reads is not compared")
     budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
 
     def evaluate_options(

@@ -9,7 +9,7 @@ from safetensors.numpy import save
 
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable
-from unjam.errors import InputError
+from unjam.errors import InputError, NoCavError
 from unjam.files import INVALID_DATA_ERRORS, sha256_of, to_json
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import replace_null
@@ -50,7 +50,11 @@ class EpisodeLog(RowLog):
         return sha256_of(to_json([scenario_recipe(scenario), recipe]).encode() + save(arrays))
 
     def add(self, setup: str, seeds: Iterable[tuple[int, ...]], rows: Iterable[dict[str, Any]]) -> None:
-        """Add the rows of the episodes of a setup; they are on the disk when this returns."""
+        """Add the rows of the episodes of a setup; they are on the disk when this returns.
+
+        Failed episodes are not: their cause may be mended in a later call.
+        """
         for seed, row in zip(seeds, rows, strict=True):
             self.episodes[setup, seed] = row
-            self.append({"setup": setup, "seed": seed, "row": row})
+            if row["status"] != "failed" or row["error"] == NoCavError.__name__:
+                self.append({"setup": setup, "seed": seed, "row": row})

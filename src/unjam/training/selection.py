@@ -226,11 +226,13 @@ def compare_on_test_seeds(
         ]
         widths = _width_text([each.effect.relative_half_width for each in (*results, *acc_results)], precision)
         status = f"{format_count(len(rows[HUMAN_BASELINE]), 'test seed')}: {widths}"
-        remaining = f"; {format_count(len(active), 'option')} remain, {_remaining_time_text(budget)}" if active else ""
+        verb = "remains" if len(active) == 1 else "remain"
+        remaining = f"; {format_count(len(active), 'option')} {verb}, {_remaining_time_text(budget)}" if active else ""
         on_message(status + remaining)
-    acc_rows = [row for option in acc_options for row in rows[option]]
-    if all(row["status"] == "failed" for row in acc_rows):
-        raise_failure(acc_rows)
+    for options in filter(None, (acc_options, finalists)):
+        new_rows = [row for option in options for row in rows[option]]
+        if all(row["status"] == "failed" for row in new_rows):
+            raise_failure(new_rows)
     return AssessmentFindings(rows, results, acc_results)
 
 
