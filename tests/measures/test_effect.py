@@ -14,6 +14,7 @@ from unjam.measures.statistics import Estimate, estimate
 USUAL: dict[str, Any] = {
     **FEASIBLE_ROW,
     "mean_speed": 20.0,
+    "cav_mean_speed": 20.0,
     "travel_time": 100.0,
     "delay": 40.0,
     "outflow_veh_per_h": 2000.0,

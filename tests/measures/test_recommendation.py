@@ -42,6 +42,13 @@ def test_recommendation_has_its_numbers() -> None:
     )
 
 
+def test_a_controller_that_sacrifices_its_cavs_is_not_recommended() -> None:
+    slow = replace(HELPS, cav_speed_change=between(-0.97, -0.93))
+    assert slow.verdict == "not recommended"
+    assert slow.reasons == ["the CAVs themselves are 95 % slower than ACC vehicles alone (limit 10 %)"]
+    assert not replace(HELPS, cav_speed_change=between(-0.5, -0.05)).reasons
+
+
 def test_rejection_has_its_reason() -> None:
     assert QUICK_AND_WRONG.summary == (
         "mine.py:bold at a penetration rate of 10 %: not recommended: flow is lower than that of the human "

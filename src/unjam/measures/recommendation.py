@@ -26,6 +26,8 @@ from unjam.text import format_count
 
 MAX_TELEPORT_SHARE = 0.01
 """share of the baseline's vehicles that SUMO may teleport or remove; with more of them travel times mean nothing"""
+MAX_CAV_SLOWDOWN = 0.1
+"""share by which CAVs may be slower than with their ACC alone: a controller must not sacrifice them"""
 NEGLIGIBLE_DELAY_SHARE = 0.05
 """delay of the human baseline up to which there is nothing to gain, as a share of the free-flow travel time"""
 MIN_VERDICT_SEEDS = 10
@@ -148,6 +150,8 @@ class ControllerResult:
     """difference of flow to the same ACC vehicles [veh/h]"""
     missing_seeds: float = 0.0
     """number of further test seeds that a verdict needs"""
+    cav_speed_change: Estimate | None = None
+    """relative change of the CAVs' own mean speed, compared with the same ACC vehicles; None: unknown"""
 
     @property
     def reasons(self) -> list[str]:
@@ -161,6 +165,9 @@ class ControllerResult:
         elif not change.high < 0:
             relation = "longer than" if change.low > 0 else "not shown to be shorter than"
             reasons.append(f"travel time is {relation} {acc}: {format_seconds(change)}")
+        if self.cav_speed_change is not None and self.cav_speed_change.high < -MAX_CAV_SLOWDOWN:
+            slower = f"{-100 * self.cav_speed_change.mean:.0f} % slower than {ACC_BASELINE}"
+            reasons.append(f"the CAVs themselves are {slower} (limit {100 * MAX_CAV_SLOWDOWN:g} %)")
         return reasons
 
     @property

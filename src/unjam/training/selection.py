@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from unjam.measures.effect import FLOW_METRIC, TIME_METRIC, Effect, describe_harm, effect_of, is_too_small
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.recommendation import MIN_VERDICT_SEEDS, AccResult, ControllerResult, required_seeds
-from unjam.measures.statistics import CONFIDENCE, Estimate, format_percent, paired_difference
+from unjam.measures.statistics import CONFIDENCE, Estimate, format_percent, paired_difference, relative_difference
 from unjam.seeds import held_out_seeds, selection_seeds
 from unjam.text import format_count, format_duration
 from unjam.training.evaluate import raise_failure
@@ -247,7 +247,8 @@ def _controller_result(
     required = max(required_seeds(each, half_width) for each in (difference, effect.travel_time))
     required = MIN_VERDICT_SEEDS if _is_rejected(effect, difference) else required
     missing = 0.0 if _has_failed(effect) else max(0.0, required - difference.count)
-    return ControllerResult(*option, effect, difference, flow_difference, missing)
+    cav_speed_change = relative_difference(rows[option], acc_rows, "cav_mean_speed")
+    return ControllerResult(*option, effect, difference, flow_difference, missing, cav_speed_change)
 
 
 def _is_rejected(effect: Effect, difference_to_acc: Estimate) -> bool:
