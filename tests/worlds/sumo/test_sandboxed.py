@@ -62,7 +62,7 @@ def test_a_sandboxed_simulation_returns_the_same_results(road: Scenario, simulat
             make_traffic(road, (0,), each).start(is_controlled=False)  # pyright: ignore[reportArgumentType]
             names = ["0", "1"]
             arguments = dict[str, tuple[object, ...]]({"neighbors": ("1", 100.0), "left": (), "expects_vehicles": ()})
-            arguments |= dict.fromkeys(("lanes", "now", "has_refused"), ())
+            arguments |= dict.fromkeys(("lanes", "now", "has_refused", "jam_teleport_count"), ())
             arguments |= dict.fromkeys(("type_of", "route_of"), ("1",)) | {"type_limits": ("DEFAULT_VEHTYPE",)}
             answers.append(
                 {name: getattr(each, name)(*arguments.get(name, (names,))) for name in methods if name not in others}

@@ -245,8 +245,11 @@ class Simulation(AbstractContextManager["Simulation"]):
         """Return the vehicles' desired speeds over the speed limit, and their maximum speeds [m/s]."""
         return list(zip(map(self._sumo.vehicle.getSpeedFactor, ids), map(self.max_speed, ids), strict=True))
 
-    def neighbors(self, name: str, max_distance: float) -> NeighborStates:
-        """Return a vehicle's neighbors as SUMO sees them; beyond `max_distance` [m], this gap and its own speed."""
+    def neighbors(self, ids: Sequence[str], max_distance: float) -> list[NeighborStates]:
+        """Return the vehicles' neighbors as SUMO sees them; beyond `max_distance` [m], this gap and their own speed."""
+        return [self._neighbors_of(name, max_distance) for name in ids]
+
+    def _neighbors_of(self, name: str, max_distance: float) -> NeighborStates:
         vehicle, speed = self._sumo.vehicle, self._get_speed(name)
         if self._has_sublanes:
             leader, leader_gap, follower, follower_gap = find_lateral_neighbors(self._sumo, name, max_distance)
@@ -262,10 +265,11 @@ class Simulation(AbstractContextManager["Simulation"]):
             values += [self._get_speed(other) if gap < max_distance else speed, min(max(gap, 0.0), max_distance)]
         return NeighborStates(leader if values[1] < max_distance else "", *values)
 
-    def is_on_opposite_lane(self, name: str) -> bool:
-        """Return whether a vehicle drives on a lane of the opposite direction, to overtake."""
-        edge = self._sumo.lane.getEdgeID(lane) if (lane := self._get_lane(name)) else ""
-        return bool(edge) and edge[0] != INTERNAL_EDGE_PREFIX and edge not in self.remaining_routes([name])[0][:1]
+    def vehicles_on_opposite_lanes(self, ids: Sequence[str]) -> list[str]:
+        """Return the vehicles that drive on a lane of the opposite direction, to overtake."""
+        edges = [self._sumo.lane.getEdgeID(lane) if lane else "" for lane in map(self._get_lane, ids)]
+        rows = zip(ids, edges, self.remaining_routes(ids), strict=True)
+        return [name for name, edge, route in rows if edge not in ("", *route[:1]) and edge[0] != INTERNAL_EDGE_PREFIX]
 
     def is_in_contact(self, name: str, leader: str) -> bool:
         """Return whether a vehicle overlaps with the leader on its lane, longitudinally and laterally."""

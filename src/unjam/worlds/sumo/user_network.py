@@ -170,22 +170,23 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         states = list[FollowingState]()
         for name, (leader, state) in zip(names, self._tracked_leaders(names), strict=True):
             if not leader:  # at high speed, the filter needs a longer range than the drivers' sensors have
-                state = FollowingState(state.speed, *self._find_neighbors(name, SAFETY_FILTER_RANGE)[1:3])
+                state = FollowingState(state.speed, *self._find_neighbors([name], SAFETY_FILTER_RANGE)[0][1:3])
             states.append(state)
         return states
 
     def _neighbors(self, names: Sequence[str]) -> list[NeighborStates]:
         """Return the vehicles' neighbors; SUMO is called once per step."""
         new = [name for name in names if name not in self._cached_neighbors]
-        self._cached_neighbors |= {name: self._find_neighbors(name, MAX_OBSERVED_GAP) for name in new}
+        self._cached_neighbors |= zip(new, self._find_neighbors(new, MAX_OBSERVED_GAP) if new else (), strict=True)
         return [self._cached_neighbors[name] for name in names]
 
-    def _find_neighbors(self, name: str, max_distance: float) -> NeighborStates:
-        if self.road.files.has_opposite_lanes and self._simulation.is_on_opposite_lane(name):
+    def _find_neighbors(self, names: Sequence[str], max_distance: float) -> list[NeighborStates]:
+        found, simulation = self._simulation.neighbors(names, max_distance), self._simulation
+        if self.road.files.has_opposite_lanes and (opposite := simulation.vehicles_on_opposite_lanes(names)):
             # There SUMO reports the vehicle behind as the leader; SUMO's own checks watch oncoming traffic.
-            (speed,) = self._simulation.speeds([name])
-            return NeighborStates("", speed, max_distance, speed, max_distance)
-        return self._simulation.neighbors(name, max_distance)
+            for name, speed in zip(opposite, simulation.speeds(opposite), strict=True):
+                found[names.index(name)] = NeighborStates("", speed, max_distance, speed, max_distance)
+        return found
 
     def _collisions(self) -> tuple[Sequence[str], bool]:
         """Return SUMO's collisions and CAVs in contact with their leader, and whether that ends the episode."""
