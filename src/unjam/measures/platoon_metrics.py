@@ -40,7 +40,9 @@ def _fuel_by_power(episode: Episode, columns: Any) -> float:
     """
     if episode.trips.vehicle_ids:
         counted = episode.trips.vehicles_of(*VEHICLE_GROUPS)
-        is_counted = np.array([name in counted for name in episode.vehicle_ids], bool)
+        is_counted = np.zeros(episode.speeds.shape[1], bool)  # only vehicles of one class share a column
+        numbers = np.array(episode.vehicle_columns or range(len(is_counted)), np.intp)
+        is_counted[numbers] = [name in counted for name in episode.vehicle_ids]
         numbers = np.arange(len(is_counted))[columns]
         columns = numbers[is_counted[numbers]]
     speeds, fuel, distance = episode.speeds[:, columns], 0.0, 0.0

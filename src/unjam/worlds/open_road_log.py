@@ -173,12 +173,18 @@ class OpenRoadLog:
         return self._kinds
 
     def episode_fields(
-        self, trajectories: Sequence[Trajectory], branches: Sequence[str], teleported: Sequence[str]
+        self,
+        trajectories: Sequence[Trajectory],
+        branches: Sequence[str],
+        teleported: Sequence[str],
+        groups: Sequence[Hashable],
     ) -> tuple[NDArray[np.intp], dict[str, Any]]:
-        """Return the column of each vehicle, and the fields of the record; empty `branches`: unknown origins."""
+        """Return the column of each vehicle, and the fields of the record; empty `branches`: unknown origins.
+
+        Only vehicles of one branch and group share columns.
+        """
         vehicles, cavs = self.traffic.vehicle_ids, dict.fromkeys(each.vehicle for each in trajectories)
-        groups = [(name in cavs, branch) for name, branch in zip(vehicles, branches, strict=True)]
-        columns = self.traffic.columns(groups)
+        columns = self.traffic.columns([*zip((name in cavs for name in vehicles), branches, groups, strict=True)])
         branch_of_column = dict(zip(columns.tolist(), branches, strict=True))
         is_shared = len(branch_of_column) < len(vehicles)
         return columns, {

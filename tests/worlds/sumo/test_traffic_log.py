@@ -10,14 +10,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.reports.open_roads import ramp_episode, user_episode
+from tests.worlds.sumo.user_networks import straight
+from unjam.controller import make_driver
 from unjam.measures.metrics import measure
 from unjam.reports.html import replay_data
 from unjam.reports.results import pack_episode, to_plot_episode, unpack_episode
 from unjam.reports.space_time import lane_map_figure
+from unjam.scenarios import make_scenario
 from unjam.worlds import open_road_log, reward
+from unjam.worlds.episode import run_episode
 from unjam.worlds.open_road_log import TrafficLog
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import REWARDS, episode_reward_terms, make_reward
+from unjam.worlds.sumo.backend import SumoBackend
+from unjam.worlds.sumo.simulation import Simulation
 
 Stays = list[tuple[int, int]]
 """of each vehicle its first moment, and how many more it stays"""
@@ -135,6 +141,27 @@ def test_a_collision_belongs_to_the_last_part(whole: Episode, small: None) -> No
 
     found = episode_reward_terms(crashes, whole.speeds, whole.trajectories, True, whole.backlog)["crashed"]
     assert np.flatnonzero(found).tolist() == [whole.control_steps - 1]
+
+
+def test_metrics_of_a_users_network_with_several_classes_are_the_same_with_shared_columns(
+    tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bikes = '<vType id="bike" vClass="bicycle" speedDev="0"/>'
+    flow = '<flow id="{0}" type="{0}" route="along" begin="0" end="60" period="{1}"/>'
+    demand = bikes + flow.format("car", 4) + flow.format("bike", 9)
+    path = straight(tmp_path, demand, length=150.0, end=100.0, step=0.5)
+    scenario, results = make_scenario(str(path), {"penetration_rate": 0.5}), list[Episode]()
+    for cells in (10**9, 0):
+        monkeypatch.setattr(open_road_log, "MAX_UNSHARED_CELLS", cells)
+        driver = make_driver("acc", scenario.control_step)
+        results.append(run_episode(scenario, driver, 1, backend=SumoBackend(simulation), record_details=True))
+    whole, shared = results
+    assert shared.speeds.shape[1] < whole.speeds.shape[1] == len(whole.vehicle_ids)
+    found = measure(shared)
+    for name, value in measure(whole).items():
+        is_number = isinstance(value, float)
+        assert found[name] == (pytest.approx(value, nan_ok=True, rel=1e-9) if is_number else value), name
+    assert found["fuel_by_power"] > 0.0
 
 
 @pytest.mark.long

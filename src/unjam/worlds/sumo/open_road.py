@@ -1,6 +1,6 @@
 """Traffic on roads with ends: vehicles enter and leave, and each trip of a CAV is a trajectory."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any, cast
@@ -144,6 +144,10 @@ class OpenTraffic(Traffic[OpenRoadT]):
     def _branches(self, vehicles: Sequence[str]) -> Sequence[str]:
         return [""] * len(vehicles)
 
+    def _column_groups(self, vehicles: Sequence[str]) -> Sequence[Hashable]:
+        """Return the groups of vehicles that may share columns of the record."""
+        return [""] * len(vehicles)
+
     def _make_log(self) -> OpenRoadLog:
         return OpenRoadLog(self.scenario, *self._names_and_speeds())
 
@@ -277,7 +281,8 @@ class OpenTraffic(Traffic[OpenRoadT]):
             driver_log, self.has_crashed, lambda: self._report_progress(self.control_steps)
         )
         branches = self._branches(log.traffic.vehicle_ids)
-        columns, fields = log.episode_fields(trajectories, branches, list(vehicles.teleported))
+        groups = self._column_groups(log.traffic.vehicle_ids)
+        columns, fields = log.episode_fields(trajectories, branches, list(vehicles.teleported), groups)
         fields |= {
             "fuel": np.repeat(log.fuel, self._fuel_interval)[: self.control_steps] if details else np.zeros((0, 0)),
             "arrivals": vehicles.arrivals,

@@ -61,7 +61,7 @@ def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float, e
                 continue
             if float(trip["depart"]) >= 0.0 or float(trip["departDelay"]) > 0.0:
                 ids.append(trip["id"])
-                kinds.append(_vehicle_class(trip["vType"], vehicle_classes))
+                kinds.append(find_vehicle_class(trip["vType"], vehicle_classes))
                 entrances.append(trip["departLane"].rpartition("_")[0])
                 times.append([float(trip[name]) for name in TRIP_ATTRIBUTES])
                 removed.append(trip.get("vaporized") in REMOVAL_REASONS)
@@ -90,7 +90,7 @@ def find_slow_entrances(trips: Trips, speed_limits: dict[str, float]) -> tuple[S
     return tuple(found)
 
 
-def _vehicle_class(kind: str, vehicle_classes: dict[str, str]) -> str:
+def find_vehicle_class(kind: str, vehicle_classes: dict[str, str]) -> str:
     """Return the class of a type, or of the type of which `kind` is SUMO's copy for one vehicle: `type@vehicle`."""
     names = kind, kind.rpartition("@")[0], kind.partition("@")[0]
     return next((vehicle_classes[name] for name in names if name in vehicle_classes), "")

@@ -23,7 +23,7 @@ from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.inputs import user_network_inputs, vehicle_class_by_type
 from unjam.worlds.sumo.networks import network_geometry
 from unjam.worlds.sumo.open_road import MultiLaneTraffic
-from unjam.worlds.sumo.outputs import find_slow_entrances
+from unjam.worlds.sumo.outputs import find_slow_entrances, find_vehicle_class
 from unjam.worlds.sumo.sections import RoadsideService
 from unjam.worlds.sumo.simulation import VehicleLimits
 from unjam.worlds.sumo.transports import NeighborStates
@@ -50,6 +50,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         self._edge_numbers: dict[str, int] = {}
         self._allowed_speed_sum, self._allowed_speed_count = 0.0, 0
         self._contact_cavs = set[str]()
+        self._kind_of_vehicle: dict[str, str] = {}
         self._teleport_totals = 0, 0
         """SUMO's numbers of teleports so far: all, and those from jams"""
         self._entered_vehicle_count, self._selected_cav_count = 0, 0
@@ -76,6 +77,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         return self.road.cavs is None or self._selected_cav_count < self.road.cavs
 
     def _is_cav(self, name: str) -> bool:
+        self._kind_of_vehicle[name] = self._simulation.type_of(name)
         is_cav = self._may_add_cav() and self._is_selected(name)
         self._entered_vehicle_count += 1
         self._selected_cav_count += is_cav
@@ -83,7 +85,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
 
     def _is_selected(self, name: str) -> bool:
         """Return whether a vehicle may be a CAV with every driver: by its type, or a hash of its id and the seed."""
-        road, kind = self.road, self._simulation.type_of(name)
+        road, kind = self.road, self._kind_of_vehicle[name]
         if kind in road.cav_types:
             return True
         return kind in road.eligible_types and self._hash_number(name) < road.penetration_rate * 2**64
@@ -127,6 +129,10 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         self.is_finished = not simulation.expects_vehicles() and (not until or simulation.now() >= until)
         if self.options.record_details:
             self._route_counts.update(simulation.route_of(name) for name in entered_names)
+
+    def _column_groups(self, vehicles: Sequence[str]) -> Sequence[str]:
+        classes = vehicle_class_by_type(self.road)
+        return [find_vehicle_class(self._kind_of_vehicle.get(name, ""), classes) for name in vehicles]
 
     def _vehicle_limits(self, names: Sequence[str]) -> tuple[Floats, Floats, Floats]:
         """Return acceleration, comfortable and emergency deceleration of the vehicles that CAVs replace [m/s2]."""
