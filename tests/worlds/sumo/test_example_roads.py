@@ -10,6 +10,7 @@ import pytest
 from tests.worlds.sumo.user_networks import grid
 from unjam.controller import make_driver
 from unjam.errors import InputError
+from unjam.measures.metrics import measure
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.example_roads import EXAMPLE_ROADS, write_example_road
@@ -24,6 +25,15 @@ def test_a_road_can_be_driven(name: str, tmp_path: Path) -> None:
     assert (episode.status, episode.warnings) == ("completed", ())
     assert len(episode.vehicle_ids) > 30
     assert episode.slow_entrances == ()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", EXAMPLE_ROADS)
+def test_a_whole_episode_of_a_road_has_its_metrics(name: str, tmp_path: Path) -> None:
+    scenario = make_scenario(str(write_example_road(name, tmp_path)), {"penetration_rate": 0.1})
+    row = measure(run_episode(scenario, make_driver("human", scenario.control_step), 1, record_details=True))
+    assert row["status"] == "completed"
+    assert min(row["travel_time"], row["fuel_by_power"], row["outflow_veh_per_h"]) > 0.0
 
 
 def test_ramps_of_user_networks_are_marked_where_they_join(tmp_path: Path) -> None:
