@@ -121,6 +121,9 @@ def test_a_result_of_a_model_file_continues_only_with_the_same_file(suite: str, 
     assert "does not contain its control step: here it acts every 0.1 s" in lines[0]
     assert first.sha256 == sha256_of_file(file)
     assert unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1) == first
+    slow = unjam.benchmark(f"{file}:policy_time_step=1.0", "ring", tmp_path / "b.json", workers=1)
+    assert slow.sha256 not in (None, first.sha256)
+    assert unjam.benchmark(f"{file}:policy_time_step=1.0", "ring", tmp_path / "b.json", workers=1) == slow
     save(PPO("MlpPolicy", Space(), seed=1, device="cpu"), tmp_path)
     with pytest.raises(InputError, match="hash of the driver"):
         unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1)

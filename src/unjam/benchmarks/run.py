@@ -181,8 +181,12 @@ def _driver_hash(label: str, driver: Driver) -> str | None:
     """Return the SHA-256 of a file of the driver, else of recipe, code and weights; None for a Python object."""
     if found := label and controller_hash(label):
         return found
-    if not is_serializable(driver):
-        return sha256_of_file(Path(label)) if label and Path(label).is_file() else None
+    if not is_serializable(driver):  # a policy file, which may have parameters
+        file, _, parameters = label.rpartition(":") if not Path(label).is_file() else (label, "", "")
+        if not file or not Path(file).is_file():
+            return None
+        content = sha256_of_file(Path(file))
+        return sha256_of(f"{content} {parameters}".encode()) if parameters else content
     recipe, arrays = driver_recipe(driver)
     for part in user_code_recipes(recipe):  # the hash of the code is there, too
         part["path"] = Path(part["path"]).name

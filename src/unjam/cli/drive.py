@@ -221,13 +221,12 @@ def assess_command(
     """
     from unjam.reports.assessment import OPTION_HEADINGS, option_rows, parse_assessment
     from unjam.training.assess import DEFAULT_CONTROLLERS, assess, make_request
-    from unjam.training.episode_log import EPISODES_FILE
 
     drivers, changes = driver or DEFAULT_CONTROLLERS, opt.merge_settings(changes, opt.parse_settings(settings))
     request = make_request(scenario, _parse_rates(penetration_rates), episodes, precision, minutes, drivers, changes)
     folder = opt.new_folder(out, f"assess-{Path(scenario).stem}")
     progress = output.ProgressReporter("assessing", "steps")
-    resume = output.suggest_resume(folder / EPISODES_FILE, *output.arguments_without("--out"), "--out", folder)
+    resume = output.suggest_resume(folder / REQUEST_FILE, *output.arguments_without("--out"), "--out", folder)
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), resume, progress, WorkerPool(workers) as pool:
         on_message = (lambda line: None) if json else partial(err_console.print, soft_wrap=True)
         assessment = assess(request, folder, pool, progress.update, on_message, progress.begin)

@@ -7,10 +7,12 @@ from typing import Any
 
 from safetensors.numpy import save
 
+from unjam import __version__
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable
 from unjam.errors import InputError, NoCavError
 from unjam.files import INVALID_DATA_ERRORS, sha256_of, to_json
+from unjam.manifest import manifest
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import replace_null
 from unjam.scenarios import scenario_recipe
@@ -25,8 +27,9 @@ class EpisodeLog(RowLog):
     """Rows of metrics by scenario and driver, and by seed."""
 
     def __init__(self, folder: Path, scenario: Scenario) -> None:
-        """Begin in a new folder, or resume in one with the same scenario and files; `InputError` for other folders."""
+        """Begin in a new folder, or resume with the same scenario, files and version; `InputError` for others."""
         request = {"scenario": scenario_recipe(scenario), "files": file_hashes((), scenario)}
+        request |= {"unjam": __version__, "commit": manifest()["commit"]}
         super().__init__(folder, request, EPISODES_FILE)
         self._call = token_hex(16)
         self.episodes: dict[tuple[str, tuple[int, ...]], dict[str, Any]] = {}
