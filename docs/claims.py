@@ -35,8 +35,8 @@ They have the values of its Tables B2 to B6 (`--preset paper`) and 300,000 envir
 4,000,000 of its authors' code; [all that differs](#what-differs-from-the-paper) is in the last table. Returns "on
 test seeds" are of the deterministic controller that validation chose, on 20 seeds that played no part in training or
 selection; other numbers of trainings are of training episodes, exploration included. Verdicts are about the three to
-ten trainings that they name, with these settings, and not about methods; they are not corrected for their number. Numbers are means over
-trainings; [tables and figures](docs/results.md) have interquartile means.
+ten trainings that they name, with these settings, and not about methods; they are not corrected for their
+number. Numbers are means over trainings; [tables and figures](docs/results.md) have interquartile means.
 
 The paper's method without the safety filter, on test seeds, in short (95 % intervals over trainings):
 
