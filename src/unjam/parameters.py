@@ -32,7 +32,7 @@ NonNegativeInt = Annotated[int, Field(ge=0)]
 def as_range(value: Any) -> Any:
     """Return the range (230, 230) for the number 230, and other values unchanged."""
     if isinstance(value, str):
-        raise ValueError("a number, or two like (220, 270)")
+        raise ValueError("a number, or two like [220, 270]")
     return (value, value) if isinstance(value, int | float) else value
 
 

@@ -1,5 +1,6 @@
 """Tables, progress and suggested commands are printed as documented."""
 
+import json
 import os
 import re
 import shlex
@@ -18,13 +19,15 @@ from rich.table import Table
 from rich.text import Text
 
 from unjam.cli import output
+from unjam.cli.catalog import parameter_entries
+from unjam.cli.options import parse_settings
 from unjam.cli.train import _TrainingProgress
 from unjam.measures.metric_table import choose_baseline
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate
 from unjam.parameters import parse_assignments
 from unjam.reports.assessment import OPTION_HEADINGS
-from unjam.scenarios import Recorded
+from unjam.scenarios import SCENARIOS, Recorded, example_scenario
 from unjam.training.config import RunConfig
 
 USUAL: dict[str, Any] = {"status": "completed", "reason": "", **dict.fromkeys(METRICS, 1.0)}
@@ -324,3 +327,13 @@ def test_a_console_keeps_styles_and_no_break_spaces() -> None:
         Text("1.0\u00a0[0.9, 1.1] – ü", "red")
     )
     assert text.getvalue() == "\x1b[31m1.0\u00a0[0.9, 1.1] – ü\x1b[0m\n"
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_defaults_of_parameters_are_shown_as_they_are_set(name: str) -> None:
+    for entry in parameter_entries(example_scenario(name)):
+        default = entry["default"]
+        for value in default.values() if isinstance(default, dict) else (default,):
+            if value is not None:
+                expected = json.loads(json.dumps(value))
+                assert parse_settings([f"x={output.setting_text(value)}"]) == {"x": expected}, entry["name"]

@@ -31,7 +31,7 @@ from unjam.manifest import manifest, without_folders
 from unjam.measures.gain import EpisodeRows
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import measure
-from unjam.parameters import check_integer
+from unjam.parameters import check_integer, split_parameters
 from unjam.processes import lock_file
 from unjam.road_family import FAMILY_PREFIX
 from unjam.scenarios import make_scenario
@@ -181,12 +181,12 @@ def _driver_hash(label: str, driver: Driver) -> str | None:
     """Return the SHA-256 of a file of the driver, else of recipe, code and weights; None for a Python object."""
     if found := label and controller_hash(label):
         return found
-    if not is_serializable(driver):  # a policy file, which may have parameters
-        file, _, parameters = label.rpartition(":") if not Path(label).is_file() else (label, "", "")
+    if not is_serializable(driver):
+        file, parameters = split_parameters(label)  # of a policy
         if not file or not Path(file).is_file():
             return None
         content = sha256_of_file(Path(file))
-        return sha256_of(f"{content} {parameters}".encode()) if parameters else content
+        return sha256_of(to_json([content, parameters]).encode()) if parameters else content
     recipe, arrays = driver_recipe(driver)
     for part in user_code_recipes(recipe):  # the hash of the code is there, too
         part["path"] = Path(part["path"]).name

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from unjam.cli.options import JsonOption
-from unjam.cli.output import console, new_table, print_json, print_wrapped
+from unjam.cli.output import console, new_table, print_json, print_wrapped, setting_text
 from unjam.controller import PACKAGED_PREFIX, packaged_names
 from unjam.controller.file import read_controller
 from unjam.drivers.observation import FEATURES
@@ -76,18 +76,17 @@ def scenarios_command(
 
 def _print_scenarios(scenarios: Mapping[str, Any]) -> None:
     """Print the main facts on scenarios as a table, in a narrow terminal as a list."""
-    columns = ("road", "vehicles", "limit")
-    table = new_table(("scenario", *columns, "control steps", "warm-up"))
-    is_narrow = console.width < MIN_TABLE_WIDTH
+    headings = "road", "vehicles", "limit", "control steps", "warm-up"
+    table = new_table(("scenario", *headings))
     for key, scenario in scenarios.items():
-        facts, steps = dict(scenario.facts()), f"{scenario.horizon:,}"
         warmup = f"{scenario.warmup * scenario.simulation_step:g} s"
-        if is_narrow:
-            console.print(key, style="bold")
-            values = (*(f"{column}: {facts[column]}" for column in columns), f"control steps: {steps}")
-            print_wrapped("  " + "; ".join((*values, f"warm-up: {warmup}")))
-        table.add_row(key, *map(facts.__getitem__, columns), steps, warmup)
-    if not is_narrow:
+        values = *map(dict(scenario.facts()).__getitem__, headings[:3]), f"{scenario.horizon:,}", warmup
+        if console.width >= MIN_TABLE_WIDTH:
+            table.add_row(key, *values)
+            continue
+        console.print(key, style="bold")
+        print_wrapped("  " + "; ".join(f"{heading}: {value}" for heading, value in zip(headings, values, strict=True)))
+    if table.rows:
         console.print(table)
 
 
@@ -207,13 +206,7 @@ def _print_parameters(rows: list[dict[str, Any]], title: str) -> None:
     for row in rows:
         name, value = row["name"], row["default"]
         values = {f"{name}.{key}": each for key, each in value.items()} if isinstance(value, dict) else {name: value}
-        defaults = " ".join(f"{key}={_setting_text(each)}" for key, each in values.items())
+        texts = {key: "(none)" if each is None else setting_text(each) or '""' for key, each in values.items()}
+        defaults = " ".join(f"{key}={text}" for key, text in texts.items())
         meaning = " ".join(row["description"].split())
         print_wrapped(f"  {defaults}" + (f": {meaning}" if meaning else ""))
-
-
-def _setting_text(value: Any) -> str:
-    """Return a value as `--set` reads it."""
-    if type(value) in (int, float):
-        return f"{value:.12g}"
-    return str(value).lower() if isinstance(value, bool) or value is None else str(value) or '""'

@@ -261,7 +261,20 @@ def setting_options(
     if backend != "sumo":
         yield from ("--set", f"backend={backend}") if prefix else ("--backend", backend)
     for key, value in changes.items():
-        yield from ("--set", f"{prefix}{key}={value if isinstance(value, str) else json.dumps(value)}")
+        yield from ("--set", f"{prefix}{key}={setting_text(value)}")
+
+
+def setting_text(value: Any) -> str:
+    """Return a value as `--set` reads it: a text as it is, others as TOML."""
+    return value if isinstance(value, str) else _toml_text(value)
+
+
+def _toml_text(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key} = {_toml_text(each)}' for key, each in value.items())}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml_text, value))}]"
+    return json.dumps(value)
 
 
 def arguments_without(*options: str) -> list[str]:

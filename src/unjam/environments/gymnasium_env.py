@@ -49,8 +49,8 @@ Observations = NDArray[np.float32]
 
 def as_action(action: Any, name: str) -> float:
     """Return the action of one CAV as a number [m/s2]; raise `InputError` unless it is a single finite one."""
-    allowed, is_float = "one finite number", isinstance(action, np.ndarray) and action.dtype.kind == "f"
-    values = action if is_float else as_numbers(action, f"step: {name}", allowed)
+    allowed, is_ready = "one finite number", type(action) is np.ndarray and action.dtype.kind == "f"
+    values = action if is_ready else as_numbers(action, f"step: {name}", allowed)
     if values.size != 1 or not isfinite(number := values.item()):
         raise InputError(f"step: {name}: {one_line(repr(action), 60)} is not allowed; allowed: {allowed}")
     return number

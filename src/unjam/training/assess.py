@@ -224,10 +224,9 @@ def assess(
             first, last = new_seeds[0][-1] + 1, new_seeds[-1][-1] + 1
             numbers = f"seeds {first} to {last}" if first < last else f"seed {first}"
             stage = f"simulating {kind} {numbers} of {format_count(len(new_options), 'option')}"
-            for option, new_rows in zip(
-                new_options, evaluate_options(stage, [*new_options], new_seeds).rows.values(), strict=True
-            ):
-                log.add(hashes[option], new_seeds, new_rows)
+            new_rows = evaluate_options(stage, [*new_options], new_seeds).rows
+            for option in new_options:
+                log.add(hashes[option], new_seeds, new_rows[option.label])
         budget.spend(len(options) * len(seeds), len(new_options) * len(new_seeds))
         rows = {option: [log.episodes[hashes[option], seed] for seed in seeds] for option in options}
         human_rows = rows[HUMAN_BASELINE]

@@ -46,7 +46,7 @@ class EpisodeLog(RowLog):
     def setup_hash(self, scenario: Scenario, driver: Driver) -> str:
         """Return the SHA-256 of a scenario, a driver and its weights.
 
-        That of a driver of this process alone, whose content is unknown, is another one in each call.
+        The content of a driver that no other process can build is unknown: its hash differs in each call.
         """
         is_known = is_serializable(driver)
         recipe, arrays = driver_recipe(driver) if is_known else (f"{driver.describe()} {self._call} {id(driver)}", {})

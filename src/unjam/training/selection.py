@@ -230,9 +230,9 @@ def compare_on_test_seeds(
         remaining = f"; {format_count(len(active), 'option')} {verb}, {_remaining_time_text(budget)}" if active else ""
         on_message(status + remaining)
     for options in filter(None, (acc_options, finalists)):
-        new_rows = [row for option in options for row in rows[option]]
-        if all(row["status"] == "failed" for row in new_rows):
-            raise_failure(new_rows)
+        option_rows = [row for option in options for row in rows[option]]
+        if all(row["status"] == "failed" for row in option_rows):
+            raise_failure(option_rows)
     return AssessmentFindings(rows, results, acc_results)
 
 

@@ -74,8 +74,9 @@ def _nan_mean(values: Array) -> Array:
         return _nan_sum(values)
     if namespace(values) is np:
         total = np.add.reduce(values, -1)  # NaN if a vehicle is absent
-        if total == total if values.ndim == 1 else not np.isnan(total).any():
-            return total / max(values.shape[-1], 1)  # the way below takes several times as long
+        is_any_absent = isnan(total) if values.ndim == 1 else np.isnan(total).any()
+        if not is_any_absent:  # the way below takes several times as long
+            return total / max(values.shape[-1], 1)
     return _nan_sum(values) / clamp_min((~namespace(values).isnan(values)).sum(-1), 1)
 
 

@@ -50,7 +50,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         self._edge_numbers: dict[str, int] = {}
         self._allowed_speed_sum, self._allowed_speed_count = 0.0, 0
         self._contact_cavs = set[str]()
-        self._kind_of_vehicle: dict[str, str] = {}
+        self._vehicle_types: dict[str, str] = {}
         self._teleport_totals = 0, 0
         """SUMO's numbers of teleports so far: all, and those from jams"""
         self._entered_vehicle_count, self._selected_cav_count = 0, 0
@@ -77,7 +77,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         return self.road.cavs is None or self._selected_cav_count < self.road.cavs
 
     def _is_cav(self, name: str) -> bool:
-        self._kind_of_vehicle[name] = self._simulation.type_of(name)
+        self._vehicle_types[name] = self._simulation.type_of(name)
         is_cav = self._may_add_cav() and self._is_selected(name)
         self._entered_vehicle_count += 1
         self._selected_cav_count += is_cav
@@ -85,7 +85,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
 
     def _is_selected(self, name: str) -> bool:
         """Return whether a vehicle may be a CAV with every driver: by its type, or a hash of its id and the seed."""
-        road, kind = self.road, self._kind_of_vehicle[name]
+        road, kind = self.road, self._vehicle_types[name]
         if kind in road.cav_types:
             return True
         return kind in road.eligible_types and self._hash_number(name) < road.penetration_rate * 2**64
@@ -104,7 +104,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         road, simulation = self.road, self._simulation
         self._correct_teleports(before)
         max_teleports = int(road.files.options.get("max-num-teleports", -1))
-        if self._vehicles.teleports > before and 0 <= max_teleports < simulation.teleport_count():
+        if self._vehicles.teleports > before and 0 <= max_teleports < self._teleport_totals[0]:
             self.stop_reason = f"more than {max_teleports} teleports (max-num-teleports)"
         for name in simulation.departed_vehicles() if road.drivers else ():
             kind = simulation.type_of(name)
@@ -132,7 +132,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
 
     def _column_groups(self, vehicles: Sequence[str]) -> Sequence[str]:
         classes = vehicle_class_by_type(self.road)
-        return [find_vehicle_class(self._kind_of_vehicle.get(name, ""), classes) for name in vehicles]
+        return [find_vehicle_class(self._vehicle_types.get(name, ""), classes) for name in vehicles]
 
     def _vehicle_limits(self, names: Sequence[str]) -> tuple[Floats, Floats, Floats]:
         """Return acceleration, comfortable and emergency deceleration of the vehicles that CAVs replace [m/s2]."""
