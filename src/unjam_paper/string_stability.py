@@ -126,12 +126,12 @@ STRING_STABILITY = Study(
     title="what string stability costs on closed roads: experts tuned with limits on their string gain",
     make_parts=lambda study_folder, seeds: {
         **{f"{road}/{HUMAN_LABEL}": (measure_human_baseline, (road,)) for road in STRING_ROADS},
+        **{f"{road}/{expert} 0": (measure_tuned, (road, expert, 0.0)) for road, expert in OTHER_EXPERT.items()},
         **{
             f"{road}/smooth-acc {limit:g}": (measure_tuned, (road, "smooth-acc", limit))
             for limit in GAIN_LIMITS
             for road in STRING_ROADS
         },
-        **{f"{road}/{expert} 0": (measure_tuned, (road, expert, 0.0)) for road, expert in OTHER_EXPERT.items()},
     },
     minutes=70.0,
     tables={road: partial(string_table, road) for road in STRING_ROADS},
