@@ -148,8 +148,8 @@ class UserNetwork(Scenario):
         begin, options = self._begin(files), dict(files.options)
         if self.begin is not None:
             options["begin"] = str(self.begin)
-        if files.end is not None:  # flows without an end last until it: at least to the horizon
-            options["end"] = str(max(files.end, self._end(begin)))
+        if files.end is not None:
+            options["end"] = str(self._end_of_flows(files))
         cav_seed = int(generator.integers(2**31))
         drivers = self.driver_population.draw(DRIVERS_PER_EPISODE, generator) if self.driver_population else ()
         return UserNetworkRoad(
@@ -186,6 +186,16 @@ class UserNetwork(Scenario):
     def _end(self, begin: float) -> float:
         return begin + self._time_before_control + self.horizon * self.control_step
 
+    def _has_same_end(self, files: SumoFiles) -> bool:
+        """Return whether an episode ends with the configuration: SUMO ends with the first step that reaches its end."""
+        end = self._end(self._begin(files))
+        return files.end is not None and -1e-6 < end - files.end < self.simulation_step - 1e-6
+
+    def _end_of_flows(self, files: SumoFiles) -> float:
+        """Return until when flows without an end last: to that of the configuration, and at least to the horizon."""
+        end = self._end(self._begin(files))
+        return end if files.end is None else max(files.end, end)
+
     @property
     def _time_before_control(self) -> float:
         """Warm-up, and the step in which SUMO inserts the first vehicles [s]."""
@@ -206,6 +216,11 @@ class UserNetwork(Scenario):
         """The differences from plain SUMO, and the vehicles that stay human-driven because of their class."""
         files = read_sumo_files(Path(self.file))
         notes = notes_on_files(files)
+        if files.has_spread_flows and files.end is not None and not self._has_same_end(files):
+            end = self._end_of_flows(files)
+            owner = "episode, not of the configuration" if end > files.end else "configuration, not of the episode"
+            spread = f"flows with a number of vehicles and no end are spread until {_format_time(end)}"
+            notes.append(f"{files.path.name}: {spread}, the end of the {owner}")
         others = files.used_types - self.eligible_types(files) - set(self.cav_types)
         if self.penetration_rate and others:
             notes.append(
@@ -217,16 +232,15 @@ class UserNetwork(Scenario):
     def plain_sumo_command(self, seed: int) -> str:
         """Return the command by which plain SUMO has the same traffic without CAVs; empty with calibrated drivers.
 
-        Its trips are those of the travel time: also of vehicles that are under way or waiting at the end.
+        Its trips are those of the travel time: also of vehicles that are under way or waiting at the end. There is none
+        for a part of flows that have a number of vehicles: plain SUMO would spread them over that part.
         """
-        if self.driver_population:
-            return ""
         files, words = read_sumo_files(Path(self.file)), ["sumo", "-c", self.file, "--seed", str(seed)]
         begin, end = self._begin(files), self._end(self._begin(files))
+        if self.driver_population or (files.has_spread_flows and end < self._end_of_flows(files)):
+            return ""
         words += ["--begin", f"{begin:g}"] if self.begin is not None else []
-        # SUMO ends with the first step that reaches its end.
-        has_same_end = files.end is not None and -1e-6 < end - files.end < self.simulation_step - 1e-6
-        words += [] if has_same_end else ["--end", f"{end:.10g}"]
+        words += [] if self._has_same_end(files) else ["--end", f"{end:.10g}"]
         return shlex.join([*words, "--tripinfo-output", "trips.xml", *UNFINISHED_TRIPS_OPTIONS])
 
     def possible_cav_ids(self) -> tuple[str, ...]:

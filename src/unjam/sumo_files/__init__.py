@@ -92,6 +92,7 @@ class SumoFiles(NamedTuple):
     removes_jammed_vehicles: bool  # instead of teleporting them
     has_bicycle_lanes: bool  # for bicycles only
     has_opposite_lanes: bool  # on which vehicles may overtake
+    has_spread_flows: bool  # with a number of vehicles, which SUMO spreads until the end of the simulation
 
 
 _read_files: dict[Path, tuple[dict[Path, FileStamp], SumoFiles]] = {}

@@ -105,6 +105,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
         "removes_jammed_vehicles": options.get("time-to-teleport.remove", "").lower() in TRUE_VALUES,
         "has_bicycle_lanes": demand.has_bicycle_lanes,
         "has_opposite_lanes": demand.has_opposite_lanes,
+        "has_spread_flows": demand.has_spread_flows,
         "types": demand.types,
         "type_parameters": demand.type_parameters,
         "stamps": {str(file): stamps[file] for file in [path, *files, *sorted(stamps.keys() - {path, *files})]},
@@ -203,6 +204,7 @@ class _Demand:
         self.has_bicycle_lanes = self.has_opposite_lanes = False
         self.calibrates = False  # SUMO's number of expected vehicles excludes those that calibrators will add
         self.last_end = 0.0  # latest end that a flow names, in calibrators and elsewhere [s]
+        self.has_spread_flows = False  # with a number of vehicles, which SUMO spreads until its end
         self._distributions: dict[str, set[str]] = {}  # types of each; other files than the defining one can use it
         self._current_type = ""  # the type that is being read; empty: none
         self._current_distribution: set[str] = set()  # types of the distribution that is being read
@@ -224,6 +226,7 @@ class _Demand:
                     self.type_parameters[self._current_type][attributes.get("key", "")] = attributes.get("value", "")
             case "person" | "personFlow":
                 self.first_departure = None  # persons may use their own car
+                self.has_spread_flows |= tag == "personFlow" and _is_spread(attributes)
             case "personTrip":
                 modes = attributes.get("modes", "").replace(",", " ").split()
                 default_types = {MODE_TYPES[mode] for mode in modes if mode in MODE_TYPES}
@@ -255,6 +258,7 @@ class _Demand:
         if "speed" in attributes and "vehsPerHour" not in attributes:
             return  # a calibrator that only changes speeds
         self.used_names.add(attributes.get("type", DEFAULT_VEHICLE_TYPE))
+        self.has_spread_flows |= depart_attribute == "begin" and _is_spread(attributes)
         if (end := attributes.get("end")) and isfinite(last := _parse_time(end)):
             self.last_end = max(self.last_end, last)
         if self.first_departure is not None:
@@ -273,6 +277,10 @@ class _Demand:
         for name in used & OTHER_DEFAULT_TYPES.keys():
             self.types.setdefault(name, {"vClass": OTHER_DEFAULT_TYPES[name]})
         return used
+
+
+def _is_spread(flow: XmlAttributes) -> bool:
+    return "number" in flow and not flow.keys() & {"end", "period", "probability", "vehsPerHour", "perHour"}
 
 
 def _write_copy(path: Path, copy: str, driver_count: str, types: str = "") -> None:

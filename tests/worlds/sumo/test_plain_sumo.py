@@ -131,10 +131,15 @@ def test_flows_without_an_end_have_as_many_vehicles_as_in_plain_sumo(tmp_path: P
     command = [sumo_program("sumo"), "-c", str(path), *trip_options(tmp_path / "plain.xml")]
     subprocess.run(command, check=True, capture_output=True, cwd=tmp_path)
     plain = read_trips(tmp_path / "plain.xml", CLASSES, 0.0)
-    for end in (None, 60.0):
-        changes = {} if end is None else {"end": end}
-        episode, _ = human_baseline(path, simulation, **changes)
-        assert len(episode.trips.vehicle_ids) == (len(plain.vehicle_ids) if end is None else 20)
+    for end, count in {120.0: 40, 60.0: 20, 240.0: 40}.items():
+        episode, _ = human_baseline(path, simulation, end=end)
+        assert len(episode.trips.vehicle_ids) == count
+        scenario = make_scenario(str(path), {"penetration_rate": 0.2, "end": end})
+        notes = [note for note in scenario.notes if "flows with a number of vehicles" in note]
+        assert len(notes) == (end != 120.0)
+        command = scenario.plain_sumo_command(1)
+        assert (end == 60.0) == (command == ""), "plain SUMO would spread all 40 over 60 s"
+        assert end != 240.0 or "until 240 s, the end of the episode" in notes[0]
     assert len(plain.vehicle_ids) == 40
 
 

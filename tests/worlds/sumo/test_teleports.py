@@ -3,6 +3,7 @@
 import re
 import subprocess
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -11,18 +12,19 @@ import numpy as np
 import pytest
 
 import unjam
-from tests.worlds.sumo.user_networks import straight
+from tests.worlds.sumo.user_networks import built, grid, straight
 from unjam.controller import make_driver
 from unjam.drivers import Human
 from unjam.drivers.car_following import Constant
 from unjam.drivers.command import Command
 from unjam.measures.metrics import measure
 from unjam.scenarios import make_scenario
+from unjam.scenarios.scenario import sumo_seed
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.sumo.backend import SumoBackend, make_traffic
 from unjam.worlds.sumo.networks import sumo_program
-from unjam.worlds.sumo.open_road import OpenTraffic
+from unjam.worlds.sumo.open_road import ActiveVehicles, OpenTraffic
 from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.world import DriverLog
 
@@ -125,6 +127,68 @@ def test_vehicles_that_sumo_removes_from_a_jam_have_not_arrived(
     removing.write_text(text.replace("</configuration>", '<max-num-teleports value="2"/></configuration>'))
     stopped = run_episode(scenario, make_driver(driver, 0.5), 1, backend=SumoBackend(simulation))
     assert (stopped.status, stopped.teleports) == ("teleports", 3)
+
+
+def with_options(path: Path, **options: str) -> Path:
+    """Set options of a configuration, and return it."""
+    text = path.read_text()
+    for name, value in options.items():
+        text = re.sub(rf'<{name} value="[^"]*"/>', "", text)
+        text = text.replace("</configuration>", f'<{name} value="{value}"/></configuration>')
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(("cause", "driver"), [("calibrator", "human"), ("calibrator", "acc"), ("collision", "human")])
+def test_vehicles_that_sumo_is_removing_have_no_speed(
+    cause: str, driver: str, tmp_path: Path, simulation: Simulation
+) -> None:
+    if cause == "collision":
+        path = with_options(grid(tmp_path), **{"collision.action": "remove", "collision.mingap-factor": "2"})
+    else:
+        edges = "".join(f'<edge id="{each}" from="{each[0]}" to="{each[1]}" speed="14"/>' for each in ("ab", "bc"))
+        places = {"a": 0, "b": 500, "c": 1000}
+        nodes = "".join(f'<node id="{name}" x="{x}" y="0"/>' for name, x in places.items())
+        flow = '<flow id="f" route="along" begin="0" end="150" vehsPerHour="1200" departSpeed="max"/>'
+        inputs = '<additional-files value="calibrator.add.xml"/><end value="200"/>'
+        path = built(tmp_path, nodes, edges, f'<route id="along" edges="ab bc"/>{flow}', inputs)
+        (tmp_path / "calibrator.add.xml").write_text(
+            '<additional><route id="last" edges="bc"/><calibrator id="c" edge="bc" pos="0" freq="30">'
+            '<flow begin="0" end="150" vehsPerHour="400" route="last"/></calibrator></additional>'
+        )
+    changes = {"penetration_rate": 1e-9 if driver == "human" else 0.3, "actuation": "cruise", "safety.active": False}
+    scenario, removed = make_scenario(str(path), changes), list[str]()
+    take_off_road = ActiveVehicles.take_off_road
+
+    def record_removed(vehicles: ActiveVehicles, names: Sequence[str]) -> None:
+        removed.extend(names)
+        take_off_road(vehicles, names)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ActiveVehicles, "take_off_road", record_removed)
+        episode = run_episode(scenario, make_driver(driver, scenario.control_step), 3, backend=SumoBackend(simulation))
+    assert removed
+    assert np.nanmin(episode.speeds) >= 0.0
+    metrics = measure(episode)
+    assert 0.0 < metrics["mean_speed"] < 20.0
+    assert metrics["human_max_braking"] < 20.0
+    assert episode.arrivals == episode.trips.has_arrived.sum()
+    assert cause == "calibrator" or episode.teleports == episode.collisions > 10
+
+
+def test_vehicles_that_sumo_teleports_to_the_end_of_their_route_have_arrived(
+    tmp_path: Path, simulation: Simulation
+) -> None:
+    path = with_options(grid(tmp_path), **{"step-length": "2", "time-to-teleport": "10"})
+    scenario = make_scenario(str(path), {"penetration_rate": 1e-9})
+    episode = run_episode(scenario, Human(), 3, backend=SumoBackend(simulation))
+    trips, command = tmp_path / "trips.xml", scenario.plain_sumo_command(sumo_seed((3,)))
+    subprocess.run(command.replace("trips.xml", str(trips)).split(), check=True, capture_output=True)
+    plain = [each.attrib for each in ElementTree.parse(trips).iter("tripinfo")]
+    assert any(each["vaporized"] == "teleport" for each in plain)
+    durations = dict(zip(episode.trips.vehicle_ids, episode.trips.duration.tolist(), strict=True))
+    assert durations == {each["id"]: float(each["duration"]) for each in plain}
+    assert episode.trips.has_arrived.sum() == sum(float(each["arrival"]) >= 0.0 for each in plain) == episode.arrivals
 
 
 @pytest.mark.parametrize("removes", [False, True])

@@ -47,6 +47,9 @@ class ActiveVehicles:
         """whether each vehicle on the road is a CAV, in order of entry"""
         self.teleported: dict[str, bool] = {}
         """the same for vehicles that SUMO has teleported and not yet reinserted"""
+        self.off_road: dict[str, bool] = {}
+        """the same for vehicles that SUMO is removing, which it lists as arrived or teleported only later"""
+        self._removed_unlisted = set[str]()
         self.collided = set[str]()
         self.arrivals = self.teleports = 0
         self.removed_count = 0
@@ -56,12 +59,15 @@ class ActiveVehicles:
         """Update after a step, and return the vehicles that left and that entered, which `is_cav` judges."""
         entered, arrived = simulation.departed_vehicles(), simulation.arrived_vehicles()
         teleporting = simulation.teleporting_vehicles()
-        self.arrivals += len(arrived)
+        self.arrivals += len(set(arrived) - self._removed_unlisted)
+        self._removed_unlisted.difference_update(arrived)
         self.teleports += len(teleporting)
-        self.teleported |= {name: self.is_cav[name] for name in teleporting if name in self.is_cav}
+        known = {**self.off_road, **self.is_cav} if self.off_road else self.is_cav
+        self.teleported |= {name: known[name] for name in teleporting if name in known}
         left = [*arrived, *teleporting]
         for name in left:
             self.is_cav.pop(name, None)
+            self.off_road.pop(name, None)
         for name in arrived:  # SUMO may teleport a vehicle to the end of its route
             self.teleported.pop(name, None)
         for name in entered:
@@ -70,13 +76,20 @@ class ActiveVehicles:
             self.is_cav[name] = self.teleported.pop(name)
         return left, entered
 
+    def take_off_road(self, names: Sequence[str]) -> None:
+        """Take vehicles from the road which SUMO is removing: calibrators do so, and collisions."""
+        self.off_road |= {name: self.is_cav.pop(name) for name in names}
+
     def add_collision(self, colliding: Sequence[str], simulation: Simulation) -> None:
         """Count a collision in the last step; vehicles that SUMO removes for it are teleports, not arrivals."""
         self.collided.update(colliding)
-        removed = set(colliding).intersection(simulation.arrived_vehicles())
+        removed = set(colliding) & {*simulation.arrived_vehicles(), *self.off_road}
         removed -= set(simulation.teleporting_vehicles())  # one that is teleported to its end has arrived
+        unlisted = removed & self.off_road.keys()
+        self._removed_unlisted |= unlisted
         self.teleports += len(removed)
         self.add_removals(len(removed))
+        self.arrivals += len(unlisted)  # not counted as arrived so far
 
     def add_removals(self, count: int) -> None:
         """Count vehicles that SUMO has removed, and lists as arrived; they are counted as teleports, too."""
@@ -123,6 +136,10 @@ class OpenTraffic(Traffic[OpenRoadT]):
             names = list(self._vehicles.is_cav)
             self._cached_speeds = names, np.array(self._simulation.speeds(names), np.float64)
         return self._cached_speeds
+
+    def _vehicles_off_road(self) -> list[str]:
+        """Return the vehicles that SUMO is removing, and does not yet list as arrived: on user networks only."""
+        return []
 
     def _local_states(self, names: Sequence[str]) -> LocalState:
         """Return the local states of CAVs; called once after each control step."""
@@ -242,6 +259,9 @@ class OpenTraffic(Traffic[OpenRoadT]):
     def _update_active_vehicles(self) -> None:
         self._cached_speeds: tuple[Sequence[str], Floats] | None = None
         left, entered = self._vehicles.update(self._simulation, self._is_cav)
+        if off_road := self._vehicles_off_road():
+            self._vehicles.take_off_road(off_road)
+            left, self._cached_speeds = [*left, *off_road], None
         self._controlled_cavs.difference_update(entered)  # SUMO allows the name of a vehicle that has left
         self._update_vehicles(left, entered)
 

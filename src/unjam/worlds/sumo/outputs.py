@@ -18,8 +18,8 @@ from unjam.worlds.sumo.networks import MESSAGE_TOTAL_MARKER
 NOT_ARRIVED = -1.0
 TRIP_ATTRIBUTES = "departDelay", "duration", "timeLoss", "arrival", "departSpeed"
 """attributes of a trip that are read [s, m/s]"""
-REMOVAL_REASONS = "teleport", "collision"
-"""values of `vaporized` of vehicles that SUMO removes from a jam or a collision instead of teleporting them"""
+MAX_HALTING_SPEED = 0.1
+"""speed up to which SUMO takes a vehicle for halting, and may remove it from a jam [m/s]"""
 MIN_NOTED_DELAY, MIN_NOTED_VEHICLES = 2.0, 10
 """mean insertion delay [s] and number of vehicles from which an entrance is slow"""
 FREE_SPEED_SHARE = 0.8
@@ -44,11 +44,14 @@ def trip_options(path: Path) -> list[str]:
     return ["--tripinfo-output", str(path), *unfinished]
 
 
-def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float, end: float = 0.0) -> Trips:
+def read_trips(
+    path: Path, vehicle_classes: dict[str, str], warmup_end: float, end: float = 0.0, removes_jammed: bool = False
+) -> Trips:
     """Return the trips in a file that SUMO has closed, except those that ended by `warmup_end` [s] or depart later.
 
-    A vehicle that SUMO removed has not arrived: its trip counts until `end` [s], or that of the last one in the file.
-    `vehicle_classes` has the vehicle class of each vehicle type. Raise `DiskError` if the file is not complete.
+    A vehicle that SUMO removed from a collision or a jam (`removes_jammed`: instead of teleporting it) has not arrived:
+    its trip counts until `end` [s], or that of the last one in the file. `vehicle_classes` has the vehicle class of
+    each vehicle type. Raise `DiskError` if the file is not complete.
     """
     ids, kinds, entrances, times = list[str](), list[str](), list[str](), list[list[float]]()
     removed = list[bool]()
@@ -64,7 +67,10 @@ def read_trips(path: Path, vehicle_classes: dict[str, str], warmup_end: float, e
                 kinds.append(find_vehicle_class(trip["vType"], vehicle_classes))
                 entrances.append(trip["departLane"].rpartition("_")[0])
                 times.append([float(trip[name]) for name in TRIP_ATTRIBUTES])
-                removed.append(trip.get("vaporized") in REMOVAL_REASONS)
+                reason, speed = trip.get("vaporized"), float(trip["arrivalSpeed"])
+                # SUMO gives the same reason to vehicles that it teleports to the end of their route.
+                is_jammed = removes_jammed and reason == "teleport" and speed <= MAX_HALTING_SPEED
+                removed.append(reason == "collision" or is_jammed)
             element.clear()
     except ElementTree.ParseError:
         raise DiskError(f"SUMO has not written {path.name} whole; allowed: space in {path.parent}") from None

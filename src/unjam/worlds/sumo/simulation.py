@@ -389,11 +389,11 @@ class Simulation(AbstractContextManager["Simulation"]):
         is_same_edge = lane.rpartition("_")[0] == loop_lane.rpartition("_")[0]
         return not is_same_edge or position - length >= loop_position
 
-    def end_with_trips(self, vehicle_classes: dict[str, str], warmup_end: float) -> Trips:
+    def end_with_trips(self, vehicle_classes: dict[str, str], warmup_end: float, removes_jammed: bool) -> Trips:
         """End the episode, so that SUMO writes its last records, and return the trips as `read_trips` does."""
         end = self.now()
         self._library.end()
-        return read_trips(self._trip_file, vehicle_classes, warmup_end, end)
+        return read_trips(self._trip_file, vehicle_classes, warmup_end, end, removes_jammed)
 
     @property
     def is_lost(self) -> bool:

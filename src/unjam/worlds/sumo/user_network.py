@@ -112,6 +112,11 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
                 number = self._hash_number(f"driver of {name}") % len(road.drivers)
                 simulation.change_type(name, CALIBRATED_TYPE_TEMPLATE.format(kind, number))
 
+    def _vehicles_off_road(self) -> list[str]:
+        names, speeds = self._names_and_speeds()
+        is_off = speeds < 0.0  # SUMO has no speed of them
+        return [names[row] for row in np.flatnonzero(is_off).tolist()] if is_off.any() else []
+
     def _correct_teleports(self, before: int) -> None:
         """Correct counts of the last step: SUMO lists jumps from stop to stop as teleports, removals as arrivals."""
         vehicles, removes = self._vehicles, self.road.files.removes_jammed_vehicles
@@ -276,7 +281,8 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         """Return the record with all trips; this ends SUMO."""
         episode = super()._make_record(driver_log)
         start = self.road.files.begin + self.scenario.warmup * self.scenario.simulation_step
-        trips = self._simulation.end_with_trips(vehicle_class_by_type(self.road), start)
+        classes, removes_jammed = vehicle_class_by_type(self.road), self.road.files.removes_jammed_vehicles
+        trips = self._simulation.end_with_trips(classes, start, removes_jammed)
         hidden = [self._hidden_time_loss.get(name, 0.0) for name in trips.vehicle_ids]
         # After the last arrival, vehicles that wait for persons go on waiting.
         rest = (self.scenario.horizon - self.control_steps) * self.scenario.control_step
