@@ -1,3 +1,5 @@
+import copy
+import pickle
 import re
 import subprocess
 import sys
@@ -442,3 +444,15 @@ def test_an_expert_accelerates_exactly_as_in_an_episode() -> None:
             environment.step(np.zeros(1))
             found.append(environment._road.world.last_applied_acceleration())
     np.testing.assert_array_equal(found, cav.applied_acceleration)
+
+
+@pytest.mark.parametrize("backend", ["sumo", "batch"])
+def test_environments_are_copied_before_the_first_reset_only(backend: str) -> None:
+    with closing(RoadEnv("ring", backend=backend, horizon=5)) as environment:
+        other = copy.deepcopy(environment)
+        observation, _ = environment.reset(seed=3)
+        for make_copy in (copy.deepcopy, pickle.dumps):
+            with pytest.raises(InputError, match="a copy after reset is not allowed"):
+                make_copy(environment)
+    with closing(other):
+        np.testing.assert_array_equal(other.reset(seed=3)[0], observation)

@@ -136,6 +136,12 @@ class RoadStepper:
         self.lock = CopyableLock()
         """held during calls of the environment"""
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes for a copy; raise `InputError` after a reset: a simulation cannot be copied."""
+        if self._world is not None:
+            raise InputError("environment: a copy after reset is not allowed; allowed: before, or a new environment")
+        return self.__dict__
+
     def _check_scenario(self, scenario: Scenario, backend: Backend) -> None:
         check_can_drive(self._driver.expert, scenario)
         check_policy_inputs(self._driver.features, scenario, "features")
