@@ -18,7 +18,6 @@ from unjam.drivers.registry import driver_from_name
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
 from unjam.measures.statistics import metric_estimate, paired_difference
 from unjam.reports.figures import LINE_COLORS, new_figure
-from unjam.road_family import ACTUATOR_LATENCY
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.search_space import SearchSpace, default_search_space
@@ -50,14 +49,9 @@ TUNING_STEPS = {"ring": 3_000_000, "ring-jammed": 3_000_000, "figure-eight": 1_5
 STORED_METRICS = ("seed", "return", "mean_speed", "speed_std_fleet_steady", "min_time_gap", "feasibility")
 
 
-def string_road(name: str) -> Scenario:
-    """Return a closed road whose CAVs have the actuator of a usual car."""
-    return make_scenario(name, {"actuator": ACTUATOR_LATENCY})
-
-
 def measure_tuned(road: str, expert: str, limit: float, workers: int) -> Table:
     """Return an expert that was tuned with a limit on its string gain, with its gain and its test episodes."""
-    scenario = string_road(road)
+    scenario = make_scenario(road)
     space = SMOOTH_ACC_SPACE if expert == "smooth-acc" else default_search_space(expert, scenario.control_step)
     with WorkerPool(workers) as pool, tempfile.TemporaryDirectory() as folder:
         out, options = Path(folder, "tuned"), {"screen": True, "max_string_gain": limit}
@@ -76,7 +70,7 @@ def measure_episodes(scenario: Scenario, driver: str, workers: int) -> Table:
 
 def measure_human_baseline(road: str, workers: int) -> Table:
     """Return the test episodes of the human baseline."""
-    episodes = measure_episodes(string_road(road), HUMAN_LABEL, workers)
+    episodes = measure_episodes(make_scenario(road), HUMAN_LABEL, workers)
     return [{"expert": HUMAN_LABEL, "limit": 0.0, "episodes": episodes}]
 
 
