@@ -62,9 +62,14 @@ TUNING_STEPS = {"ring": 3_000_000, "ring-jammed": 3_000_000, "figure-eight": 1_5
 STORED_METRICS = ("seed", "return", "mean_speed", "speed_std_fleet_steady", "min_time_gap", "feasibility")
 
 
+def closed_road(name: str, car: str = "usual") -> Scenario:
+    """Return a closed road with one of the `CARS`."""
+    return replace(make_scenario(name), actuator=CARS[car])
+
+
 def measure_tuned(road: str, expert: str, limit: float, workers: int) -> Table:
     """Return an expert that was tuned with a limit on its string gain, with its gain and its test episodes."""
-    scenario = make_scenario(road)
+    scenario = closed_road(road)
     space = SMOOTH_ACC_SPACE if expert == "smooth-acc" else default_search_space(expert, scenario.control_step)
     with WorkerPool(workers) as pool, tempfile.TemporaryDirectory() as folder:
         out, options = Path(folder, "tuned"), {"screen": True, "max_string_gain": limit}
@@ -83,13 +88,13 @@ def measure_episodes(scenario: Scenario, driver: str, workers: int) -> Table:
 
 def measure_human_baseline(road: str, workers: int) -> Table:
     """Return the test episodes of the human baseline."""
-    episodes = measure_episodes(make_scenario(road), HUMAN_LABEL, workers)
+    episodes = measure_episodes(closed_road(road), HUMAN_LABEL, workers)
     return [{"expert": HUMAN_LABEL, "limit": 0.0, "episodes": episodes}]
 
 
 def measure_packaged(road: str, car: str, workers: int) -> Table:
     """Return the test episodes of `pi` and of packaged controllers with one of the `CARS`, and their string gains."""
-    scenario = replace(make_scenario(road), actuator=CARS[car])
+    scenario = closed_road(road, car)
     rows: Table = []
     with WorkerPool(workers) as pool:
         point = find_operating_points({road: scenario}, pool)[road]
