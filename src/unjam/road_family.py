@@ -21,7 +21,12 @@ NGSIM_IDM = {
     **{"max_acceleration": 1.243, "comfortable_deceleration": 1.424},
 }
 """the common IDM of the 325 drivers of the NGSIM pairs, results/field.json"""
-ACTUATOR_LATENCY, LONG_ACTUATOR_LATENCY = {"lag": 0.3, "delay": 0.2}, {"lag": 0.5, "delay": 0.5}  # [s]
+NO_LATENCY, LATENCY, LONG_LATENCY = (
+    {"lag": lag, "delay": delay} for lag, delay in ((0.0, 0.0), (0.3, 0.2), (0.5, 0.5))
+)
+"""of actuators [s]: ideal vehicles, usual cars, slow ones"""
+IDEAL: dict[str, Any] = {"actuator": NO_LATENCY}
+"""vehicles that obey at once: roads of the family keep them, except those with `delayed` or `delay` in their name"""
 SENSOR_ERRORS = {"gap_error": 0.5, "speed_error": 0.3}
 NOISY_SENSORS: dict[str, Any] = {"sensors": {**SENSOR_ERRORS, "dropout": 0.1}, "safety": SENSOR_ERRORS}
 """sensors with errors that lose a tenth of the readings; the safety filter allows for the errors"""
@@ -43,9 +48,9 @@ class FamilyRoad:
 def ring_options(
     vehicles: int, cavs: int, warmup: int, spacing: tuple[float, float] = (10.0, 12.27), **extra: Any
 ) -> dict[str, Any]:
-    """Return the options of a ring; `spacing` is the road length per vehicle [m], the paper's by default."""
+    """Return the options of a ring of ideal vehicles; `spacing`: road length per vehicle [m], the paper's."""
     length = [round(vehicles * each) for each in spacing]
-    return {"vehicles": vehicles, "cavs": cavs, "warmup": warmup, "length": length, **extra}
+    return {"vehicles": vehicles, "cavs": cavs, "warmup": warmup, "length": length, **IDEAL, **extra}
 
 
 FAMILY: dict[str, FamilyRoad] = {
@@ -58,33 +63,33 @@ FAMILY: dict[str, FamilyRoad] = {
     "ring-66-grown-4-cavs": FamilyRoad("ring", ring_options(66, 4, LONG_WARM_UP)),
     "ring-22-wide": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, (13.0, 16.0))),
     "ring-22-aggressive": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, humans=AGGRESSIVE_IDM)),
-    "ring-22-delayed": FamilyRoad("ring", ring_options(22, 1, SHORT_WARM_UP, actuator=ACTUATOR_LATENCY)),
-    "figure-eight-14": FamilyRoad("figure-eight"),
-    "figure-eight-12": FamilyRoad("figure-eight", {"vehicles": 12}),
+    "ring-22-delayed": FamilyRoad("ring", ring_options(22, 1, SHORT_WARM_UP, actuator=LATENCY)),
+    "figure-eight-14": FamilyRoad("figure-eight", IDEAL),
+    "figure-eight-12": FamilyRoad("figure-eight", {"vehicles": 12, **IDEAL}),
     "on-ramp-5": FamilyRoad("on-ramp", {"penetration_rate": 0.05}),
     "on-ramp-20": FamilyRoad("on-ramp", {"penetration_rate": 0.2}),
     "on-ramp-10-less-demand": FamilyRoad("on-ramp", {"penetration_rate": 0.1, "inflow": 2900.0}),
     "ring-33-grown": FamilyRoad("ring", ring_options(33, 1, LONG_WARM_UP), "combination"),
     "ring-66-growing-2-cavs": FamilyRoad("ring", ring_options(66, 2, SHORT_WARM_UP), "combination"),
     "ring-44-delayed-aggressive": FamilyRoad(
-        "ring", ring_options(44, 2, LONG_WARM_UP, humans=AGGRESSIVE_IDM, actuator=ACTUATOR_LATENCY), "combination"
+        "ring", ring_options(44, 2, LONG_WARM_UP, humans=AGGRESSIVE_IDM, actuator=LATENCY), "combination"
     ),
     "on-ramp-10": FamilyRoad("on-ramp", {"penetration_rate": 0.1}, "combination"),
     "ring-22-dense": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, (9.1, 9.8)), "axis"),
     "ring-88-grown": FamilyRoad("ring", ring_options(88, 1, LONG_WARM_UP), "axis"),
     "ring-44-grown-5-cavs": FamilyRoad("ring", ring_options(44, 5, LONG_WARM_UP), "axis"),
     "ring-22-ngsim-idm": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, humans=NGSIM_IDM), "axis"),
-    "figure-eight-wide": FamilyRoad("figure-eight", {"radius": (36, 38)}, "axis"),
+    "figure-eight-wide": FamilyRoad("figure-eight", {"radius": (36, 38), **IDEAL}, "axis"),
     "on-ramp-10-more-demand": FamilyRoad(
         "on-ramp", {"penetration_rate": 0.1, "inflow": 3400.0, "ramps.0.inflow": 600.0}, "axis"
     ),
     "one-lane-10": FamilyRoad("on-ramp-1", {"penetration_rate": 0.1}, "axis"),
-    "ring-22-long-delay": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, actuator=LONG_ACTUATOR_LATENCY), "axis"),
+    "ring-22-long-delay": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, actuator=LONG_LATENCY), "axis"),
     "ring-22-noisy-sensors": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **NOISY_SENSORS), "axis"),
     "ring-22-ngsim": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **NGSIM_DRIVERS), "axis"),
     "ring-22-astazero": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **ASTAZERO_DRIVERS), "axis"),
-    "figure-eight-ngsim": FamilyRoad("figure-eight", NGSIM_DRIVERS, "axis"),
-    "figure-eight-astazero": FamilyRoad("figure-eight", ASTAZERO_DRIVERS, "axis"),
+    "figure-eight-ngsim": FamilyRoad("figure-eight", {**NGSIM_DRIVERS, **IDEAL}, "axis"),
+    "figure-eight-astazero": FamilyRoad("figure-eight", {**ASTAZERO_DRIVERS, **IDEAL}, "axis"),
     "on-ramp-10-ngsim": FamilyRoad(
         "on-ramp", {"penetration_rate": 0.1, "inflow": 2600.0, "ramps.0.inflow": 400.0, **NGSIM_DRIVERS}, "axis"
     ),

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from unjam.controller import make_driver
 from unjam.drivers.command import Command
+from unjam.drivers.safety import INSTANT_ACTUATOR
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.physics.arrays import Array, Floats, clamp_min
 from unjam.physics.idm import PAPER_IDM, IDMParameters, idm_acceleration
@@ -93,10 +94,10 @@ class CAVSwitchesOff(ChangingRings):
 
 
 ROAD_CHANGES: dict[str, tuple[Ring, type[ChangingRings]]] = {
-    "a wave arrives": (Ring(horizon=END_STEP), WaveArrives),
-    "human drivers change": (Ring(horizon=END_STEP, warmup=SHORT_WARM_UP), HumansChange),
+    "a wave arrives": (Ring(horizon=END_STEP, actuator=INSTANT_ACTUATOR), WaveArrives),
+    "human drivers change": (Ring(horizon=END_STEP, warmup=SHORT_WARM_UP, actuator=INSTANT_ACTUATOR), HumansChange),
     "one of two CAVs switches off": (
-        Ring(length=(440, 540), vehicles=44, cavs=2, horizon=END_STEP, warmup=SHORT_WARM_UP),
+        Ring(length=(440, 540), vehicles=44, cavs=2, horizon=END_STEP, warmup=SHORT_WARM_UP, actuator=INSTANT_ACTUATOR),
         CAVSwitchesOff,
     ),
 }

@@ -30,10 +30,10 @@ from unjam.physics.arrays import Floats
 from unjam.reports.figures import TEXT_COLOR, new_figure
 from unjam.reports.results import replace_null
 from unjam.road_family import (
-    ACTUATOR_LATENCY,
     AGGRESSIVE_IDM,
     FAMILY,
     GROUP_BY_SCENARIO,
+    LATENCY,
     LONG_WARM_UP,
     SHARED_RINGS_GROUP,
     SHORT_WARM_UP,
@@ -107,7 +107,7 @@ ALL_ROADS_BASELINES = {label: FAMILY_DRIVERS[label] for label in ("unjam:best", 
 UNSEEN_SHARED_RINGS = {
     "ring-88-grown-6-cavs": ring_options(88, 6, LONG_WARM_UP),
     "ring-44-aggressive-3-cavs": ring_options(44, 3, LONG_WARM_UP, humans=AGGRESSIVE_IDM),
-    "ring-44-delayed-4-cavs": ring_options(44, 4, LONG_WARM_UP, actuator=ACTUATOR_LATENCY),
+    "ring-44-delayed-4-cavs": ring_options(44, 4, LONG_WARM_UP, actuator=LATENCY),
     "ring-55-dense-4-cavs": ring_options(55, 4, LONG_WARM_UP, (9.1, 9.8)),
     "ring-66-wide-4-cavs": ring_options(66, 4, LONG_WARM_UP, (13.0, 16.0)),
     "ring-44-no-warm-up-3-cavs": ring_options(44, 3, 0),

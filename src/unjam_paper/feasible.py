@@ -19,7 +19,7 @@ from unjam.controller.certificate import make_certificate
 from unjam.controller.file import SUFFIX, read_controller
 from unjam.drivers.car_following import FollowerStopper
 from unjam.drivers.driver import Driver
-from unjam.drivers.safety import Actuator, SafetyFilter
+from unjam.drivers.safety import INSTANT_ACTUATOR, Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL
@@ -162,19 +162,19 @@ RING_DRIVERS: dict[str, DriverSource] = {
 FEASIBLE_ROADS = {
     "ring": EvaluationRoad(
         sizes=(220, 230, 240, 250, 260, 270),
-        make_scenario=lambda length: Ring(length=(length, length), warmup=0),
+        make_scenario=lambda length: Ring(length=(length, length), actuator=INSTANT_ACTUATOR),
         drivers=RING_DRIVERS | CEILING,
         baselines=(PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL),
     ),
     "ring-jammed": EvaluationRoad(
         sizes=(220, 230, 240, 250, 260, 270),
-        make_scenario=lambda length: Ring(length=(length, length), warmup=LONG_WARM_UP),
+        make_scenario=lambda length: Ring(length=(length, length), warmup=LONG_WARM_UP, actuator=INSTANT_ACTUATOR),
         drivers={**RING_DRIVERS, GAP_PI_JAMMED_LONG_LABEL: GAP_PI_JAMMED_LONG_TUNED, **CEILING},
         baselines=(GAP_PI_LABEL, GAP_PI_JAMMED_LABEL, GAP_PI_JAMMED_LONG_LABEL),
     ),
     "figure-eight": EvaluationRoad(
         sizes=(32, 33, 34, 35),
-        make_scenario=lambda radius: FigureEight(radius=(radius, radius)),
+        make_scenario=lambda radius: FigureEight(radius=(radius, radius), actuator=INSTANT_ACTUATOR),
         drivers={
             **{HUMAN_LABEL: "human", "pacer": "pacer", "varying pacer": "pacer:use_tuned=true"},
             **{PACER_TUNED_LABEL: "unjam:figure-eight-tuned", PACER_LONG_LABEL: PACER_LONG_TUNED},
@@ -276,13 +276,14 @@ def envelope_rings(**changes: Any) -> Iterator[tuple[str, Ring]]:
     for vehicles, cavs, (words, (low, high)), warmup in each:
         name = f"{vehicles} vehicles, {cavs} automated, {words}{', jammed' if warmup else ''}"
         length = low * vehicles, high * vehicles
-        yield name, Ring(vehicles=vehicles, cavs=cavs, length=length, warmup=warmup, **changes)
+        size: dict[str, Any] = {"vehicles": vehicles, "cavs": cavs, "length": length, "warmup": warmup}
+        yield name, Ring(actuator=INSTANT_ACTUATOR, **size, **changes)
 
 
 def envelope_figure_eights() -> Iterator[tuple[str, FigureEight]]:
     """Yield the figure eights by name."""
     for low, high in ((27, 29), (30, 31), (32, 35), (36, 40), (41, 50)):
-        yield f"radius {low} to {high} m", FigureEight(radius=(low, high))
+        yield f"radius {low} to {high} m", FigureEight(radius=(low, high), actuator=INSTANT_ACTUATOR)
 
 
 def envelope_lanes(**changes: Any) -> Iterator[tuple[str, Motorway]]:
@@ -296,7 +297,7 @@ def envelope_lanes(**changes: Any) -> Iterator[tuple[str, Motorway]]:
 def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
     """Yield the default ring with each impairment, by its name."""
     for name, changes in IMPAIRMENTS.items():
-        yield name, replace(Ring(warmup=warmup), **changes)
+        yield name, replace(Ring(warmup=warmup, actuator=INSTANT_ACTUATOR), **changes)
 
 
 def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:

@@ -17,6 +17,7 @@ from unjam.measures.effect import FUEL_METRIC
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
 from unjam.measures.metrics import GASOLINE_DENSITY
 from unjam.measures.statistics import metric_estimate, paired_difference
+from unjam.road_family import NO_LATENCY
 from unjam.scenarios import make_scenario
 from unjam.seeds import held_out_seeds
 from unjam.worlds.record import Episode
@@ -45,7 +46,7 @@ def idle_rate(episode: Episode) -> float:
 
 def measure_fuel(road: str, emission_class: str, drivers: Sequence[str], workers: int) -> Table:
     """Return the fuel [ml/km], the idle rate [l/h] and the mean speed [m/s] of drivers, one row for each episode."""
-    scenario = make_scenario(road, {"emission_class": emission_class})
+    scenario = make_scenario(road, {"emission_class": emission_class, "actuator": NO_LATENCY})
     tasks = [
         EpisodeTask(scenario, make_driver(name, scenario.control_step), seed, record_details=True)
         for name in drivers

@@ -3,9 +3,11 @@
 from typing import Any
 
 from unjam.parameters import merge_changes
+from unjam.road_family import NO_LATENCY
 
 PAPER: dict[str, Any] = {
     **{"expert": "pi:time_constant=0", "steps": 4_000_000, "stratified": False},
+    "scenario_options": {"actuator": NO_LATENCY},
     "policy": {
         **{"inputs": ["local"], "exploration_std": 1.0, "action_duration": 0},
         **{"privileged_critic": False, "normalize_value": False},
@@ -21,7 +23,8 @@ PAPER: dict[str, Any] = {
     },
     "model": {"k_max": 500, "kappa": 2.0, "model_ratio": 1.0},
 }
-"""settings that the paper reports, Tables B2 to B6 and section 4.1, else those of its authors' code"""
+"""settings that the paper reports, Tables B2 to B6 and section 4.1, else those of its authors' code; vehicles obey at
+once"""
 PAPER_EXACT = {
     "scenario_options": {"safety": {"active": False}},
     "policy": {"zero_init": False},

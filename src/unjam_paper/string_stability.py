@@ -5,7 +5,9 @@ Without a limit, they amplify oscillations that are slower than a lap and cannot
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,13 @@ import pandas as pd
 from matplotlib.figure import Figure
 from optuna.distributions import FloatDistribution
 
+from unjam.controller import make_driver
 from unjam.drivers.registry import driver_from_name
+from unjam.drivers.safety import INSTANT_ACTUATOR, STANDARD_ACTUATOR
+from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
 from unjam.measures.statistics import metric_estimate, paired_difference
 from unjam.reports.figures import LINE_COLORS, new_figure
-from unjam.road_family import ACTUATOR_LATENCY
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.search_space import SearchSpace, default_search_space
@@ -26,13 +30,21 @@ from unjam.training.string_limit import find_operating_points
 from unjam.training.tune import tune
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import read_part
-from unjam_paper.study import Study, Table, evaluate_drivers
+from unjam_paper.study import NO_VALUE_TEXT, Study, Table, evaluate_drivers
 
 OTHER_EXPERT = {"ring": "pi-from-gap", "ring-jammed": "pi-from-gap", "figure-eight": "pacer"}
 """expert that always amplifies some frequency, by road"""
 STRING_ROADS = tuple(OTHER_EXPERT)
-GAIN_LIMITS = (1.02, 0.0, 1.1, 1.3)
-"""largest allowed string gains; 0: any"""
+GAIN_LIMITS = {"ring": (1.02, 0.0, 1.1, 1.3), "ring-jammed": (1.02, 0.0, 1.1, 1.3), "figure-eight": (1.02, 0.0)}
+"""largest allowed string gains, by road; 0: any"""
+PACKAGED = {
+    "ring": ("unjam:ring-gap-tuned", "unjam:ring-best"),
+    "ring-jammed": ("unjam:ring-jammed-tuned", "unjam:ring-jammed-best"),
+    "figure-eight": ("unjam:figure-eight-tuned", "unjam:figure-eight-best"),
+}
+"""packaged controllers that were tuned and trained for ideal vehicles, by road"""
+CARS = {"ideal": INSTANT_ACTUATOR, "usual": STANDARD_ACTUATOR}
+"""actuators of CAVs"""
 STRING_SEEDS = 20
 """test seeds of each tuned expert"""
 SMOOTH_ACC_SPACE: SearchSpace = {
@@ -50,14 +62,14 @@ TUNING_STEPS = {"ring": 3_000_000, "ring-jammed": 3_000_000, "figure-eight": 1_5
 STORED_METRICS = ("seed", "return", "mean_speed", "speed_std_fleet_steady", "min_time_gap", "feasibility")
 
 
-def string_road(name: str) -> Scenario:
-    """Return a closed road whose CAVs have the actuator of a usual car."""
-    return make_scenario(name, {"actuator": ACTUATOR_LATENCY})
+def closed_road(name: str, car: str = "usual") -> Scenario:
+    """Return a closed road with one of the `CARS`."""
+    return replace(make_scenario(name), actuator=CARS[car])
 
 
 def measure_tuned(road: str, expert: str, limit: float, workers: int) -> Table:
     """Return an expert that was tuned with a limit on its string gain, with its gain and its test episodes."""
-    scenario = string_road(road)
+    scenario = closed_road(road)
     space = SMOOTH_ACC_SPACE if expert == "smooth-acc" else default_search_space(expert, scenario.control_step)
     with WorkerPool(workers) as pool, tempfile.TemporaryDirectory() as folder:
         out, options = Path(folder, "tuned"), {"screen": True, "max_string_gain": limit}
@@ -76,8 +88,37 @@ def measure_episodes(scenario: Scenario, driver: str, workers: int) -> Table:
 
 def measure_human_baseline(road: str, workers: int) -> Table:
     """Return the test episodes of the human baseline."""
-    episodes = measure_episodes(string_road(road), HUMAN_LABEL, workers)
+    episodes = measure_episodes(closed_road(road), HUMAN_LABEL, workers)
     return [{"expert": HUMAN_LABEL, "limit": 0.0, "episodes": episodes}]
+
+
+def measure_packaged(road: str, car: str, workers: int) -> Table:
+    """Return the test episodes of `pi` and of packaged controllers with one of the `CARS`, and their string gains."""
+    scenario = closed_road(road, car)
+    rows: Table = []
+    with WorkerPool(workers) as pool:
+        point = find_operating_points({road: scenario}, pool)[road]
+    for name in ("pi", *PACKAGED[road], "unjam:best"):
+        driver = make_driver(name, scenario.control_step)
+        gain = None if name == "unjam:best" else point.string_gain(driver)  # it selects its controller on the road
+        rows.append({"car": car, "driver": name, "gain": gain, "episodes": measure_episodes(scenario, name, workers)})
+    return rows
+
+
+def packaged_table(road: str, folder: Path) -> pd.DataFrame:
+    """Return gain, return and mean speed of packaged controllers with ideal and usual cars."""
+    _, human = tuned_rows(road, folder)
+    return pd.DataFrame(
+        [
+            {
+                "driver": row["driver"],
+                "car": row["car"],
+                "its gain": NO_VALUE_TEXT if row["gain"] is None else f"{row['gain']:.2f}",
+                **_compared_cells(row["episodes"], human),
+            }
+            for row in read_part(folder, f"packaged-{road}")
+        ]
+    )
 
 
 def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
@@ -90,17 +131,32 @@ def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
 def string_table(road: str, folder: Path) -> pd.DataFrame:
     """Return gain, return, mean speed and their differences to the human baseline, by expert and limit."""
     rows, human = tuned_rows(road, folder)
-    columns = (("return", "return", "return", 0), ("mean speed [m/s]", "speed", "mean_speed", 2))
-    table: Table = []
-    for row in rows:
-        cells = {"expert": row["expert"], "largest gain allowed": f"{row['limit']:g}" if row["limit"] else "any"}
-        cells["its gain"] = f"{row['gain']:.2f}"
-        for heading, quantity, metric, digits in columns:
-            difference = estimate_cell(paired_difference(row["episodes"], human, metric), digits, sign="+")
-            cells[heading] = f"{metric_estimate(row['episodes'], metric).mean:.{digits}f}"
-            cells[f"{quantity}, difference to human{' [m/s]' if digits else ''}"] = str(difference)
-        table.append(cells)
-    return pd.DataFrame(table)
+    return pd.DataFrame(
+        [
+            {
+                "expert": row["expert"],
+                "largest gain allowed": f"{row['limit']:g}" if row["limit"] else "any",
+                "its gain": f"{row['gain']:.2f}",
+                **_compared_cells(row["episodes"], human),
+            }
+            for row in rows
+        ]
+    )
+
+
+def _compared_cells(episodes: Table, human: Table) -> dict[str, str]:
+    """Return mean return and speed with their differences to the human baseline, time gap and feasibility."""
+    cells: dict[str, str] = {}
+    for heading, quantity, metric, digits in (
+        ("return", "return", "return", 0),
+        ("mean speed [m/s]", "speed", "mean_speed", 2),
+    ):
+        cells[heading] = f"{metric_estimate(episodes, metric).mean:.{digits}f}"
+        difference = estimate_cell(paired_difference(episodes, human, metric), digits, sign="+")
+        cells[f"{quantity}, difference to human{' [m/s]' if digits else ''}"] = str(difference)
+    feasible = sum(row["feasibility"] == FEASIBLE for row in episodes)
+    cells["min time gap [s]"] = f"{min(row['min_time_gap'] for row in episodes):.2f}"
+    return cells | {"feasible episodes": f"{feasible} of {len(episodes)}"}
 
 
 def string_figure(folder: Path) -> Figure:
@@ -126,14 +182,18 @@ STRING_STABILITY = Study(
     title="what string stability costs on closed roads: experts tuned with limits on their string gain",
     make_parts=lambda study_folder, seeds: {
         **{f"{road}/{HUMAN_LABEL}": (measure_human_baseline, (road,)) for road in STRING_ROADS},
-        **{f"{road}/{expert} 0": (measure_tuned, (road, expert, 0.0)) for road, expert in OTHER_EXPERT.items()},
         **{
             f"{road}/smooth-acc {limit:g}": (measure_tuned, (road, "smooth-acc", limit))
-            for limit in GAIN_LIMITS
-            for road in STRING_ROADS
+            for road, limits in GAIN_LIMITS.items()
+            for limit in limits
         },
+        **{f"packaged-{road}/{car}": (measure_packaged, (road, car)) for road, car in product(PACKAGED, CARS)},
+        **{f"{road}/{expert} 0": (measure_tuned, (road, expert, 0.0)) for road, expert in OTHER_EXPERT.items()},
     },
     minutes=70.0,
-    tables={road: partial(string_table, road) for road in STRING_ROADS},
+    tables={
+        **{road: partial(string_table, road) for road in STRING_ROADS},
+        **{f"packaged-{road}": partial(packaged_table, road) for road in PACKAGED},
+    },
     figures={"trade-off": string_figure},
 )

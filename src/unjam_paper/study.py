@@ -22,6 +22,7 @@ from unjam.measures.metric_table import estimate_cell, with_no_break_spaces
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, estimate, estimate_on_shared_seeds, estimate_over_trainings, format_ci
 from unjam.reports.results import EVALUATION_FILE, read_progress, read_rows
+from unjam.road_family import NO_LATENCY
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig, load_config
@@ -32,12 +33,14 @@ from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.results_file import CONTROLLERS, StudyPart, measure_parts, write_figure, write_part
 from unjam_paper.variants import VARIANTS
 
+IDEAL_CAVS: dict[str, Any] = {"scenario_options.actuator": NO_LATENCY}
+"""as in the paper, CAVs obey at once"""
 STUDY_ROADS: dict[str, dict[str, Any]] = {
-    **{name: {"scenario": name} for name in ("ring", "ring-jammed", "figure-eight", "merge")},
+    **{name: {"scenario": name, **IDEAL_CAVS} for name in ("ring", "ring-jammed", "figure-eight", "merge")},
     "on-ramp": {"scenario": "on-ramp", "scenario_options.penetration_rate": 0.05},
     **{name: {"scenario": "ring"} for name in ("rings", "shared-rings", "all-roads")},
-    "ring-11": {"scenario": "ring", "scenario_options.vehicles": 11},
-    "ring-5": {"scenario": "ring", "scenario_options.vehicles": 5},
+    "ring-11": {"scenario": "ring", "scenario_options.vehicles": 11, **IDEAL_CAVS},
+    "ring-5": {"scenario": "ring", "scenario_options.vehicles": 5, **IDEAL_CAVS},
 }
 UNFILTERED_ROADS = {road: f"{road}-unfiltered" for road in ("ring", "figure-eight", "ring-11", "ring-5")}
 """roads as in the paper, without the safety filter, by the road with it; the merge never has one"""

@@ -12,6 +12,7 @@ from unjam.drivers.driver import scalar_memory
 from unjam.drivers.local_state import COMMON_FIELDS, LocalState, state_of_ones
 from unjam.drivers.registry import driver_from_recipe, driver_recipe
 from unjam.drivers.road_experts import BROKEN_LAP_FRACTION, GATHERED_LAP_FRACTION
+from unjam.drivers.safety import INSTANT_ACTUATOR
 from unjam.drivers.wrappers import MAX_GATHERING_TIME, QueueFallback
 from unjam.measures.metrics import measure
 from unjam.physics.idm import IDMParameters
@@ -80,7 +81,8 @@ def test_among_people_who_keep_longer_distances_giving_up_helps_and_among_others
     sumo: SumoBackend,
 ) -> None:
     for headway, helps in ((1.0, False), (1.5, True)):
-        road = FigureEight(radius=(32, 32), humans=IDMParameters(time_headway=headway))
+        humans = IDMParameters(time_headway=headway)
+        road = FigureEight(radius=(32, 32), humans=humans, actuator=INSTANT_ACTUATOR)
         led, given_up = (
             measure(run_episode(road, driver, (3,), backend=sumo))["mean_speed_second_half"]
             for driver in (TWO.primary, TWO)

@@ -153,7 +153,7 @@ def test_other_objects_are_refused_in_one_line(make: Callable[..., Any], argumen
 
 
 def missing_later(state: LocalState) -> Any:
-    return np.where(state.speed > 0.2, np.nan, state.speed)
+    return np.where(state.speed > 0.05, np.nan, state.speed)
 
 
 def growing(state: LocalState) -> Any:

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 from unjam.drivers import Constant, LocalState
+from unjam.drivers.safety import INSTANT_ACTUATOR
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.environments.vector_env import RoadVectorEnv
 from unjam.errors import InputError, MissingPartError, UnjamError
@@ -357,7 +358,9 @@ def test_other_wrong_uses_are_refused() -> None:
         RoadVectorEnv(2, device=1.5)  # pyright: ignore[reportArgumentType]
     made = RoadVectorEnv(2, reward=lambda outcome: {"mine": outcome.speeds.mean(-1) / 0.0 * np.array([1.0, 0.0])})
     made.reset(seed=0)
-    numpy_feature = RoadVectorEnv(2, device="cpu", features=("local", lambda state: state.speed))
+    numpy_feature = RoadVectorEnv(
+        2, device="cpu", features=("local", lambda state: state.speed), actuator=INSTANT_ACTUATOR
+    )
     numpy_feature.reset(seed=0)
     with pytest.raises(InputError, match=r"<lambda>: feature has no gradient; allowed: within torch\.no_grad\(\)"):
         numpy_feature.step(torch.zeros((2, 1), requires_grad=True))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from unjam.drivers.registry import driver_from_name
+from unjam.drivers.safety import INSTANT_ACTUATOR
 from unjam.files import to_json
 from unjam.scenarios import Ring
 from unjam.worlds.batch.ring.world import RingBatch
@@ -69,7 +70,7 @@ def test_human_drivers_that_follow_closer_are_faster_in_the_end() -> None:
 
 @pytest.mark.usefixtures("early_change")
 def test_only_the_last_cav_switches_off() -> None:
-    lone = replace(RING, noise=0.0)
+    lone = replace(RING, noise=0.0, actuator=INSTANT_ACTUATOR)
     indices = [index for index, name in enumerate(_names(lone)) if name in _cavs(lone)]
     unchanged, changed = speeds_on(RingBatch, lone), speeds_on(CAVSwitchesOff, lone)
     first, last = indices

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from unjam.controller import string_stability as gains
-from unjam.scenarios import Ring, Scenario
+from unjam.scenarios import Ring, Scenario, make_scenario
 from unjam_paper import string_stability as study
 from unjam_paper.results_file import write_part
 from unjam_paper.string_stability import measure_human_baseline, measure_tuned, string_figure, string_table
@@ -17,16 +17,14 @@ from unjam_paper.string_stability import measure_human_baseline, measure_tuned, 
 def test_experts_are_tuned_within_their_limits_and_compared_with_human_drivers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    road = study.string_road
-
     roads = ("ring", "ring-jammed")
 
     def short_road(name: str) -> Scenario:
-        made = road(name)
+        made = make_scenario(name)
         assert isinstance(made, Ring)
         return replace(made, horizon=40, warmup=200, vehicles=8, length=(80, 90))
 
-    monkeypatch.setattr(study, "string_road", short_road)
+    monkeypatch.setattr(study, "make_scenario", short_road)
     monkeypatch.setattr(study, "STRING_SEEDS", 2)
     monkeypatch.setattr(study, "TUNING_STEPS", dict.fromkeys(roads, (12 * 8 + 2 * 8) * 40))
     monkeypatch.setattr(study, "STRING_ROADS", roads)

@@ -18,7 +18,7 @@ from tests.test_architecture import EXAMPLES
 from unjam.drivers import IDM, Constant, Human, PISaturation
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.road_experts import Cruise
-from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.safety import INSTANT_ACTUATOR, SafetyFilter
 from unjam.drivers.user_driver import FileReference
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import InputError, UnjamError
@@ -40,7 +40,7 @@ from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
-RING = Ring(horizon=60, length=(230, 230))
+RING = Ring(horizon=60, length=(230, 230), actuator=INSTANT_ACTUATOR)
 
 
 @pytest.fixture

@@ -12,12 +12,21 @@ from typer import Argument, Option
 
 from unjam.cli.options import JsonOption, check_page_path
 from unjam.cli.output import console, err_console, print_json
-from unjam.controller.file import add_certificate, add_signature, check_unsigned, controller_file, read_controller
+from unjam.controller.file import (
+    PACKAGED_PREFIX,
+    SUFFIX,
+    Controller,
+    add_certificate,
+    add_signature,
+    check_unsigned,
+    controller_file,
+    read_controller,
+)
 from unjam.controller.verify import check_parts, require_complete
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import invalid_value
 from unjam.files import check_parent_folder
-from unjam.processes import continue_in_limited_child
+from unjam.processes import PrivateFolder, continue_in_limited_child
 from unjam.training.export import export_controller
 
 
@@ -65,7 +74,9 @@ def export_command(
 
 
 def certify_command(
-    file: Annotated[Path, Argument(help="Exported .unjam file, to which the certificate is added.")],
+    file: Annotated[
+        Path, Argument(help="Exported .unjam file, to which the certificate is added; or a packaged controller.")
+    ],
     out: Annotated[
         Path | None, Option("--out", help="HTML file to write.", show_default="the name of the file with .html")
     ] = None,
@@ -75,18 +86,21 @@ def certify_command(
 
     In the tests, leaders brake to a standstill from every state of the sample, an adversarial leader searches
     for contact, and leaders oscillate at many frequencies. The certificate becomes a part of the file, and
-    `unjam verify` checks it. A signed file is refused.
+    `unjam verify` checks it. A signed file is refused. A packaged controller stays as it is, and gets the filter of its
+    road if it has none.
 
-    Example:
+    Examples:
 
     - unjam certify ring.unjam
+    - unjam certify unjam:ring-tuned
     """
     from unjam.controller.certificate import describe_worst_cases, make_certificate
 
     if out is not None:
         check_page_path(out)
-    controller, file = read_controller(file), controller_file(file)
-    target = out or file.with_suffix(".html")
+    is_packaged = str(file).startswith(PACKAGED_PREFIX)
+    controller, file = _read_with_filter(str(file)) if is_packaged else read_controller(file), controller_file(file)
+    target = out or (Path(file.name) if is_packaged else file).with_suffix(".html")
     check_parent_folder(target)
     check_unsigned(controller)
     from unjam.reports.certificate import write_certificate_page  # loads matplotlib
@@ -94,7 +108,8 @@ def certify_command(
     certificate = make_certificate(controller)
     assert isinstance(controller.driver, FilteredDriver)  # only such drivers are certified
     write_certificate_page(file.name, controller.driver, certificate, target)  # may be refused: before the file changes
-    add_certificate(file, controller, certificate)
+    if not is_packaged:
+        add_certificate(file, controller, certificate)
     if json:
         print_json({"file": str(file), "page": str(target), "certificate": certificate})
         return
@@ -104,6 +119,15 @@ def certify_command(
         largest = f"largest gain {max(each['gains']):.2f} at {each['peak_frequency']:.3g} Hz"
         console.print(f"at {each['speed']:g} m/s: {verdict}, {largest}", soft_wrap=True)
     err_console.print(f"page: {target}")
+
+
+def _read_with_filter(name: str) -> Controller:
+    """Return a packaged controller with the safety filter of its road and a sample of it."""
+    controller = read_controller(Path(name))
+    if isinstance(controller.driver, FilteredDriver):
+        return controller
+    with PrivateFolder() as private:
+        return read_controller(export_controller(name, Path(private, f"filtered{SUFFIX}")).file)
 
 
 def verify_command(

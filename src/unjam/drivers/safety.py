@@ -86,7 +86,9 @@ class Actuator(Subclassable):
 
 
 INSTANT_ACTUATOR = Actuator()
-"""a vehicle that responds to commands at once"""
+"""an ideal vehicle, which responds to commands at once"""
+STANDARD_ACTUATOR = Actuator(delay=0.2, lag=0.3)
+"""a usual car; `docs/safety.md` names the sources"""
 
 
 class FollowingState(NamedTuple):

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import model_validator
 
 from unjam.drivers.command import Limits
-from unjam.drivers.safety import Actuator
+from unjam.drivers.safety import STANDARD_ACTUATOR, Actuator
 from unjam.errors import InputError
 from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
 from unjam.physics.arrays import Floats
@@ -73,7 +73,7 @@ class Recorded(Scenario):
     """hardest braking that a CAV can command [m/s2]"""
     max_acceleration: Positive = 1.5
     """largest acceleration that a CAV can command [m/s2]"""
-    actuator: Actuator = field(default_factory=lambda: Actuator(delay=0.2, lag=0.3))
+    actuator: Actuator = STANDARD_ACTUATOR
     humans: IDMParameters = field(
         default_factory=lambda: IDMParameters(
             desired_speed=45.0, max_acceleration=1.3, comfortable_deceleration=2.0, time_headway=1.0

@@ -18,7 +18,7 @@ from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_from_name
 from unjam.drivers.requirements import Requirements
-from unjam.drivers.safety import Actuator, SafetyFilter
+from unjam.drivers.safety import INSTANT_ACTUATOR, Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.errors import InputError
 from unjam.measures.metrics import measure
@@ -225,7 +225,7 @@ class Hasty(Driver):
 
 
 def test_brakes_do_what_they_can(sumo: SumoBackend) -> None:
-    ring = replace(SHORT, action_limit=8.0)
+    ring = replace(SHORT, action_limit=8.0, actuator=INSTANT_ACTUATOR)
     (found,) = run_batch(tasks(ring, Hasty(), (1,)))
     assert_alike(found, run_episode(ring, Hasty(), 1, backend=sumo))
     assert found.audit.cav_braking.max_braking == pytest.approx(6.0)

@@ -9,14 +9,14 @@ import pytest
 from unjam.drivers import IDM, Constant, Driver, Human, LocalState, Memory, PISaturation
 from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.drivers.requirements import NO_REQUIREMENTS
-from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.safety import INSTANT_ACTUATOR, SafetyFilter
 from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring
 from unjam.worlds.episode import run_episode
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.sumo.backend import SumoBackend
 
-RING = Ring(length=(230, 230), horizon=300, safety=SafetyFilter(active=False))
+RING = Ring(length=(230, 230), horizon=300, safety=SafetyFilter(active=False), actuator=INSTANT_ACTUATOR)
 """what SUMO does with commands, without the filter"""
 STEP = 0.1
 

@@ -11,7 +11,7 @@ from unjam.drivers import Driver, LocalState, Memory, PISaturation
 from unjam.drivers.car_following import Human
 from unjam.drivers.command import Command
 from unjam.drivers.road_experts import Pacer
-from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.safety import INSTANT_ACTUATOR, SafetyFilter
 from unjam.measures.metrics import measure
 from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.scenario import MIN_CAV_GAP
@@ -67,7 +67,7 @@ def test_leader_and_gap_are_those_of_sumo(simulation: Simulation) -> None:
 
 @pytest.mark.parametrize("cavs", [2, 7, 14])
 def test_several_cavs_are_driven_and_recorded_separately(cavs: int, sumo: SumoBackend) -> None:
-    road = replace(AS_FLOW, cavs=cavs, horizon=300)
+    road = replace(AS_FLOW, cavs=cavs, horizon=300, actuator=INSTANT_ACTUATOR)
     episode = run_episode(road, AccelerationByRow(), (1,), backend=sumo)
     assert (episode.status, len(episode.trajectories)) == ("completed", cavs)
     assert tuple(trajectory.vehicle for trajectory in episode.trajectories) == episode.cav_ids

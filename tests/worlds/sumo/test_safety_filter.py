@@ -7,7 +7,7 @@ import pytest
 
 from unjam.drivers import IDM, Driver, PISaturation
 from unjam.drivers.car_following import Constant
-from unjam.drivers.safety import Actuator, SafetyFilter
+from unjam.drivers.safety import INSTANT_ACTUATOR, Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metrics import measure
@@ -15,7 +15,7 @@ from unjam.scenarios import FigureEight, Merge, Ring, Scenario
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.backend import SumoBackend
 
-RAW = Ring(actuation="raw", horizon=1500, warmup=600)
+RAW = Ring(actuation="raw", horizon=1500, warmup=600, actuator=INSTANT_ACTUATOR)
 
 
 @pytest.mark.parametrize("actuator", [Actuator(), Actuator(lag=0.3, delay=0.2)], ids=["at once", "late"])
