@@ -159,7 +159,7 @@ def watch_command(
         print_json({**given, "video": str(video) if video else None, "episode": row})
     raise_failure([row])
     if not json and video is not None:
-        console.print(str(video))
+        console.print(f"video: {video}", soft_wrap=True)
 
 
 def watch_in_window(scenario: Scenario, driver: Driver, seed: Sequence[int], pace: float) -> Episode:

@@ -36,6 +36,8 @@ NARROW_COLUMN_WIDTHS = 18, 7
 """widths of the columns of metrics and units in a narrow terminal [characters]"""
 WIDE_OPTIONS_WIDTH = 130
 """width from which a cell of the main table of an assessment is one line [characters]"""
+MAX_HEADING_LENGTH = 45
+"""length of the name of a driver from which a table shows its beginning only [characters]"""
 TEXT_COLUMN_WIDTHS = {" ": 22, "\n": 15}
 """width of headings and verdicts [characters], by what separates a mean from its interval: that of most numbers"""
 
@@ -101,9 +103,12 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
     """Print feasibility, metrics with 95 % confidence intervals, and the differences to a baseline if there is one.
 
     If the terminal is too narrow for all drivers, intervals are below means; if it is still too narrow, there are
-    several tables.
+    several tables. Long names of drivers are below them.
     """
     headings, rows = metric_table(rows_by_driver, baseline, names)
+    long_labels = [label for label in rows_by_driver if len(label) > MAX_HEADING_LENGTH]
+    for number, label in enumerate(long_labels, 1):
+        headings = [heading.replace(label, f"{label.partition(':')[0]}:… ({number})") for heading in headings]
     columns = {label: [number] for number, label in enumerate(rows_by_driver)}
     compared = [label for label in columns if label != baseline]
     for label, number in zip(compared, range(len(columns), len(headings)), strict=False):
@@ -136,6 +141,8 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
             blocks[-1] = block
     for block in blocks:
         console.print(build_table(block, separator))
+    for number, label in enumerate(long_labels, 1):
+        console.print(f"({number}) " + break_label(label, console.width - 4).replace("\n", "\n    "), soft_wrap=True)
 
 
 def break_label(label: str, width: int) -> str:
