@@ -73,7 +73,7 @@ def test_a_missing_display_is_refused_with_a_remedy(unjam: Run) -> None:
 def test_a_video_needs_no_display(unjam: Run, tmp_path: Path) -> None:
     done = unjam(*WATCH, "--video", "out.gif", environment={"DISPLAY": ""})
     assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "out.gif"
+    assert done.stdout.strip() == "video: out.gif"
     assert (tmp_path / "out.gif").stat().st_size > 10_000
 
 
