@@ -122,7 +122,7 @@ def test_wide_terminals_have_one_table(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("width", [80, 160])
 def test_long_names_of_drivers_are_below_the_table(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
-    long_name = "pi:window=30,catch_up_speed=1.2,gap_lower=6,gap_upper=40,time_constant=0.9,safe_gap=2,first_command=zero"
+    long_name = "pi:window=30,catch_up_speed=1.2,gap_lower=6,gap_upper=40,time_constant=0.9,first_command=zero"
     lines = print_example(monkeypatch, width, ("human", long_name))
     assert max(map(len, lines)) <= width
     assert any("pi:… (1)" in line for line in lines)

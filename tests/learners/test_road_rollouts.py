@@ -10,7 +10,7 @@ import pytest
 from unjam.drivers import IDM, PISaturation
 from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
-from unjam.drivers.safety import INSTANT_ACTUATOR, SafetyFilter
+from unjam.drivers.safety import INSTANT_ACTUATOR, STANDARD_ACTUATOR, Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.learners.agent import AgentSpec
 from unjam.learners.model_rollouts import ModelRollouts, full_policy
@@ -80,9 +80,10 @@ def test_rollouts_without_noise_equal_the_recording(road: LoopScenario) -> None:
         np.testing.assert_allclose(found.gaps, episode.gaps[window], atol=1e-5)
 
 
-def test_rollouts_continue_with_the_recorded_memory() -> None:
+@pytest.mark.parametrize("actuator", [INSTANT_ACTUATOR, STANDARD_ACTUATOR])
+def test_rollouts_continue_with_the_recorded_memory_and_commands(actuator: Actuator) -> None:
     network = network_of(0.0)
-    model_rollouts, _, episodes = learned_rollouts(replace(RING, noise=0.0, actuator=INSTANT_ACTUATOR), network)
+    model_rollouts, _, episodes = learned_rollouts(replace(RING, noise=0.0, actuator=actuator), network)
     model_rollouts.k_star = CONTROL_STEPS
     found = model_rollouts.roll_out(network, 1)
     assert found is not None

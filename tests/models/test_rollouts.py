@@ -1,6 +1,7 @@
 from dataclasses import replace
 from math import inf, nan
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +14,13 @@ from tests.conftest import random_network
 from tests.models.toy_dynamics import RING, ToyDynamics, environment_data
 from unjam.drivers import IDM, Constant, Driver, LocalState, PISaturation, ResidualDriver
 from unjam.drivers.observation import FeatureName, observation_size
+from unjam.drivers.safety import ActuatorState
 from unjam.drivers.user_driver import FileDriver
 from unjam.errors import UnjamError
 from unjam.models.ensemble import torch_generator
 from unjam.models.environment_data import EnvironmentData
 from unjam.models.rollouts import (
+    AT_REST,
     CLIPPED_QUANTITIES,
     ModelDynamics,
     ModelTransition,
@@ -151,11 +154,13 @@ class ClippingDynamics(ToyDynamics):
 
     steps = 0
 
-    def step(self, state: LocalState, acceleration: torch.Tensor, drawn_values: torch.Tensor) -> ModelTransition:
+    def step(
+        self, state: LocalState, acceleration: Any, drawn_values: Any, actuators: ActuatorState = AT_REST
+    ) -> ModelTransition:
         self.steps += 1
         always = torch.ones_like(acceleration)
         clipped = torch.stack([always, always * 0, always * (self.steps == 1)]) > 0
-        return super().step(state, acceleration, drawn_values)._replace(clipped=clipped)
+        return super().step(state, acceleration, drawn_values, actuators)._replace(clipped=clipped)
 
 
 def test_clipped_share_counts_steps_before_the_crash() -> None:
@@ -247,9 +252,11 @@ def test_action_limit_clips_expert_and_sum() -> None:
     commands: list[torch.Tensor] = []
 
     class RecordingDynamics(ToyDynamics):
-        def step(self, state: LocalState, acceleration: torch.Tensor, drawn_values: torch.Tensor) -> ModelTransition:
+        def step(
+            self, state: LocalState, acceleration: Any, drawn_values: Any, actuators: ActuatorState = AT_REST
+        ) -> ModelTransition:
             commands.append(acceleration)
-            return super().step(state, acceleration, drawn_values)
+            return super().step(state, acceleration, drawn_values, actuators)
 
     strong = replace(driver, expert=IDM(), network=replace(random_network(6, seed=1, scale=1.0), authority=0.2))
     roll_out(strong, RecordingDynamics(), prepare_starts(data, data.start_indices(), IDM(), "cpu"), 20, None)

@@ -7,9 +7,9 @@ import numpy as np
 from unjam.drivers import IDM, LocalState
 from unjam.drivers.check import random_state
 from unjam.drivers.residual import EXPERT_KEY, ResidualDriver
-from unjam.drivers.safety import SafetyFilter
+from unjam.drivers.safety import ActuatorState, SafetyFilter
 from unjam.models.environment_data import EnvironmentData, Recording
-from unjam.models.rollouts import ModelDynamics, ModelTransition
+from unjam.models.rollouts import AT_REST, ModelDynamics, ModelTransition
 from unjam.physics.arrays import Array, as_column, namespace, stack_columns
 from unjam.scenarios import Ring
 from unjam.tree import map_leaves
@@ -29,7 +29,9 @@ class ToyDynamics(ModelDynamics):
         self.leader = leader
         self.bonus = bonus
 
-    def step(self, state: LocalState, acceleration: Array, drawn_values: Array) -> ModelTransition:
+    def step(
+        self, state: LocalState, acceleration: Array, drawn_values: Array, actuators: ActuatorState = AT_REST
+    ) -> ModelTransition:
         """Move all three by 0.1 s; a part of the reward does not depend on speeds."""
         step = 0.1
         follower_state = state._replace(

@@ -5,6 +5,7 @@ maximum, and keep its time gap behind one that brakes hard. `docs/safety.md` has
 """
 
 import sys
+from collections.abc import Callable
 from math import exp
 from typing import Annotated, Any, NamedTuple
 
@@ -22,6 +23,10 @@ class ActuatorState(NamedTuple):
     acceleration: Array
     pending: tuple[Array, ...] = ()
     """commands that have not arrived yet, the next one first"""
+
+    def map(self, function: Callable[[Array], Array]) -> "ActuatorState":
+        """Return the state with a function applied to each array."""
+        return ActuatorState(function(self.acceleration), tuple(map(function, self.pending)))
 
 
 Latency = Annotated[float, Field(ge=0, le=60)]
@@ -291,6 +296,10 @@ class CAVActuation:
         self._limit, self._actuator, self._step = safety.limit, actuator, step
         self._has_lag = not actuator.is_instant
         self._states: dict[str, ActuatorState] = {}
+
+    def set_state(self, name: str, state: ActuatorState) -> None:
+        """Let the vehicles of this name continue with accelerations and pending commands."""
+        self._states[name] = state
 
     def reset_rows(self, rows: Any) -> None:
         """Let some of the vehicles with a common name start again, without acceleration and commands."""

@@ -81,7 +81,9 @@ def replay_accelerations(
     generator = torch_generator((0,), device)  # not used
     members = torch.arange(model.members, device=device)
     dynamics = ModelDynamics(model, scenario, "", generator, add_noise=False, members=members)
-    world = ModelWorld(dynamics, RolloutStarts(states, {}, drawn), control_steps, scenario.acceleration_limits, None)
+    actuators = data.actuator_states_at(indices).map(lambda values: to_device(values, device))
+    starts = RolloutStarts(states, actuators, {}, drawn)
+    world = ModelWorld(dynamics, starts, control_steps, scenario.acceleration_limits, None)
     for _ in DriveLoop(world, ReplayDriver(to_device(accelerations, device))):
         pass
     shape = model.members, len(start_indices), control_steps
@@ -92,6 +94,6 @@ def replay_accelerations(
 def one_step_errors(model: RowModel, transitions: Transitions, scenario: Scenario, reward: str) -> OneStepErrors:
     """Return the errors of base and model in predicting each of the transitions."""
     targets, change = (residual_targets(transitions, base, scenario, reward) for base in (model.base, "none"))
-    inputs = torch.as_tensor(model_inputs(transitions.states, transitions.acceleration, transitions.drawn_values))
+    inputs = torch.as_tensor(model_inputs(transitions.states, transitions.response, transitions.drawn_values))
     predictions = model.member_predictions(inputs.to(model.input_mean.device))
     return OneStepErrors(targets, predictions * model.output_mask.cpu().numpy(), change)

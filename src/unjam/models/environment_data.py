@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.safety import INSTANT_ACTUATOR, Actuator, ActuatorState
 from unjam.errors import InputError
 from unjam.physics.arrays import Array
 from unjam.scenarios.scenario import Scenario
@@ -38,6 +39,9 @@ class Transitions(NamedTuple):
 
     states: LocalState
     acceleration: Floats
+    """commanded, after the filter [m/s2]"""
+    response: Floats
+    """acceleration in the step, which follows the commands with delay and lag [m/s2]"""
     drawn_values: Floats
     """scaled values that the episode drew, shape (R, m)"""
     next_states: LocalState
@@ -55,6 +59,9 @@ class EnvironmentData:
     """The trajectories of the newest episodes; old ones are dropped as long as `capacity` control steps remain."""
 
     capacity: int
+    actuator: Actuator = INSTANT_ACTUATOR
+    control_step: float = 0.1
+    """used with an actuator that is not instant [s]"""
     recordings: list[Recording] = field(default_factory=list)
     """stored trajectories, the oldest first"""
     episode_count: int = 0
@@ -89,6 +96,7 @@ class EnvironmentData:
         return Transitions(
             states=_concatenate_states([r.states.select(slice(-1)) for r in self.recordings]),
             acceleration=concatenate(lambda r: r.applied_acceleration),
+            response=concatenate(self._response),
             drawn_values=concatenate(lambda r: np.tile(r.drawn_values, (len(r.reward), 1))),
             next_states=_concatenate_states([r.states.select(slice(1, None)) for r in self.recordings]),
             reward=concatenate(lambda r: r.reward),
@@ -121,6 +129,22 @@ class EnvironmentData:
         first = np.cumsum([0, *(len(recording.states.speed) for recording in self.recordings)])
         rows = first[start_indices[:, 0]] + start_indices[:, 1]
         return _concatenate_states([recording.states for recording in self.recordings]).select(rows)
+
+    def actuator_states_at(self, start_indices: StartIndices) -> ActuatorState:
+        """Return the states of the actuators at `start_indices`, arrays of shape (n,); at rest at the beginning."""
+        count = self.actuator.delay_steps(self.control_step)
+        starts = [(self.recordings[index], step) for index, step in start_indices]
+        before = [self._response(recording)[step - 1] if step else 0.0 for recording, step in starts]
+        pending = [
+            np.array([recording.applied_acceleration[step - lag] if step >= lag else 0.0 for recording, step in starts])
+            for lag in range(count, 0, -1)
+        ]
+        return ActuatorState(np.array(before), tuple(pending))
+
+    def _response(self, recording: Recording) -> Floats:
+        if self.actuator.is_instant:
+            return recording.applied_acceleration
+        return np.diff(recording.states.speed) / self.control_step
 
 
 def is_holdout_episode(episode: Array, holdout: float) -> Array:

@@ -15,7 +15,7 @@ from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.requirements import Requirements
 from unjam.drivers.residual import EXPERT_KEY, RESIDUAL_AGE_KEY, RESIDUAL_KEY, ResidualDriver
-from unjam.drivers.safety import FollowingState
+from unjam.drivers.safety import ActuatorState, FollowingState
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import MissingPartError, UnjamError
 from unjam.models import row_model
@@ -91,6 +91,10 @@ class NumPyDriverAdapter(Driver):
         return None if features is None else to_device(np.asarray(features), self.device)
 
 
+AT_REST = ActuatorState(0.0)
+"""state of the actuators of ideal vehicles"""
+
+
 class ModelTransition(NamedTuple):
     """The result of a model step; n rows of torch tensors."""
 
@@ -100,6 +104,7 @@ class ModelTransition(NamedTuple):
     """whether a gap ahead or behind is used up, shape (n,)"""
     clipped: Tensor
     """which of `CLIPPED_QUANTITIES` were clipped, shape (3, n)"""
+    actuators: ActuatorState = AT_REST
 
 
 class ModelDynamics:
@@ -122,13 +127,24 @@ class ModelDynamics:
         self._scenario, self._generator, self._add_noise = scenario, generator, add_noise
         self._reward = tensor_reward(reward or scenario.reward)
 
-    def step(self, state: LocalState, acceleration: Tensor, drawn_values: Tensor) -> ModelTransition:
-        """Return the transitions under `acceleration` [m/s2], (n,), with `drawn_values`, (n, m), of the episodes."""
-        scenario = self._scenario
-        acceleration = scenario.safety.limit(acceleration, FollowingState(*state[:3]), scenario.control_step)
-        base_state = row_model.base_step(self._model.base, scenario, state, acceleration)
+    def step(
+        self, state: LocalState, acceleration: Tensor, drawn_values: Tensor, actuators: ActuatorState = AT_REST
+    ) -> ModelTransition:
+        """Return the transitions under commands `acceleration` [m/s2], (n,), with `drawn_values`, (n, m), of episodes.
+
+        The filter limits the commands, which the vehicles follow as their `actuators` let them.
+        """
+        scenario, actuator, response = self._scenario, self._scenario.actuator, acceleration
+        following, step = FollowingState(*state[:3]), scenario.control_step
+        if actuator.is_instant:
+            acceleration = response = scenario.safety.limit(acceleration, following, step)
+        else:
+            acceleration = scenario.safety.limit(acceleration, following, step, (actuator, actuators))
+            actuators = actuator.apply_command(acceleration, state.speed, actuators, step)
+            response = actuators.acceleration
+        base_state = row_model.base_step(self._model.base, scenario, state, response)
         expected = torch.stack([getattr(base_state, name) for name in row_model.STATE_FIELDS])
-        residual = self._residual(state, acceleration, drawn_values, expected[GAP_SLICE]).T
+        residual = self._residual(state, response, drawn_values, expected[GAP_SLICE]).T
         predicted = expected + residual[: len(row_model.STATE_FIELDS)]
         predicted_speeds, predicted_gaps = predicted[: len(row_model.SPEED_FIELDS)], predicted[GAP_SLICE]
         crashed = (predicted_gaps <= 0.0).any(0)
@@ -156,7 +172,7 @@ class ModelDynamics:
         clipped = torch.stack(
             [(speeds != predicted_speeds).any(0), (gaps != predicted_gaps).any(0), residual_reward != residual[-1]]
         )
-        return ModelTransition(next_state, reward + residual_reward * ~crashed, crashed, clipped)
+        return ModelTransition(next_state, reward + residual_reward * ~crashed, crashed, clipped, actuators)
 
     def _residual(self, state: LocalState, acceleration: Tensor, drawn_values: Tensor, expected_gaps: Tensor) -> Tensor:
         """Return the residual of the base with noise, shape (n, 6); `expected_gaps`, (2, n), are the base's."""
@@ -195,6 +211,8 @@ class RolloutStarts(NamedTuple):
     """Recorded states from which model rollouts start; n rows."""
 
     state: LocalState
+    """tensors of shape (n,)"""
+    actuators: ActuatorState
     """tensors of shape (n,)"""
     memory: Memory
     """memory of the expert, as its `tensor_driver` takes it"""
@@ -249,6 +267,7 @@ def prepare_starts(
     memory = reconstruct_memory(expert, data.recordings, start_indices)
     return RolloutStarts(
         state=data.states_at(start_indices).map(lambda values: to_device(values, device)),
+        actuators=data.actuator_states_at(start_indices).map(lambda values: to_device(values, device)),
         memory=tensor_memory(tensor_driver(expert, device), memory, device),
         drawn_values=to_device(drawn, device),
     )
@@ -271,6 +290,7 @@ class ModelWorld:
         self.states = [starts.state]
         """states at each step; the last one is the present state"""
         self._dynamics, self._starts, self._control_steps, self._generator = dynamics, starts, control_steps, generator
+        self._actuators = starts.actuators
         speed = starts.state.speed
         self._is_running, self._running_log, self._rewards = torch.ones_like(speed), [], []
         self._episode_noise: Tensor | None = None
@@ -294,7 +314,8 @@ class ModelWorld:
         """Make one model step in each row."""
         assert command is not None
         acceleration = self.limits.clip(command.acceleration)
-        transition = self._dynamics.step(self.states[-1], acceleration, self._starts.drawn_values)
+        transition = self._dynamics.step(self.states[-1], acceleration, self._starts.drawn_values, self._actuators)
+        self._actuators = transition.actuators
         self.states.append(transition.state)
         self._running_log.append(self._is_running)
         self._rewards.append(transition.reward * self._is_running)

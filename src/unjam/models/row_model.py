@@ -176,7 +176,7 @@ def fit_row_model(
     """Fit `model` further, in place, see `fit_ensemble`; the result depends on the arguments alone."""
     generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
     to_device: Any = {"device": model.input_mean.device}
-    columns = model_inputs(transitions.states, transitions.acceleration, transitions.drawn_values)
+    columns = model_inputs(transitions.states, transitions.response, transitions.drawn_values)
     targets = torch.as_tensor(residual_targets(transitions, model.base, scenario, reward), **to_device)
     model.reward_range.copy_(torch.stack([targets[:, -1].min(), targets[:, -1].max()]))
     inputs = torch.as_tensor(columns, **to_device)
@@ -201,7 +201,7 @@ def fit_row_model(
 def residual_targets(transitions: Transitions, base: str, scenario: Scenario, reward: str) -> Floats:
     """Return the residuals of `base`, (rows, 6), SI units; of `none`, the change of the state, and the reward."""
     states, next_states, acceleration = transitions.states, transitions.next_states, transitions.acceleration
-    predicted = base_step(base, scenario, states, acceleration)
+    predicted = base_step(base, scenario, states, transitions.response)
     reward_function = make_reward(reward or scenario.reward)
     predicted_reward = base_reward(base, reward_function, next_states, acceleration, transitions.crashed)
     residual = [getattr(next_states, name) - getattr(predicted, name) for name in STATE_FIELDS]

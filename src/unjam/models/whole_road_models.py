@@ -9,6 +9,7 @@ import numpy as np
 
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.residual import EXPERT_KEY
+from unjam.drivers.safety import ActuatorState
 from unjam.errors import InputError
 from unjam.models import road_model
 from unjam.models.comparison import ReplayDriver
@@ -139,6 +140,11 @@ class ClosedRoadModel(WholeRoadModel[road_model.RoadSamples]):
                 for each, row in pairs
             ],
         )
+        if road.steps_per_control_step == 1 and not road.actuator.is_instant:
+            states = [self.data.actuator_states_at(each) for each in self._starts_by_cav(start_indices)]
+            accelerations, pending = zip(*states, strict=True)
+            commands = tuple(map(np.concatenate, zip(*pending, strict=True)))
+            world.set_actuators(ActuatorState(np.concatenate(accelerations), commands))
         return finish_drive(start_batch_drive(world, driver, explore=True, memory=memory))
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:
@@ -160,11 +166,15 @@ class ClosedRoadModel(WholeRoadModel[road_model.RoadSamples]):
 
     def _expert_memory(self, start_indices: StartIndices) -> Memory:
         """Return the expert's memory: all rows of the first CAV, then of the second."""
-        cavs = self.cavs_per_start  # each episode has as many recordings
-        first = start_indices[:, 0] // cavs * cavs
-        starts = [np.column_stack([first + cav, start_indices[:, 1]]) for cav in range(cavs)]
+        starts = self._starts_by_cav(start_indices)
         memories = [reconstruct_memory(self.task.expert, self.data.recordings, each) for each in starts]
         return map_leaves(lambda *values: np.concatenate(values), *memories)
+
+    def _starts_by_cav(self, start_indices: StartIndices) -> list[StartIndices]:
+        """Return the same moments of each CAV of the episodes of recordings."""
+        cavs = self.cavs_per_start  # each episode has as many recordings
+        first = start_indices[:, 0] // cavs * cavs
+        return [np.column_stack([first + cav, start_indices[:, 1]]) for cav in range(cavs)]
 
 
 class MotorwayModel(WholeRoadModel[MotorwaySamples]):

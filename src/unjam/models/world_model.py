@@ -60,7 +60,7 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
         self.settings, self.task, self.exploration_signs, self.seed = settings, task, exploration_signs, seed
         self.scenario = replace(task.scenario, humans=replace(task.scenario.humans, **settings.humans))
         """the road with the IDM parameters of the base, which are calibrated if the settings ask for it"""
-        self.data = EnvironmentData(settings.buffer_size)
+        self.data = EnvironmentData(settings.buffer_size, task.scenario.actuator, task.scenario.control_step)
         self.samples: list[EpisodeSamplesT] = []
         """of the episodes in D_a, oldest first"""
         self.first_new_episode, self.new_steps = 0, 0

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from unjam.drivers.local_state import LocalState
+from unjam.drivers.safety import ActuatorState
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, invalid_value
 from unjam.models.ensemble import torch_generator
@@ -27,6 +28,8 @@ class ModelState(NamedTuple):
 
     observed: LocalState
     """what the CAVs observe, shape (n,)"""
+    actuators: ActuatorState
+    """accelerations and pending commands of the CAVs [m/s2], shape (n,)"""
     drawn_values: Tensor
     """scaled values that their episodes drew, shape (n, m)"""
     is_running: Tensor
@@ -75,7 +78,8 @@ class LearnedModel:
         observed = data.states_at(start_indices).map(lambda values: to_device(values, DEVICE))
         generator_state = torch_generator((seed,), DEVICE).get_state()
         running = torch.ones_like(observed.speed)
-        self.set_state(ModelState(observed, to_device(drawn, DEVICE), running, generator_state))
+        actuators = data.actuator_states_at(start_indices).map(lambda values: to_device(values, DEVICE))
+        self.set_state(ModelState(observed, actuators, to_device(drawn, DEVICE), running, generator_state))
         return observed
 
     def state(self) -> ModelState:
@@ -87,6 +91,7 @@ class LearnedModel:
         rows, size = len(state.observed.speed), len(self.world_model.scenario.drawn_ranges)
         for name, values, shape in (
             *((name, each, (rows,)) for name, each in state.observed._asdict().items() if each is not None),
+            *(("actuators", each, (rows,)) for each in (state.actuators.acceleration, *state.actuators.pending)),
             ("drawn_values", state.drawn_values, (rows, size)),
             ("is_running", state.is_running, (rows,)),
         ):
@@ -102,15 +107,17 @@ class LearnedModel:
 
         After its collision a row still moves, with the reward zero; `crashed` says whether it had one so far.
         """
-        observed, drawn, is_running, _ = self._state
+        observed, actuators, drawn, is_running, _ = self._state
         if tuple(acceleration.shape) != tuple(observed.speed.shape):
             raise invalid_value("acceleration: shape", tuple(acceleration.shape), str(tuple(observed.speed.shape)))
         if not bool((is_finite := acceleration.isfinite()).all()):
             raise invalid_value("acceleration", float(acceleration[~is_finite][0]), "finite numbers")
         limits = self.world_model.scenario.acceleration_limits
-        transition = self._dynamics.step(observed, limits.clip(acceleration.to(observed.speed)), drawn)
+        transition = self._dynamics.step(observed, limits.clip(acceleration.to(observed.speed)), drawn, actuators)
         still_running = is_running * ~transition.crashed
-        self._state = self._state._replace(observed=transition.state, is_running=still_running)
+        self._state = self._state._replace(
+            observed=transition.state, actuators=transition.actuators, is_running=still_running
+        )
         return transition._replace(reward=transition.reward * is_running, crashed=still_running == 0.0)
 
     @torch.no_grad()

@@ -13,7 +13,7 @@ import numpy as np
 
 from unjam.drivers.command import Command, batch_commanded_accelerations
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.safety import CAVActuation, FollowingState
+from unjam.drivers.safety import ActuatorState, CAVActuation, FollowingState
 from unjam.drivers.sensors import SensorReadings
 from unjam.errors import EpisodeError
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, replace_columns
@@ -150,6 +150,10 @@ class RingBatch:
             self._figure_eight.restore_memory(cast(Sequence[CrossingMemory], memories))
         self._set_motion(speeds, positions, as_numpy(self._loop_lengths))
         self._reset_log()
+
+    def set_actuators(self, state: ActuatorState) -> None:
+        """Let the CAVs start with accelerations and pending commands, all rows of the first CAV, then of the second."""
+        self._actuation.set_state("all", state)
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
         """Run the warm-up, unless `warm_up_states` are set; then hand the CAVs over, unless they stay human.
