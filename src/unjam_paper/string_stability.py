@@ -160,20 +160,21 @@ def _compared_cells(episodes: Table, human: Table) -> dict[str, str]:
 
 
 def string_figure(folder: Path) -> Figure:
-    """Draw the return of the tuned experts over their string gain, for each road."""
+    """Draw the mean speed of all vehicles over the string gain of the tuned experts, for each road."""
     figure = new_figure(3.0)
     panels: Sequence[Any] = figure.subplots(1, len(STRING_ROADS), squeeze=False)[0]
     for axes, road in zip(panels, STRING_ROADS, strict=True):
         rows, human = tuned_rows(road, folder)
-        axes.axhline(np.mean([row["return"] for row in human]), color=LINE_COLORS[2], ls="--", label="human drivers")
+        speed = np.mean([row["mean_speed"] for row in human])
+        axes.axhline(speed, color=LINE_COLORS[2], ls="--", label="human drivers")
         for color, expert in zip(LINE_COLORS, dict.fromkeys(row["expert"] for row in rows), strict=False):
             own = sorted((row for row in rows if row["expert"] == expert), key=lambda row: row["gain"])
-            returns = [metric_estimate(row["episodes"], "return") for row in own]
-            bars = [[each.mean - each.low for each in returns], [each.high - each.mean for each in returns]]
-            gains, means = [row["gain"] for row in own], [each.mean for each in returns]
-            axes.errorbar(gains, means, bars, color=color, marker="o", label=expert)
+            speeds = [metric_estimate(row["episodes"], "mean_speed") for row in own]
+            bars = [[each.mean - each.low for each in speeds], [each.high - each.mean for each in speeds]]
+            gains, means = [row["gain"] for row in own], [each.mean for each in speeds]
+            axes.errorbar(gains, means, bars, color=color, ls="", marker="o", label=expert)
         axes.axvline(1.02, color="0.7", lw=0.8)
-        axes.set(title=road, xlabel="largest string gain", ylabel="return")
+        axes.set(title=road, xlabel="largest string gain", ylabel="mean speed [m/s]")
     panels[0].legend()
     return figure
 
