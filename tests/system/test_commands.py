@@ -17,6 +17,7 @@ from tests.faults.processes import SETTINGS, TINY
 from tests.recordings.synthetic_trajectories import write_table
 from tests.system.conftest import UNJAM, Run
 from tests.worlds.sumo.user_networks import game, straight
+from unjam.controller.file import packaged_file
 
 SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=80"]
 TINY_RUN = [
@@ -509,3 +510,15 @@ def test_calibrated_human_drivers_in_drive_train_and_evaluate(unjam: Run, tmp_pa
     evaluated = document(unjam("evaluate", "run", "-n", 1, *humans, "--out", "among", "--json"))
     assert "trained" in {entry["driver"] for entry in evaluated["drivers"]}
     assert (tmp_path / "among" / "report.html").is_file()
+
+
+@pytest.mark.long
+def test_packaged_controllers_are_certified_and_stay_as_they_are(unjam: Run, tmp_path: Path) -> None:
+    file = packaged_file("ring-tuned")
+    before = file.read_bytes()
+    done = unjam("certify", "unjam:ring-tuned")
+    assert "0 contacts" in done.stdout
+    assert done.stdout.count("string stable, largest gain") == 3
+    assert "not string stable" in (tmp_path / "ring-tuned.html").read_text()
+    assert file.read_bytes() == before
+    assert not file.with_suffix(".html").exists()
