@@ -92,7 +92,7 @@ def measure_human_baseline(road: str, workers: int) -> Table:
     return [{"expert": HUMAN_LABEL, "limit": 0.0, "episodes": episodes}]
 
 
-def measure_packaged(road: str, car: str, workers: int) -> Table:
+def measure_car(road: str, car: str, workers: int) -> Table:
     """Return the test episodes of `pi` and of packaged controllers with one of the `CARS`, and their string gains."""
     scenario = closed_road(road, car)
     rows: Table = []
@@ -105,7 +105,7 @@ def measure_packaged(road: str, car: str, workers: int) -> Table:
     return rows
 
 
-def packaged_table(road: str, folder: Path) -> pd.DataFrame:
+def car_table(road: str, folder: Path) -> pd.DataFrame:
     """Return gain, return and mean speed of packaged controllers with ideal and usual cars."""
     _, human = tuned_rows(road, folder)
     return pd.DataFrame(
@@ -175,7 +175,8 @@ def string_figure(folder: Path) -> Figure:
             axes.errorbar(gains, means, bars, color=color, ls="", marker="o", label=expert)
         axes.axvline(1.02, color="0.7", lw=0.8)
         axes.set(title=road, xlabel="largest string gain", ylabel="mean speed [m/s]")
-    panels[0].legend()
+    for axes in (panels[0], panels[-1]):
+        axes.legend()
     return figure
 
 
@@ -188,13 +189,13 @@ STRING_STABILITY = Study(
             for road, limits in GAIN_LIMITS.items()
             for limit in limits
         },
-        **{f"packaged-{road}/{car}": (measure_packaged, (road, car)) for road, car in product(PACKAGED, CARS)},
+        **{f"packaged-{road}/{car}": (measure_car, (road, car)) for road, car in product(PACKAGED, CARS)},
         **{f"{road}/{expert} 0": (measure_tuned, (road, expert, 0.0)) for road, expert in OTHER_EXPERT.items()},
     },
     minutes=70.0,
     tables={
         **{road: partial(string_table, road) for road in STRING_ROADS},
-        **{f"packaged-{road}": partial(packaged_table, road) for road in PACKAGED},
+        **{f"packaged-{road}": partial(car_table, road) for road in PACKAGED},
     },
     figures={"trade-off": string_figure},
 )

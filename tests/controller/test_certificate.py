@@ -251,11 +251,20 @@ def test_the_line_of_a_certificate_names_what_it_assumes() -> None:
     assert " states at 0 to 5 m/s with gaps of 8 to 23 m: 0 contacts" in text
 
 
+def test_gaps_on_a_closed_road_may_be_nearly_as_long_as_the_road() -> None:
+    wide = visited_states()._replace(leader_gap=np.full(60, 250.0), loop_length=np.full(60, 420.0))
+    assert certify_driver(filter_driver(PISaturation()), wide, PAPER_IDM).domain.leader_gap == (250.0, 250.0)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"leader_gap": np.full(60, 1e9)}, "gap of the sample is not allowed; allowed: 0 to 100 in each state"),
+        ({"leader_gap": np.full(60, 1e9)}, "gap of the sample is not allowed; allowed: 0 to 245 in each state"),
         ({"leader_gap": np.full(60, -3.0)}, "gap of the sample is not allowed"),
+        (
+            {"leader_gap": np.full(60, 1e9), "loop_length": np.full(60, 1e12)},
+            r"gap of the sample is not allowed; allowed: 0 to 1e\+07",
+        ),
         ({"speed": np.full(60, np.nan)}, "speed of the sample is not allowed; allowed: 0 to 100"),
     ],
 )

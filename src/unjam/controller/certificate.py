@@ -26,6 +26,7 @@ ATTACK_SECONDS, ATTACK_STEP_SECONDS = 40.0, 1.0  # of an adversarial maneuver, a
 ATTACK_POPULATION, ATTACK_GENERATIONS, ATTACK_ELITES = 128, 16, 12  # of the cross-entropy method
 MAX_LEADER_ACCELERATION = 3.0  # of an adversarial leader [m/s2]
 MAX_SPEED = 100.0  # of a state [m/s]
+MAX_LOOP_LENGTH = 1e7  # of a state on a closed road, where a gap can be nearly as long [m]
 MIN_MOVING_SPEED = 1.0  # speed above which time gaps are evaluated [m/s]
 
 
@@ -133,7 +134,7 @@ def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: I
     if len(states.speed) < fewest:
         count = format_count(len(states.speed), "state")
         raise InputError(f"certify: a sample of {count} is not allowed; allowed: {fewest} or more")
-    limits = {"speed": MAX_SPEED, "leader speed": MAX_SPEED, "gap": MAX_OBSERVED_GAP}
+    limits = {"speed": MAX_SPEED, "leader speed": MAX_SPEED, "gap": np.fmax(min(loop, MAX_LOOP_LENGTH), MAX_OBSERVED_GAP)}
     for (name, largest), values in zip(limits.items(), states, strict=True):
         if not ((values >= 0.0) & (values <= largest)).all():  # refuses NaN, too
             raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")
