@@ -532,9 +532,27 @@ def test_each_pair_has_its_own_time_step_and_a_missing_row_ends_a_trajectory(tmp
     assert found[0].time_step == pytest.approx(1 / 30, rel=1e-4)
 
 
+@pytest.mark.parametrize("jump", [-30.0, 6.0])
+def test_a_jump_of_the_gap_ends_a_trajectory_and_is_counted(jump: float, tmp_path: Path) -> None:
+    times = np.arange(0, 60, 0.1)
+    rows = waves(times, times, "a")
+    rows.loc[rows.index[300:], "gap"] += jump
+    rows["gap"] += 40.0
+    rows.to_csv(tmp_path / "t.csv", index=False)
+    found = read_trajectories(tmp_path / "t.csv")
+    assert [(each.name, len(each.speed)) for each in found.trajectories] == [("a", 300), ("a/2", 300)]
+    assert any("split at 1 jump of the gap by more than 5 m" in line for line in found.summary_lines())
+
+
 def test_table_with_only_short_trajectories_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no trajectory lasts 20 s; the longest lasts 2\.9 s"):
+    with pytest.raises(InputError, match=r"no trajectory lasts 20 s; the longest lasts 2\.9 s; rows are"):
         read_trajectories(write_table_file(tmp_path / "t.csv"))
+    times = np.arange(0, 60, 0.1)
+    rows = waves(times, times, "a")
+    rows.loc[rows.index[::2], "gap"] += 20.0
+    rows.to_csv(tmp_path / "two.csv", index=False)
+    with pytest.raises(InputError, match="rows are missing at 0 places, the gap jumps at 599 places"):
+        read_trajectories(tmp_path / "two.csv")
 
 
 def test_driver_columns_name_the_driver(tmp_path: Path) -> None:

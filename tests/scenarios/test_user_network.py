@@ -83,6 +83,14 @@ def test_the_command_for_plain_sumo_has_changed_times_and_no_calibrated_drivers(
     assert replace(road, population="unjam:ngsim").plain_sumo_command(7) == ""
 
 
+def test_the_command_for_plain_sumo_has_the_values_of_replaced_options(tmp_path: Path) -> None:
+    options = '<random value="true"/><max-depart-delay value="10"/>'
+    path = straight(tmp_path, '<vehicle id="a" type="car" route="along" depart="0"/>', options=options)
+    command = make_scenario(str(path), {"penetration_rate": 0.1}).plain_sumo_command(7)
+    assert " --random false" in command
+    assert " --max-depart-delay -1" in command
+
+
 @pytest.mark.long
 def test_vehicles_that_depart_before_the_begin_are_left_out(tmp_path: Path, sumo: SumoBackend) -> None:
     departing = (f'<vehicle id="{at}" type="car" route="along" depart="{at}"/>' for at in (0, 5, 40, 60))

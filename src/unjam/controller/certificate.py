@@ -134,7 +134,8 @@ def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: I
     if len(states.speed) < fewest:
         count = format_count(len(states.speed), "state")
         raise InputError(f"certify: a sample of {count} is not allowed; allowed: {fewest} or more")
-    limits = {"speed": MAX_SPEED, "leader speed": MAX_SPEED, "gap": np.fmax(min(loop, MAX_LOOP_LENGTH), MAX_OBSERVED_GAP)}
+    max_gap = float(np.fmax(min(loop, MAX_LOOP_LENGTH), MAX_OBSERVED_GAP))
+    limits = {"speed": MAX_SPEED, "leader speed": MAX_SPEED, "gap": max_gap}
     for (name, largest), values in zip(limits.items(), states, strict=True):
         if not ((values >= 0.0) & (values <= largest)).all():  # refuses NaN, too
             raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")

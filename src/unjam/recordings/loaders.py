@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from unjam.errors import InputError, unknown_name
 from unjam.physics.arrays import Floats
@@ -26,6 +27,8 @@ VALUE_LIMITS = {"speed": (0.0, 70.0), "leader_speed": (0.0, 70.0), "gap": (0.0, 
 """smallest and largest allowed value of a column [m/s, m/s, m]; other values are errors, or have another unit"""
 TIME_STEP_TOLERANCE, MISSING_ROW_INTERVAL = 0.01, 1.5
 """largest relative difference between equal intervals, and smallest ratio to the usual one where a row is missing"""
+MAX_PAIR_JUMP = 5.0
+"""largest change of a gap between two rows beyond that by the speeds; a larger one is to another vehicle [m]"""
 MAX_TIME_STEP, MIN_TRAJECTORY_SAMPLES = 1.5, 3
 """longest time between two samples, to see waves of a few seconds [s], and fewest samples of a trajectory"""
 UNIT_RATIO_LIMITS = (2 / 3, 1.5)
@@ -82,6 +85,8 @@ class ReadResult:
     """reason why a row was dropped, by its line in the file; the header is line 1"""
     skipped_rows: dict[str, int]
     """number of valid rows that are not used, by reason"""
+    jump_count: int = 0
+    """number of rows at which another trajectory begins, because the gap jumps"""
 
     def summary_lines(self) -> list[str]:
         """Return the lines of a summary: rows that are used, skipped and dropped."""
@@ -92,6 +97,9 @@ class ReadResult:
         lines += [
             f"skipped: {format_count(count, 'row')}: {reason}" for reason, count in self.skipped_rows.items() if count
         ]
+        if self.jump_count:
+            jumps = f"split at {format_count(self.jump_count, 'jump')} of the gap by more than {MAX_PAIR_JUMP:g} m"
+            lines.append(f"{jumps} beyond the speeds: does a pair have several vehicles?")
         dropped = [f"dropped: line {line}: {reason}" for line, reason in self.bad_rows.items()]
         more = len(dropped) - MAX_LISTED_ROWS
         return [
@@ -292,9 +300,9 @@ def split_trajectories(
 ) -> ReadResult:
     """Return the trajectories of a table with the columns `line`, `TABLE_COLUMNS` and any of `OPTIONAL_COLUMNS`.
 
-    A trajectory consists of rows of one pair, between which none is missing. Its time step is that of its pair. Rows
-    may be in any order. `skipped_rows` has the numbers of rows that were skipped before, by reason. Raise `InputError`
-    if a row is bad, or no trajectory remains.
+    A trajectory consists of rows of one pair, between which none is missing and the gap does not jump. Its time step is
+    that of its pair. Rows may be in any order. `skipped_rows` has the numbers of rows that were skipped before, by
+    reason. Raise `InputError` if a row is bad, or no trajectory remains.
     """
     (is_bad, bad_rows), skipped_rows = _find_bad_rows(frame), skipped_rows or {}
     bad_count = int(np.sum(is_bad))
@@ -309,11 +317,14 @@ def split_trajectories(
         raise InputError(f"{path.name}: time: there are no two rows of one vehicle")
     intervals = [np.diff(rows["time"].to_numpy(np.float64)) for rows in groups]
     has_missing = [each > MISSING_ROW_INTERVAL * np.median(each) for each in intervals]
+    has_jump = [
+        _find_jumps(rows, each) & ~missing for rows, each, missing in zip(groups, intervals, has_missing, strict=True)
+    ]
     regular = [each[~missing] for each, missing in zip(intervals, has_missing, strict=True)]
     steps = _common_time_steps([float(each.mean()) for each in regular], [float(each.sum()) for each in regular])
     trajectories, part_counts, short_count, longest = list[FollowingTrajectory](), Counter[str](), len(good), 0.0
-    for rows, missing, step in zip(groups, has_missing, steps, strict=True):
-        for first, last in pairwise([0, *(np.flatnonzero(missing) + 1).tolist(), len(rows)]):
+    for rows, missing, jumps, step in zip(groups, has_missing, has_jump, steps, strict=True):
+        for first, last in pairwise([0, *(np.flatnonzero(missing | jumps) + 1).tolist(), len(rows)]):
             seconds = (last - first - 1) * step
             longest = max(longest, seconds)
             if seconds < options.min_seconds - step / 2 or last - first < MIN_TRAJECTORY_SAMPLES:
@@ -332,10 +343,21 @@ def split_trajectories(
             trajectories.append(FollowingTrajectory(name, driver or pair, step, speed, leader_speed, gap, kind, split))
     limit = f"{options.min_seconds:g} s"
     if not trajectories:
-        raise InputError(f"{path.name}: no trajectory lasts {limit}; the longest lasts {longest:.3g} s")
+        breaks = {"rows are missing": has_missing, "the gap jumps": has_jump}
+        counts = ", ".join(f"{what} at {sum(map(np.sum, where)):,} places" for what, where in breaks.items())
+        raise InputError(f"{path.name}: no trajectory lasts {limit}; the longest lasts {longest:.3g} s; {counts}")
     _check_units(trajectories, path)
     reasons = {**skipped_rows, f"trajectories shorter than {limit}": short_count}
-    return ReadResult(trajectories, len(frame) + sum(skipped_rows.values()), bad_rows, reasons)
+    jump_count = int(sum(each.sum() for each in has_jump))
+    return ReadResult(trajectories, len(frame) + sum(skipped_rows.values()), bad_rows, reasons, jump_count)
+
+
+def _find_jumps(rows: pd.DataFrame, intervals: Floats) -> NDArray[np.bool_]:
+    """Return after which rows the gap changes by more than the speeds allow; `intervals` to the next rows [s]."""
+    speed, leader_speed, gap = (rows[name].to_numpy(np.float64) for name in ("speed", "leader_speed", "gap"))
+    closing = speed - leader_speed
+    expected = -0.5 * (closing[1:] + closing[:-1]) * intervals
+    return np.abs(np.diff(gap) - expected) > MAX_PAIR_JUMP
 
 
 def _check_units(trajectories: Sequence[FollowingTrajectory], path: Path) -> None:

@@ -37,6 +37,8 @@ ROAD_CLASSES = (
     *("bus", "coach", "motorcycle", "moped", "custom1", "custom2"),
 )
 """SUMO's vehicle classes that can become CAVs"""
+PLAIN_SUMO_VALUES = {"random": "false", "max-depart-delay": "-1"}
+"""values of replaced options with which plain SUMO has the same traffic"""
 DEFAULT_PENETRATION_RATE = 0.1
 """used if neither a rate nor vehicle types are set"""
 DRIVERS_PER_EPISODE = 100
@@ -241,6 +243,8 @@ class UserNetwork(Scenario):
             return ""
         words += ["--begin", f"{begin:g}"] if self.begin is not None else []
         words += [] if self._has_same_end(files) else ["--end", f"{end:.10g}"]
+        for option in filter(PLAIN_SUMO_VALUES.__contains__, files.replaced_options):
+            words += [f"--{option}", PLAIN_SUMO_VALUES[option]]
         return shlex.join([*words, "--tripinfo-output", "trips.xml", *UNFINISHED_TRIPS_OPTIONS])
 
     def possible_cav_ids(self) -> tuple[str, ...]:
