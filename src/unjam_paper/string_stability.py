@@ -43,6 +43,9 @@ PACKAGED = {
     "figure-eight": ("unjam:figure-eight-tuned", "unjam:figure-eight-best"),
 }
 """packaged controllers that were tuned and trained for ideal vehicles, by road"""
+OWN_COLUMNS = "largest gain allowed", "its gain", "set time gap [s]"
+SHOWN_METRICS = ("return", "return", 0), ("mean_speed", "mean speed [m/s]", 2)
+"""metrics with their headings and digits"""
 CARS = {"ideal": INSTANT_ACTUATOR, "usual": STANDARD_ACTUATOR}
 """actuators of CAVs"""
 STRING_SEEDS = 20
@@ -106,19 +109,24 @@ def measure_car(road: str, car: str, workers: int) -> Table:
 
 
 def car_table(road: str, folder: Path) -> pd.DataFrame:
-    """Return gain, return and mean speed of packaged controllers with ideal and usual cars."""
+    """Return gain, return and mean speed of packaged controllers with both cars, and what usual cars lose."""
     _, human = tuned_rows(road, folder)
-    return pd.DataFrame(
-        [
-            {
-                "driver": row["driver"],
-                "car": row["car"],
-                "its gain": NO_VALUE_TEXT if row["gain"] is None else f"{row['gain']:.2f}",
-                **_compared_cells(row["episodes"], human),
-            }
-            for row in read_part(folder, f"packaged-{road}")
-        ]
-    )
+    measured = read_part(folder, f"packaged-{road}")
+    ideal = {row["driver"]: row["episodes"] for row in measured if row["car"] == "ideal"}
+    rows = [{"driver": HUMAN_LABEL, "car": NO_VALUE_TEXT, "its gain": NO_VALUE_TEXT, **_mean_cells(human, human)}]
+    for row in measured:
+        own = row["episodes"]
+        cells = {
+            "driver": row["driver"],
+            "car": row["car"],
+            "its gain": _gain_text(row["gain"]),
+            **_mean_cells(own, human),
+        }
+        for metric, heading, digits in SHOWN_METRICS:
+            difference = estimate_cell(paired_difference(own, ideal[row["driver"]], metric), digits, sign="+")
+            cells[f"{heading}, difference to ideal car"] = NO_VALUE_TEXT if row["car"] == "ideal" else str(difference)
+        rows.append(cells)
+    return pd.DataFrame(rows).fillna(NO_VALUE_TEXT)
 
 
 def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
@@ -129,34 +137,32 @@ def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
 
 
 def string_table(road: str, folder: Path) -> pd.DataFrame:
-    """Return gain, return, mean speed and their differences to the human baseline, by expert and limit."""
+    """Return gain, set time gap, return and mean speed with differences to the human baseline, by expert and limit."""
     rows, human = tuned_rows(road, folder)
-    return pd.DataFrame(
-        [
-            {
-                "expert": row["expert"],
-                "largest gain allowed": f"{row['limit']:g}" if row["limit"] else "any",
-                "its gain": f"{row['gain']:.2f}",
-                **_compared_cells(row["episodes"], human),
-            }
-            for row in rows
-        ]
-    )
+    table = [{"expert": HUMAN_LABEL, **dict.fromkeys(OWN_COLUMNS, NO_VALUE_TEXT), **_mean_cells(human, human)}]
+    for row in rows:
+        time_gap = getattr(driver_from_name(row["driver"], 0.1), "time_gap", None)
+        limit = f"{row['limit']:g}" if row["limit"] else "any"
+        own = limit, _gain_text(row["gain"]), NO_VALUE_TEXT if time_gap is None else f"{time_gap:.1f}"
+        cells = dict(zip(OWN_COLUMNS, own, strict=True))
+        table.append({"expert": row["expert"], **cells, **_mean_cells(row["episodes"], human)})
+    return pd.DataFrame(table)
 
 
-def _compared_cells(episodes: Table, human: Table) -> dict[str, str]:
+def _gain_text(gain: float | None) -> str:
+    return NO_VALUE_TEXT if gain is None else f"{gain:.3f}"
+
+
+def _mean_cells(episodes: Table, human: Table) -> dict[str, str]:
     """Return mean return and speed with their differences to the human baseline, time gap and feasibility."""
     cells: dict[str, str] = {}
-    for heading, quantity, metric, digits in (
-        ("return", "return", "return", 0),
-        ("mean speed [m/s]", "speed", "mean_speed", 2),
-    ):
+    for metric, heading, digits in SHOWN_METRICS:
         cells[heading] = f"{metric_estimate(episodes, metric).mean:.{digits}f}"
         difference = estimate_cell(paired_difference(episodes, human, metric), digits, sign="+")
-        cells[f"{quantity}, difference to human{' [m/s]' if digits else ''}"] = str(difference)
+        cells[f"{heading}, difference to human"] = NO_VALUE_TEXT if episodes is human else str(difference)
     feasible = sum(row["feasibility"] == FEASIBLE for row in episodes)
     cells["min time gap [s]"] = f"{min(row['min_time_gap'] for row in episodes):.2f}"
-    return cells | {"feasible episodes": f"{feasible} of {len(episodes)}"}
+    return cells | {"feasible episodes": NO_VALUE_TEXT if episodes is human else f"{feasible} of {len(episodes)}"}
 
 
 def string_figure(folder: Path) -> Figure:

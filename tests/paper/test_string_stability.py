@@ -35,6 +35,6 @@ def test_experts_are_tuned_within_their_limits_and_compared_with_human_drivers(
         assert rows[0]["gain"] <= 1.1
         write_part(tmp_path, name, [*measure_human_baseline(name, 1), *rows])
         table = string_table(name, tmp_path)
-        assert list(table["largest gain allowed"]) == ["1.1", "any"]
-        assert table["return, difference to human"].str.contains(" to ").all()
+        assert list(table["largest gain allowed"])[1:] == ["1.1", "any"]
+        assert table["return, difference to human"].iloc[1:].str.contains(" to ").all()
     assert len(string_figure(tmp_path).axes) == len(roads)
