@@ -182,8 +182,9 @@ def test_vehicles_that_sumo_teleports_to_the_end_of_their_route_have_arrived(
     path = with_options(grid(tmp_path), **{"step-length": "2", "time-to-teleport": "10"})
     scenario = make_scenario(str(path), {"penetration_rate": 1e-9})
     episode = run_episode(scenario, Human(), 3, backend=SumoBackend(simulation))
-    trips, command = tmp_path / "trips.xml", scenario.plain_sumo_command(sumo_seed((3,)))
-    subprocess.run(command.replace("trips.xml", str(trips)).split(), check=True, capture_output=True)
+    trips, (_, *words) = tmp_path / "trips.xml", scenario.plain_sumo_command(sumo_seed((3,))).split()
+    command = [sumo_program("sumo"), *(str(trips) if word == trips.name else word for word in words)]
+    subprocess.run(command, check=True, capture_output=True)
     plain = [each.attrib for each in ElementTree.parse(trips).iter("tripinfo")]
     assert any(each["vaporized"] == "teleport" for each in plain)
     durations = dict(zip(episode.trips.vehicle_ids, episode.trips.duration.tolist(), strict=True))
