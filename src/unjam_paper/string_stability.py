@@ -113,20 +113,20 @@ def car_table(road: str, folder: Path) -> pd.DataFrame:
     _, human = tuned_rows(road, folder)
     measured = read_part(folder, f"packaged-{road}")
     ideal = {row["driver"]: row["episodes"] for row in measured if row["car"] == "ideal"}
-    rows = [{"driver": HUMAN_LABEL, "car": NO_VALUE_TEXT, "its gain": NO_VALUE_TEXT, **_mean_cells(human, human)}]
-    for row in measured:
-        own = row["episodes"]
-        cells = {
-            "driver": row["driver"],
-            "car": row["car"],
-            "its gain": _gain_text(row["gain"]),
-            **_mean_cells(own, human),
-        }
+    rows: Table = []
+    for row in [{"driver": HUMAN_LABEL, "car": NO_VALUE_TEXT, "gain": None, "episodes": human}, *measured]:
+        cells = {"driver": row["driver"], "car": row["car"], "its gain": _gain_text(row["gain"])}
         for metric, heading, digits in SHOWN_METRICS:
-            difference = estimate_cell(paired_difference(own, ideal[row["driver"]], metric), digits, sign="+")
-            cells[f"{heading}, difference to ideal car"] = NO_VALUE_TEXT if row["car"] == "ideal" else str(difference)
-        rows.append(cells)
-    return pd.DataFrame(rows).fillna(NO_VALUE_TEXT)
+            cells[heading] = f"{metric_estimate(row['episodes'], metric).mean:.{digits}f}"
+            found = NO_VALUE_TEXT
+            if row["car"] == "usual":
+                difference = paired_difference(row["episodes"], ideal[row["driver"]], metric)
+                found = str(estimate_cell(difference, digits, sign="+"))
+            cells[f"{heading}, difference to ideal car"] = found
+        others = _mean_cells(row["episodes"], human)
+        names = f"{SHOWN_METRICS[1][1]}, difference to human", "min time gap [s]", "feasible episodes"
+        rows.append(cells | {name: others[name] for name in names})
+    return pd.DataFrame(rows)
 
 
 def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
