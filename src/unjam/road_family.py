@@ -21,11 +21,9 @@ NGSIM_IDM = {
     **{"max_acceleration": 1.243, "comfortable_deceleration": 1.424},
 }
 """the common IDM of the 325 drivers of the NGSIM pairs, results/field.json"""
-NO_LATENCY, LATENCY, LONG_LATENCY = (
-    {"lag": lag, "delay": delay} for lag, delay in ((0.0, 0.0), (0.3, 0.2), (0.5, 0.5))
-)
+NO_LATENCY, LATENCY, LONG_LATENCY = {"lag": 0.0, "delay": 0.0}, {"lag": 0.3, "delay": 0.2}, {"lag": 0.5, "delay": 0.5}
 """of actuators [s]: ideal vehicles, usual cars, slow ones"""
-IDEAL: dict[str, Any] = {"actuator": NO_LATENCY}
+IDEAL_VEHICLES: dict[str, Any] = {"actuator": NO_LATENCY}
 """vehicles that obey at once: roads of the family keep them, except those with `delayed` or `delay` in their name"""
 SENSOR_ERRORS = {"gap_error": 0.5, "speed_error": 0.3}
 NOISY_SENSORS: dict[str, Any] = {"sensors": {**SENSOR_ERRORS, "dropout": 0.1}, "safety": SENSOR_ERRORS}
@@ -50,7 +48,7 @@ def ring_options(
 ) -> dict[str, Any]:
     """Return the options of a ring of ideal vehicles; `spacing`: road length per vehicle [m], the paper's."""
     length = [round(vehicles * each) for each in spacing]
-    return {"vehicles": vehicles, "cavs": cavs, "warmup": warmup, "length": length, **IDEAL, **extra}
+    return {"vehicles": vehicles, "cavs": cavs, "warmup": warmup, "length": length, **IDEAL_VEHICLES, **extra}
 
 
 FAMILY: dict[str, FamilyRoad] = {
@@ -64,8 +62,8 @@ FAMILY: dict[str, FamilyRoad] = {
     "ring-22-wide": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, (13.0, 16.0))),
     "ring-22-aggressive": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, humans=AGGRESSIVE_IDM)),
     "ring-22-delayed": FamilyRoad("ring", ring_options(22, 1, SHORT_WARM_UP, actuator=LATENCY)),
-    "figure-eight-14": FamilyRoad("figure-eight", IDEAL),
-    "figure-eight-12": FamilyRoad("figure-eight", {"vehicles": 12, **IDEAL}),
+    "figure-eight-14": FamilyRoad("figure-eight", IDEAL_VEHICLES),
+    "figure-eight-12": FamilyRoad("figure-eight", {"vehicles": 12, **IDEAL_VEHICLES}),
     "on-ramp-5": FamilyRoad("on-ramp", {"penetration_rate": 0.05}),
     "on-ramp-20": FamilyRoad("on-ramp", {"penetration_rate": 0.2}),
     "on-ramp-10-less-demand": FamilyRoad("on-ramp", {"penetration_rate": 0.1, "inflow": 2900.0}),
@@ -79,7 +77,7 @@ FAMILY: dict[str, FamilyRoad] = {
     "ring-88-grown": FamilyRoad("ring", ring_options(88, 1, LONG_WARM_UP), "axis"),
     "ring-44-grown-5-cavs": FamilyRoad("ring", ring_options(44, 5, LONG_WARM_UP), "axis"),
     "ring-22-ngsim-idm": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, humans=NGSIM_IDM), "axis"),
-    "figure-eight-wide": FamilyRoad("figure-eight", {"radius": (36, 38), **IDEAL}, "axis"),
+    "figure-eight-wide": FamilyRoad("figure-eight", {"radius": (36, 38), **IDEAL_VEHICLES}, "axis"),
     "on-ramp-10-more-demand": FamilyRoad(
         "on-ramp", {"penetration_rate": 0.1, "inflow": 3400.0, "ramps.0.inflow": 600.0}, "axis"
     ),
@@ -88,8 +86,8 @@ FAMILY: dict[str, FamilyRoad] = {
     "ring-22-noisy-sensors": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **NOISY_SENSORS), "axis"),
     "ring-22-ngsim": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **NGSIM_DRIVERS), "axis"),
     "ring-22-astazero": FamilyRoad("ring", ring_options(22, 1, LONG_WARM_UP, **ASTAZERO_DRIVERS), "axis"),
-    "figure-eight-ngsim": FamilyRoad("figure-eight", {**NGSIM_DRIVERS, **IDEAL}, "axis"),
-    "figure-eight-astazero": FamilyRoad("figure-eight", {**ASTAZERO_DRIVERS, **IDEAL}, "axis"),
+    "figure-eight-ngsim": FamilyRoad("figure-eight", {**NGSIM_DRIVERS, **IDEAL_VEHICLES}, "axis"),
+    "figure-eight-astazero": FamilyRoad("figure-eight", {**ASTAZERO_DRIVERS, **IDEAL_VEHICLES}, "axis"),
     "on-ramp-10-ngsim": FamilyRoad(
         "on-ramp", {"penetration_rate": 0.1, "inflow": 2600.0, "ramps.0.inflow": 400.0, **NGSIM_DRIVERS}, "axis"
     ),

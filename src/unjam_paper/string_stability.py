@@ -1,10 +1,10 @@
 """What string stability costs on closed roads: experts of usual cars, tuned with several limits on their string gain.
 
-Without a limit, they amplify oscillations that are slower than a lap and cannot arise there, but on a motorway.
+The study also compares packaged controllers in ideal and usual cars.
 """
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -26,14 +26,14 @@ from unjam.reports.figures import LINE_COLORS, new_figure
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.training.search_space import SearchSpace, default_search_space
-from unjam.training.string_limit import find_operating_points
+from unjam.training.string_limit import MAX_STRING_GAIN, find_operating_points
 from unjam.training.tune import tune
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import read_part
 from unjam_paper.study import NO_VALUE_TEXT, Study, Table, evaluate_drivers
 
 OTHER_EXPERT = {"ring": "pi-from-gap", "ring-jammed": "pi-from-gap", "figure-eight": "pacer"}
-"""expert that always amplifies some frequency, by road"""
+"""expert that is tuned without a limit, by road"""
 STRING_ROADS = tuple(OTHER_EXPERT)
 GAIN_LIMITS = {"ring": (1.02, 0.0, 1.1, 1.3), "ring-jammed": (1.02, 0.0, 1.1, 1.3), "figure-eight": (1.02, 0.0)}
 """largest allowed string gains, by road; 0: any"""
@@ -43,7 +43,8 @@ PACKAGED = {
     "figure-eight": ("unjam:figure-eight-tuned", "unjam:figure-eight-best"),
 }
 """packaged controllers that were tuned and trained for ideal vehicles, by road"""
-OWN_COLUMNS = "largest gain allowed", "its gain", "set time gap [s]"
+EXPERT_COLUMNS = "largest gain allowed", "string gain", "set time gap [s]"
+"""headings of what a tuned expert has, and human drivers do not"""
 SHOWN_METRICS = ("return", "return", 0), ("mean_speed", "mean speed [m/s]", 2)
 """metrics with their headings and digits"""
 CARS = {"ideal": INSTANT_ACTUATOR, "usual": STANDARD_ACTUATOR}
@@ -115,18 +116,10 @@ def car_table(road: str, folder: Path) -> pd.DataFrame:
     ideal = {row["driver"]: row["episodes"] for row in measured if row["car"] == "ideal"}
     rows: Table = []
     for row in [{"driver": HUMAN_LABEL, "car": NO_VALUE_TEXT, "gain": None, "episodes": human}, *measured]:
-        cells = {"driver": row["driver"], "car": row["car"], "its gain": _gain_text(row["gain"])}
-        for metric, heading, digits in SHOWN_METRICS:
-            cells[heading] = f"{metric_estimate(row['episodes'], metric).mean:.{digits}f}"
-            found = NO_VALUE_TEXT
-            if row["car"] == "usual":
-                difference = paired_difference(row["episodes"], ideal[row["driver"]], metric)
-                found = str(estimate_cell(difference, digits, sign="+"))
-            cells[f"{heading}, difference to ideal car"] = found
-        others = _mean_cells(row["episodes"], human)
-        names = f"{SHOWN_METRICS[1][1]}, difference to human", "min time gap [s]", "feasible episodes"
-        rows.append(cells | {name: others[name] for name in names})
-    return pd.DataFrame(rows)
+        cells = {"driver": row["driver"], "car": row["car"], "string gain": _gain_text(row["gain"])}
+        baselines = {"ideal car": ideal[row["driver"]] if row["car"] == "usual" else None, "human": human}
+        rows.append(cells | _mean_cells(row["episodes"], baselines))
+    return pd.DataFrame(rows).drop(columns="return, difference to human")
 
 
 def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
@@ -139,13 +132,15 @@ def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
 def string_table(road: str, folder: Path) -> pd.DataFrame:
     """Return gain, set time gap, return and mean speed with differences to the human baseline, by expert and limit."""
     rows, human = tuned_rows(road, folder)
-    table = [{"expert": HUMAN_LABEL, **dict.fromkeys(OWN_COLUMNS, NO_VALUE_TEXT), **_mean_cells(human, human)}]
+    table = [
+        {"expert": HUMAN_LABEL, **dict.fromkeys(EXPERT_COLUMNS, NO_VALUE_TEXT), **_mean_cells(human, {"human": human})}
+    ]
     for row in rows:
         time_gap = getattr(driver_from_name(row["driver"], 0.1), "time_gap", None)
         limit = f"{row['limit']:g}" if row["limit"] else "any"
         own = limit, _gain_text(row["gain"]), NO_VALUE_TEXT if time_gap is None else f"{time_gap:.1f}"
-        cells = dict(zip(OWN_COLUMNS, own, strict=True))
-        table.append({"expert": row["expert"], **cells, **_mean_cells(row["episodes"], human)})
+        cells = dict(zip(EXPERT_COLUMNS, own, strict=True))
+        table.append({"expert": row["expert"], **cells, **_mean_cells(row["episodes"], {"human": human})})
     return pd.DataFrame(table)
 
 
@@ -153,16 +148,20 @@ def _gain_text(gain: float | None) -> str:
     return NO_VALUE_TEXT if gain is None else f"{gain:.3f}"
 
 
-def _mean_cells(episodes: Table, human: Table) -> dict[str, str]:
-    """Return mean return and speed with their differences to the human baseline, time gap and feasibility."""
+def _mean_cells(episodes: Table, baselines: Mapping[str, Table | None]) -> dict[str, str]:
+    """Return mean return and speed with their differences to other episodes, if any, time gap and feasibility."""
     cells: dict[str, str] = {}
     for metric, heading, digits in SHOWN_METRICS:
         cells[heading] = f"{metric_estimate(episodes, metric).mean:.{digits}f}"
-        difference = estimate_cell(paired_difference(episodes, human, metric), digits, sign="+")
-        cells[f"{heading}, difference to human"] = NO_VALUE_TEXT if episodes is human else str(difference)
+        for name, others in baselines.items():
+            text = NO_VALUE_TEXT
+            if others is not None and others is not episodes:
+                text = str(estimate_cell(paired_difference(episodes, others, metric), digits, sign="+"))
+            cells[f"{heading}, difference to {name}"] = text
     feasible = sum(row["feasibility"] == FEASIBLE for row in episodes)
     cells["min time gap [s]"] = f"{min(row['min_time_gap'] for row in episodes):.2f}"
-    return cells | {"feasible episodes": NO_VALUE_TEXT if episodes is human else f"{feasible} of {len(episodes)}"}
+    is_human = baselines["human"] is episodes
+    return cells | {"feasible episodes": NO_VALUE_TEXT if is_human else f"{feasible} of {len(episodes)}"}
 
 
 def string_figure(folder: Path) -> Figure:
@@ -179,7 +178,7 @@ def string_figure(folder: Path) -> Figure:
             bars = [[each.mean - each.low for each in speeds], [each.high - each.mean for each in speeds]]
             gains, means = [row["gain"] for row in own], [each.mean for each in speeds]
             axes.errorbar(gains, means, bars, color=color, ls="", marker="o", label=expert)
-        axes.axvline(1.02, color="0.7", lw=0.8)
+        axes.axvline(MAX_STRING_GAIN, color="0.7", lw=0.8)
         axes.set(title=road, xlabel="largest string gain", ylabel="mean speed [m/s]")
     for axes in (panels[0], panels[-1]):
         axes.legend()

@@ -13,7 +13,7 @@ import numpy as np
 
 from tests.worlds.sumo.user_networks import straight
 from unjam.drivers.registry import DRIVERS, driver_from_name
-from unjam.road_family import IDEAL
+from unjam.road_family import IDEAL_VEHICLES
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.episode import run_episode
@@ -23,9 +23,9 @@ from unjam.worlds.sumo.networks import sumo_version
 from unjam.worlds.sumo.simulation import Simulation
 
 ROADS = {
-    "ring": ("ring", {"horizon": 200, **IDEAL}),
-    "ring-warm": ("ring-warm", {"horizon": 100, "warmup": 300, **IDEAL}),
-    "figure-eight": ("figure-eight", {"horizon": 400, **IDEAL}),
+    "ring": ("ring", {"horizon": 200, **IDEAL_VEHICLES}),
+    "ring-warm": ("ring-warm", {"horizon": 100, "warmup": 300, **IDEAL_VEHICLES}),
+    "figure-eight": ("figure-eight", {"horizon": 400, **IDEAL_VEHICLES}),
     "merge": ("merge", {"horizon": 60}),
     "on-ramp": ("on-ramp", {"horizon": 150, "peak": [0, 150], "penetration_rate": 0.3}),
     "user-network": ("", {"horizon": 250, "cav_types": ["van"]}),

@@ -93,7 +93,7 @@ class Actuator(Subclassable):
 INSTANT_ACTUATOR = Actuator()
 """an ideal vehicle, which responds to commands at once"""
 STANDARD_ACTUATOR = Actuator(delay=0.2, lag=0.3)
-"""a usual car; `docs/safety.md` names the sources"""
+"""a usual car: an assumption, see `docs/string-stability.md`"""
 
 
 class FollowingState(NamedTuple):
@@ -288,12 +288,28 @@ def _steps_to_standstill(speed: Array, change: float) -> int:
     return int(speed / change) + 1
 
 
+def actuate(
+    safety: SafetyFilter,
+    actuator: Actuator,
+    acceleration: Array,
+    state: FollowingState,
+    before: ActuatorState,
+    step: float,
+) -> tuple[Array, ActuatorState]:
+    """Return the filtered command for a desired acceleration, and the actuator's state in this step."""
+    if actuator.is_instant:
+        command = safety.limit(acceleration, state, step)
+        return command, ActuatorState(command)
+    command = safety.limit(acceleration, state, step, (actuator, before))
+    return command, actuator.apply_command(command, state.speed, before, step)
+
+
 class CAVActuation:
     """Filter and actuator of CAVs by name: a desired acceleration is filtered, then applied with delay and lag."""
 
     def __init__(self, safety: SafetyFilter, actuator: Actuator, step: float) -> None:
         """Take the settings of all CAVs; `step` is the simulation step [s]."""
-        self._limit, self._actuator, self._step = safety.limit, actuator, step
+        self._safety, self._actuator, self._step = safety, actuator, step
         self._has_lag = not actuator.is_instant
         self._states: dict[str, ActuatorState] = {}
 
@@ -315,9 +331,10 @@ class CAVActuation:
     def apply(self, name: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
         """Return the filtered command for a desired acceleration, and the acceleration in this simulation step."""
         if not self._has_lag:
-            command = self._limit(acceleration, state, self._step)
+            command = self._safety.limit(acceleration, state, self._step)
             return command, command
         actuator_state = self._states.get(name) or self._actuator.initial_state(state.speed, self._step)
-        command = self._limit(acceleration, state, self._step, (self._actuator, actuator_state))
-        self._states[name] = self._actuator.apply_command(command, state.speed, actuator_state, self._step)
+        command, self._states[name] = actuate(
+            self._safety, self._actuator, acceleration, state, actuator_state, self._step
+        )
         return command, self._states[name].acceleration

@@ -14,7 +14,7 @@ from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import SPEED_SCALE, LocalState, ScaledInput
 from unjam.drivers.requirements import NO_REQUIREMENTS, Requirements, RoadInterface
 from unjam.drivers.road_experts import BROKEN_LAP_FRACTION, GATHERED_LAP_FRACTION
-from unjam.drivers.safety import INSTANT_ACTUATOR, Actuator, ActuatorState, FollowingState, SafetyFilter
+from unjam.drivers.safety import INSTANT_ACTUATOR, Actuator, ActuatorState, FollowingState, SafetyFilter, actuate
 from unjam.drivers.sensors import MIN_SENSED_GAP
 from unjam.drivers.speed_history import MAX_WINDOW_STEPS
 from unjam.errors import InputError
@@ -216,8 +216,7 @@ class FilteredDriver(DriverWrapper):
         if actuator.is_instant:
             return self.safety.limit(acceleration, following, step), {INNER_KEY: after}
         before = ActuatorState(memory["acceleration"], tuple(memory[key] for key in self._pending_keys))
-        command = self.safety.limit(acceleration, following, step, (actuator, before))
-        responding = actuator.apply_command(command, state.speed, before, step)
+        command, responding = actuate(self.safety, actuator, acceleration, following, before, step)
         return command, {INNER_KEY: after, **self._actuator_memory(responding)}
 
     @cached_property

@@ -132,14 +132,15 @@ class EnvironmentData:
 
     def actuator_states_at(self, start_indices: StartIndices) -> ActuatorState:
         """Return the states of the actuators at `start_indices`, arrays of shape (n,); at rest at the beginning."""
-        count = self.actuator.delay_steps(self.control_step)
+        if self.actuator.is_instant:
+            return ActuatorState(np.zeros(len(start_indices)))
         starts = [(self.recordings[index], step) for index, step in start_indices]
-        before = [self._response(recording)[step - 1] if step else 0.0 for recording, step in starts]
         pending = [
-            np.array([recording.applied_acceleration[step - lag] if step >= lag else 0.0 for recording, step in starts])
-            for lag in range(count, 0, -1)
+            np.array([each.applied_acceleration[at - lag] if at >= lag else 0.0 for each, at in starts])
+            for lag in range(self.actuator.delay_steps(self.control_step), 0, -1)
         ]
-        return ActuatorState(np.array(before), tuple(pending))
+        changes = np.array([each.states.speed[at] - each.states.speed[max(at - 1, 0)] for each, at in starts])
+        return ActuatorState(changes / self.control_step, tuple(pending))
 
     def _response(self, recording: Recording) -> Floats:
         if self.actuator.is_instant:

@@ -15,7 +15,7 @@ from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.requirements import Requirements
 from unjam.drivers.residual import EXPERT_KEY, RESIDUAL_AGE_KEY, RESIDUAL_KEY, ResidualDriver
-from unjam.drivers.safety import ActuatorState, FollowingState
+from unjam.drivers.safety import ActuatorState, FollowingState, actuate
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import MissingPartError, UnjamError
 from unjam.models import row_model
@@ -134,14 +134,10 @@ class ModelDynamics:
 
         The filter limits the commands, which the vehicles follow as their `actuators` let them.
         """
-        scenario, actuator, response = self._scenario, self._scenario.actuator, acceleration
-        following, step = FollowingState(*state[:3]), scenario.control_step
-        if actuator.is_instant:
-            acceleration = response = scenario.safety.limit(acceleration, following, step)
-        else:
-            acceleration = scenario.safety.limit(acceleration, following, step, (actuator, actuators))
-            actuators = actuator.apply_command(acceleration, state.speed, actuators, step)
-            response = actuators.acceleration
+        scenario, following = self._scenario, FollowingState(*state[:3])
+        setup = scenario.safety, scenario.actuator
+        acceleration, actuators = actuate(*setup, acceleration, following, actuators, scenario.control_step)
+        response = actuators.acceleration
         base_state = row_model.base_step(self._model.base, scenario, state, response)
         expected = torch.stack([getattr(base_state, name) for name in row_model.STATE_FIELDS])
         residual = self._residual(state, response, drawn_values, expected[GAP_SLICE]).T

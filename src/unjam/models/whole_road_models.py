@@ -9,7 +9,6 @@ import numpy as np
 
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.residual import EXPERT_KEY
-from unjam.drivers.safety import ActuatorState
 from unjam.errors import InputError
 from unjam.models import road_model
 from unjam.models.comparison import ReplayDriver
@@ -141,10 +140,7 @@ class ClosedRoadModel(WholeRoadModel[road_model.RoadSamples]):
             ],
         )
         if road.steps_per_control_step == 1 and not road.actuator.is_instant:
-            states = [self.data.actuator_states_at(each) for each in self._starts_by_cav(start_indices)]
-            accelerations, pending = zip(*states, strict=True)
-            commands = tuple(map(np.concatenate, zip(*pending, strict=True)))
-            world.set_actuators(ActuatorState(np.concatenate(accelerations), commands))
+            world.set_actuators(self.data.actuator_states_at(np.concatenate(self._starts_by_cav(start_indices))))
         return finish_drive(start_batch_drive(world, driver, explore=True, memory=memory))
 
     def waves(self, run_episode: Callable[[EpisodeTask], Episode]) -> Facts:

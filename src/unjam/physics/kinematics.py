@@ -6,6 +6,9 @@ Source: https://sumo.dlr.de/docs/Simulation/Basic_Definition.html
 
 from unjam.physics.arrays import Array, clamp_min, namespace, square_root
 
+HALTING_SPEED = 0.1
+"""speed below which SUMO counts a vehicle as standing [m/s]"""
+
 
 def next_speed(speed: Array, acceleration: Array, time_step: float) -> Array:
     """Return the speed one step later, v' = max(0, v + a dt): vehicles do not drive backwards."""

@@ -171,7 +171,7 @@ class UserNetwork(Scenario):
         """Raise `InputError` if no vehicle enters, by the first departure or a whole episode (`has_entered`)."""
         files = read_sumo_files(Path(self.file))
         begin, first = self._begin(files), files.first_departure
-        end = self._end(begin)
+        end = self._end(files)
         none = f"no vehicle entered before {_format_time(end)}"
         if has_entered or (has_entered is None and (first is None or first < end)):
             return
@@ -185,17 +185,17 @@ class UserNetwork(Scenario):
     def _begin(self, files: SumoFiles) -> float:
         return files.begin if self.begin is None else self.begin
 
-    def _end(self, begin: float) -> float:
-        return begin + self._time_before_control + self.horizon * self.control_step
+    def _end(self, files: SumoFiles) -> float:
+        return self._begin(files) + self._time_before_control + self.horizon * self.control_step
 
     def _has_same_end(self, files: SumoFiles) -> bool:
         """Return whether an episode ends with the configuration: SUMO ends with the first step that reaches its end."""
-        end = self._end(self._begin(files))
+        end = self._end(files)
         return files.end is not None and -1e-6 < end - files.end < self.simulation_step - 1e-6
 
     def _end_of_flows(self, files: SumoFiles) -> float:
         """Return until when flows without an end last: to that of the configuration, and at least to the horizon."""
-        end = self._end(self._begin(files))
+        end = self._end(files)
         return end if files.end is None else max(files.end, end)
 
     @property
@@ -238,7 +238,7 @@ class UserNetwork(Scenario):
         for a part of flows that have a number of vehicles: plain SUMO would spread them over that part.
         """
         files, words = read_sumo_files(Path(self.file)), ["sumo", "-c", self.file, "--seed", str(seed)]
-        begin, end = self._begin(files), self._end(self._begin(files))
+        begin, end = self._begin(files), self._end(files)
         if self.driver_population or (files.has_spread_flows and end < self._end_of_flows(files)):
             return ""
         words += ["--begin", f"{begin:g}"] if self.begin is not None else []

@@ -250,7 +250,7 @@ def _async_rate(seed: int) -> float:
 
 def _rollout_rate(episode: Episode, scenario: Scenario, driver: ResidualDriver, rows: int, steps: int) -> float:
     """Return model steps per second of rollouts from an episode of the environment."""
-    data = EnvironmentData(episode.control_steps)
+    data = EnvironmentData(episode.control_steps, scenario.actuator, scenario.control_step)
     data.add([episode], scenario)
     model = RowModel(ModelSettings(), len(scenario.drawn_ranges), (0,))
     generator = torch_generator((0,), "cpu")

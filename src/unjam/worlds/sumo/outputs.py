@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from unjam.errors import DiskError, EpisodeError
+from unjam.physics.kinematics import HALTING_SPEED
 from unjam.scenarios.user_network import UNFINISHED_TRIPS_OPTIONS
 from unjam.worlds.record import SlowEntrance, SumoWarning, Trips
 from unjam.worlds.sumo.networks import MESSAGE_TOTAL_MARKER
@@ -18,8 +19,6 @@ from unjam.worlds.sumo.networks import MESSAGE_TOTAL_MARKER
 NOT_ARRIVED = -1.0
 TRIP_ATTRIBUTES = "departDelay", "duration", "timeLoss", "arrival", "departSpeed"
 """attributes of a trip that are read [s, m/s]"""
-MAX_HALTING_SPEED = 0.1
-"""speed up to which SUMO takes a vehicle for halting, and may remove it from a jam [m/s]"""
 MIN_NOTED_DELAY, MIN_NOTED_VEHICLES = 2.0, 10
 """mean insertion delay [s] and number of vehicles from which an entrance is slow"""
 FREE_SPEED_SHARE = 0.8
@@ -69,7 +68,7 @@ def read_trips(
                 times.append([float(trip[name]) for name in TRIP_ATTRIBUTES])
                 reason, speed = trip.get("vaporized"), float(trip["arrivalSpeed"])
                 # SUMO gives the same reason to vehicles that it teleports to the end of their route.
-                is_jammed = removes_jammed and reason == "teleport" and speed <= MAX_HALTING_SPEED
+                is_jammed = removes_jammed and reason == "teleport" and speed <= HALTING_SPEED
                 removed.append(reason == "collision" or is_jammed)
             element.clear()
     except ElementTree.ParseError:

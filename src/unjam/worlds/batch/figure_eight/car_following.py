@@ -8,15 +8,13 @@ import numpy as np
 
 from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, square_root
 from unjam.physics.idm import IDMArrays, IDMParameters, fast_power, idm_acceleration
-from unjam.physics.kinematics import max_speed_to_stop, next_speed, stopping_distance
+from unjam.physics.kinematics import HALTING_SPEED, max_speed_to_stop, next_speed, stopping_distance
 from unjam.scenarios.scenario import MIN_CAV_GAP, SUMO_ACCELERATION, Scenario
 from unjam.worlds.batch.human_idm import EMERGENCY_BRAKING, SUMO_MIN_GAP, look_ahead_distance, without_minimum_gap
 from unjam.worlds.batch.noise import ArrayFactory
 
 COMMANDED_HUMAN_BRAKING = 4.5
 """deceleration of the SUMO model below commanded human drivers [m/s2]"""
-HALTING_SPEED = 0.1
-"""speed below which SUMO counts a vehicle as standing [m/s]"""
 MIN_STOP_DISTANCE = 0.01
 """distance below which the `stopSpeed` of human drivers is zero [m]"""
 

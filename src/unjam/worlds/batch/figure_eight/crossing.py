@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from unjam.drivers.car_following import MIN_IDM_GAP
 from unjam.physics.arrays import Array, Floats, clamp_max, clamp_min, namespace, replace_columns, square_root
 from unjam.physics.idm import idm_acceleration
-from unjam.physics.kinematics import gap_on_loop
+from unjam.physics.kinematics import HALTING_SPEED, gap_on_loop
 from unjam.scenarios.figure_eight import CROSSING_LINK, INNER_LINK, OUTER_LINK, figure_eight_radius, lane_lengths
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import SUMO_ACCELERATION, VEHICLE_LENGTH, Scenario
 from unjam.worlds.batch import human_idm
-from unjam.worlds.batch.figure_eight.car_following import HALTING_SPEED, CarFollowingModels, speed_after_distance
+from unjam.worlds.batch.figure_eight.car_following import CarFollowingModels, speed_after_distance
 from unjam.worlds.batch.noise import ArrayFactory
 
 FOE_VISIBILITY_DISTANCE = 4.5
