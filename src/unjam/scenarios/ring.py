@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from unjam.drivers.safety import STANDARD_ACTUATOR, Actuator
 from unjam.parameters import STRICT, NumberOrRange, PositiveInt, is_packaged, parameter_dataclass
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.road import ClosedRoad, Edge, Entry, Node, RoadNetwork, Route, as_polyline
@@ -53,6 +54,8 @@ class LoopScenario(Scenario):
     """on the road, CAVs included"""
     cavs: PositiveInt = 1
     """number of CAVs, evenly spread"""
+    actuator: Actuator = STANDARD_ACTUATOR
+    """delay and lag with which a CAV follows its commands: those of a usual car"""
 
     @model_validator(mode="after")
     def _check_counts(self) -> Self:
