@@ -172,6 +172,12 @@ TRAFFIC = (
         effect=by_study("table-1-ring-unfiltered", filter_effect),
     ),
     Difference(
+        "delay and lag of the CAV",
+        "none: the command is the acceleration (4.1.2)",
+        ("scenario.actuator.delay", "scenario.actuator.lag"),
+        "those of a usual car by default; packaged controllers with both cars are on the page on string stability",
+    ),
+    Difference(
         "SUMO's own safety of the CAV",
         "not stated",
         ("scenario.actuation",),

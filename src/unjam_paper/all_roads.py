@@ -67,10 +67,10 @@ JAM_AHEAD_TUNED_ON_ALL = (
 """results of `unjam tune all-roads` for three experts (results/tuned.json)"""
 FAMILY_EXPERTS: dict[str, tuple[str, ...]] = {
     "rings": (
-        *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:ring-jammed-tuned", "unjam:rings-tuned"),
+        *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned-ideal", "unjam:ring-jammed-tuned-ideal", "unjam:rings-tuned"),
         *("unjam:shared-rings-tuned", "follower-stopper", PI_TUNED_ON_ALL, GAP_PI_TUNED_ON_ALL),
     ),
-    "figure-eights": ("unjam:figure-eight-tuned", "pacer:use_tuned=true", PI_TUNED_ON_ALL),
+    "figure-eights": ("unjam:figure-eight-tuned-ideal", "pacer:use_tuned=true", PI_TUNED_ON_ALL),
     "motorways": ("jam-ahead", "unjam:on-ramp-tuned", "cruise", "adaptive-acc", JAM_AHEAD_TUNED_ON_ALL),
 }
 """experts by group of roads; the best one on a road has a gain of 1 there"""
@@ -85,7 +85,7 @@ SINGLE_CONTROLLERS: dict[str, str] = {
     **{JAM_AHEAD_ON_ALL_LABEL: JAM_AHEAD_TUNED_ON_ALL, PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS},
 }
 """controllers for all roads: one expert, or one file with several"""
-CLOSED_ROAD_CONTROLLERS = ("unjam:ring-best", "unjam:ring-jammed-best", "unjam:figure-eight-best")
+CLOSED_ROAD_CONTROLLERS = ("unjam:ring-best-ideal", "unjam:ring-jammed-best-ideal", "unjam:figure-eight-best")
 MOTORWAY_CONTROLLERS = ("unjam:on-ramp-tuned",)
 """packaged controllers, each with the control step of its type of road"""
 FAMILY_DRIVERS: dict[str, str] = {
@@ -99,7 +99,7 @@ TWO_LAWS_LABEL = "PI on rings and figure eights, jam-ahead on motorways (tuned o
 RING_GROUP = "rings"
 RING_BASELINES = {
     RINGS_EXPERT: RINGS_EXPERT,
-    **{label: FAMILY_DRIVERS[label] for label in (PI_ON_RINGS_LABEL, "unjam:ring-best")},
+    **{label: FAMILY_DRIVERS[label] for label in (PI_ON_RINGS_LABEL, "unjam:ring-best-ideal")},
 }
 SHARED_RING_BASELINES = {SHARED_RINGS_EXPERT: SHARED_RINGS_EXPERT, RINGS_EXPERT: RINGS_EXPERT}
 ALL_ROADS_BASELINES = {label: FAMILY_DRIVERS[label] for label in ("unjam:best", PI_ON_RINGS_LABEL, "jam-ahead")}

@@ -87,11 +87,12 @@ ON_RAMP_EFFICIENCY_STEPS = (28_800,)
 STEP_MULTIPLES = (1, 2, 3)
 """multiples of the environment steps that variants without the model use"""
 MODEL_FREE_VARIANTS = {
+    **{each: (f"{each}-few", f"{each}-double", f"{each}-ideal") for each in ("best", "jammed")},
     "eight": ("eight-few", "eight-double", "best-in-batches"),
     "ramp": ("ramp-few",) * len(STEP_MULTIPLES) + ("ramp-small",) * len(STEP_MULTIPLES),
 }
-"""variants without the model, for `STEP_MULTIPLES`, where they differ from few, double and all steps. On figure eights,
-which a batch steps only in distribution, the last is trained in batches, too"""
+"""variants without the model, for `STEP_MULTIPLES`, by prefix. On figure eights, which a batch steps only in
+distribution, the last is trained in batches, too"""
 
 
 def comparison_study(title: str, variants: Sequence[str], road: str = "ring") -> Study:
@@ -332,7 +333,7 @@ def road_model_study(road: str, prefix: str) -> Study:
 
 def compared_variants(prefix: str) -> tuple[str, ...]:
     """Return the variant of a prefix with the model, and those without it by `STEP_MULTIPLES`."""
-    return (f"{prefix}-road-model", *MODEL_FREE_VARIANTS.get(prefix, (f"{prefix}-few", f"{prefix}-double", "best")))
+    return (f"{prefix}-road-model", *MODEL_FREE_VARIANTS[prefix])
 
 
 def efficiency_table(road: str, variants: Sequence[str], step_counts: Sequence[int], folder: Path) -> pd.DataFrame:

@@ -49,23 +49,29 @@ SEEDS_PER_SIZE = 10
 """test seeds for each length or radius"""
 PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL = "PI, tuned", "gap PI, tuned", "gap PI, tuned on the jammed ring"
 GAP_PI_JAMMED_LONG_LABEL = f"{GAP_PI_JAMMED_LABEL}, double budget"
+GAP_PI_LARGER_LABEL = "gap PI, tuned on this road, larger budget"
+IDEAL_EXPERT_LABEL, IDEAL_RESIDUAL_LABEL = "gap PI, tuned for ideal cars", "residual, trained for ideal cars"
 PI_LONG_TUNED = (
     "pi:window=13.31,catch_up_speed=1.193,gap_lower=5.997,gap_upper=58.76,"
     "safe_gap=1.037,safe_gap_rule=closing,time_constant=0.8318,first_command=own-speed"
 )
-"""result of `unjam tune ring --expert pi --max-string-gain 0 --steps 12000000`; that of `pi-from-gap` is
-`unjam:ring-gap-tuned`"""
+"""result of `unjam tune ring --expert pi --max-string-gain 0 --steps 12000000` for vehicles that obey at once; that of
+`pi-from-gap` is `unjam:ring-gap-tuned-ideal`"""
 GAP_PI_JAMMED_LONG_TUNED = (
     "pi-from-gap:window=23,catch_up_speed=2.916,gap_lower=6,gap_upper=80,safe_gap=2,"
     "time_constant=2.976,fade_time=26,history_factor=0"
 )
 """result of `unjam tune ring-jammed --expert pi-from-gap --max-string-gain 0 --steps 12000000` within the ranges of
-`unjam:ring-jammed-tuned`, which had half of these steps: results/tuned.json has both commands"""
+`unjam:ring-jammed-tuned-ideal`, which had half of these steps: results/tuned.json has both commands"""
+GAP_PI_RING_LARGER_TUNED = ""
+GAP_PI_JAMMED_LARGER_TUNED = ""
+"""results of both tunings of `pi-from-gap` for usual cars with 18,000,000 steps, as many as expert and residual
+together had (results/tuned.json)"""
 PACER_LONG_TUNED = (
     "pacer:use_tuned=true,gathering_speed=1.96,gathering_gap=0.319,regathering_gap=0.1595,time_constant=0.0966"
 )
 """result of `unjam tune figure-eight --expert pacer --max-string-gain 0 --reward eq16 --steps 4860000`, without
-parameters that have no effect; with 600,000 steps it is `unjam:figure-eight-tuned`"""
+parameters that have no effect; with 600,000 steps it is `unjam:figure-eight-tuned-ideal`"""
 PACER_TUNED_LABEL, PACER_GENTLE_LABEL = "pacer, tuned", "pacer, tuned, gentle"
 PACER_LONG_LABEL = "pacer, tuned, training budget"
 FEASIBILITY_STUDY_METRICS = (
@@ -155,29 +161,56 @@ def _limit_leader(ring: Ring) -> Driver:
 
 CEILING: dict[str, DriverSource] = {"speed-limit leader": _limit_leader}
 """a driver that leads all vehicles to the speed limit of the road, which no vehicle can know"""
+RING_SIZES = (220, 230, 240, 250, 260, 270)
 RING_DRIVERS: dict[str, DriverSource] = {
     **{HUMAN_LABEL: "human", "PI": "pi", "PI (paper)": "pi:time_constant=0", PI_TUNED_LABEL: PI_LONG_TUNED},
+    **{GAP_PI_LABEL: "unjam:ring-gap-tuned-ideal", GAP_PI_JAMMED_LABEL: "unjam:ring-jammed-tuned-ideal"},
+}
+USUAL_CAR_DRIVERS: dict[str, DriverSource] = {
+    **{HUMAN_LABEL: "human", "PI": "pi", "PI (paper)": "pi:time_constant=0"},
     **{GAP_PI_LABEL: "unjam:ring-gap-tuned", GAP_PI_JAMMED_LABEL: "unjam:ring-jammed-tuned"},
 }
+USUAL_CAR_BASELINES = GAP_PI_LABEL, GAP_PI_JAMMED_LABEL, GAP_PI_LARGER_LABEL
 FEASIBLE_ROADS = {
     "ring": EvaluationRoad(
-        sizes=(220, 230, 240, 250, 260, 270),
+        sizes=RING_SIZES,
         make_scenario=lambda length: Ring(length=(length, length), actuator=INSTANT_ACTUATOR),
         drivers=RING_DRIVERS | CEILING,
         baselines=(PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL),
     ),
     "ring-jammed": EvaluationRoad(
-        sizes=(220, 230, 240, 250, 260, 270),
+        sizes=RING_SIZES,
         make_scenario=lambda length: Ring(length=(length, length), warmup=LONG_WARM_UP, actuator=INSTANT_ACTUATOR),
         drivers={**RING_DRIVERS, GAP_PI_JAMMED_LONG_LABEL: GAP_PI_JAMMED_LONG_TUNED, **CEILING},
         baselines=(GAP_PI_LABEL, GAP_PI_JAMMED_LABEL, GAP_PI_JAMMED_LONG_LABEL),
+    ),
+    "ring-usual-car": EvaluationRoad(
+        sizes=RING_SIZES,
+        make_scenario=lambda length: Ring(length=(length, length)),
+        drivers={
+            **{**USUAL_CAR_DRIVERS, GAP_PI_LARGER_LABEL: GAP_PI_RING_LARGER_TUNED},
+            **{IDEAL_EXPERT_LABEL: "unjam:ring-gap-tuned-ideal", IDEAL_RESIDUAL_LABEL: "unjam:ring-best-ideal"},
+            **CEILING,
+        },
+        baselines=USUAL_CAR_BASELINES,
+    ),
+    "ring-jammed-usual-car": EvaluationRoad(
+        sizes=RING_SIZES,
+        make_scenario=lambda length: Ring(length=(length, length), warmup=LONG_WARM_UP),
+        drivers={
+            **{**USUAL_CAR_DRIVERS, GAP_PI_LARGER_LABEL: GAP_PI_JAMMED_LARGER_TUNED},
+            IDEAL_EXPERT_LABEL: "unjam:ring-jammed-tuned-ideal",
+            IDEAL_RESIDUAL_LABEL: "unjam:ring-jammed-best-ideal",
+            **CEILING,
+        },
+        baselines=USUAL_CAR_BASELINES,
     ),
     "figure-eight": EvaluationRoad(
         sizes=(32, 33, 34, 35),
         make_scenario=lambda radius: FigureEight(radius=(radius, radius), actuator=INSTANT_ACTUATOR),
         drivers={
             **{HUMAN_LABEL: "human", "pacer": "pacer", "varying pacer": "pacer:use_tuned=true"},
-            **{PACER_TUNED_LABEL: "unjam:figure-eight-tuned", PACER_LONG_LABEL: PACER_LONG_TUNED},
+            **{PACER_TUNED_LABEL: "unjam:figure-eight-tuned-ideal", PACER_LONG_LABEL: PACER_LONG_TUNED},
             PACER_GENTLE_LABEL: preset_values("best", "figure-eight")["expert"],
         },
         baselines=(PACER_TUNED_LABEL, PACER_LONG_LABEL, PACER_GENTLE_LABEL),
@@ -186,13 +219,13 @@ FEASIBLE_ROADS = {
 }
 
 
-def _feasible_parts(roads: Sequence[str], variant: str, study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+def _feasible_parts(variants: Mapping[str, str], study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     parts: dict[str, StudyPart] = {}
-    for name in roads:
+    for name, variant in variants.items():
         road, runs = FEASIBLE_ROADS[name], planned_runs([name], [variant], seeds)
         trained = {f"training {run.seed}": run for run in runs}
-        for other in set(roads) - {name}:
-            trained["residual trained on the other road"] = PlannedRun(other, variant, 0)
+        for other in variants.keys() - {name}:
+            trained["residual trained on the other road"] = PlannedRun(other, variants[other], 0)
         drivers = road.drivers | {label: study_folder.run_folder(run) for label, run in trained.items()}
         for size in road.sizes:
             arguments = road.make_scenario(size), drivers, SEEDS_PER_SIZE, FEASIBILITY_STUDY_METRICS
@@ -224,14 +257,16 @@ def _dissolution_text(times: Floats) -> str:
     return NO_VALUE_TEXT if not share else f"{np.nanmean(times):.1f}" + (f" ({share:.0%})" if share < 1.0 else "")
 
 
-def feasible_study(title: str, roads: Sequence[str], minutes: float, variant: str = "best") -> Study:
-    """Return the study that compares trainings of a variant with the tuned experts of closed roads."""
+def feasible_study(title: str, variants: Mapping[str, str], minutes: float) -> Study:
+    """Return the study that compares trainings with tuned experts of closed roads; `variants`: one by road."""
     return Study(
         title=title,
-        make_runs=lambda seeds: planned_runs(roads, [variant], seeds),
-        make_parts=partial(_feasible_parts, roads, variant),
+        make_runs=lambda seeds: [
+            run for road, variant in variants.items() for run in planned_runs([road], [variant], seeds)
+        ],
+        make_parts=partial(_feasible_parts, variants),
         minutes=minutes,
-        tables={road: partial(feasible_table, road) for road in roads},
+        tables={road: partial(feasible_table, road) for road in variants},
     )
 
 

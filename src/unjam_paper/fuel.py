@@ -28,8 +28,8 @@ from unjam_paper.study import NO_VALUE_TEXT, Study, Table, measure_tasks
 EMISSION_CLASSES = {"HBEFA4": "HBEFA4/PC_petrol_Euro-6ab", "PHEMlight": "PHEMlight/PC_G_EU4"}
 """emission classes of SUMO, by model"""
 FUEL_DRIVERS: dict[str, tuple[str, ...]] = {
-    "ring": (HUMAN_LABEL, "pi", "unjam:best", "unjam:ring-best"),
-    "ring-jammed": (HUMAN_LABEL, "pi", "unjam:best", "unjam:ring-jammed-best"),
+    "ring": (HUMAN_LABEL, "pi", "unjam:best", "unjam:ring-best-ideal"),
+    "ring-jammed": (HUMAN_LABEL, "pi", "unjam:best", "unjam:ring-jammed-best-ideal"),
     "figure-eight": (HUMAN_LABEL, "pi", "unjam:best", "unjam:figure-eight-best"),
 }
 FUEL_SEEDS, SECONDS_PER_HOUR = 20, 3600.0

@@ -69,9 +69,9 @@ ROAD_CONDITIONS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 ROAD_CONTROLLERS = {
-    "ring": ("unjam:ring-best", "unjam:ring-gap-tuned"),
-    "ring-jammed": ("unjam:ring-jammed-best", "unjam:ring-jammed-tuned"),
-    "figure-eight": ("unjam:figure-eight-best", "unjam:figure-eight-tuned"),
+    "ring": ("unjam:ring-best-ideal", "unjam:ring-gap-tuned-ideal"),
+    "ring-jammed": ("unjam:ring-jammed-best-ideal", "unjam:ring-jammed-tuned-ideal"),
+    "figure-eight": ("unjam:figure-eight-best", "unjam:figure-eight-tuned-ideal"),
 }
 """packaged controller of a road and its best tuned expert"""
 VOLUME_ROADS = ("ring-5", "ring-11", "ring")

@@ -90,15 +90,24 @@ STUDIES: dict[str, Study] = {
     "motorway-ensemble": MOTORWAY_ENSEMBLE,
     "motorway-benchmark": MOTORWAY_BENCHMARK,
     "feasible-ring": feasible_study(
-        "feasible residual compared with the tuned expert, on the ring and the jammed ring",
-        *(("ring", "ring-jammed"), 20.0),
+        "feasible residual compared with tuned experts in usual cars, on the ring and the jammed ring",
+        {"ring-usual-car": "best", "ring-jammed-usual-car": "best"},
+        minutes=20.0,
+    ),
+    "feasible-ring-ideal": feasible_study(
+        "feasible residual compared with tuned experts in ideal cars, on the ring and the jammed ring",
+        {"ring": "best-ideal", "ring-jammed": "jammed-ideal"},
+        minutes=20.0,
     ),
     "feasible-figure-eight": feasible_study(
-        "feasible residual compared with the tuned expert, on the figure eight", ("figure-eight",), 5.0
+        "feasible residual compared with the tuned expert in ideal cars, on the figure eight",
+        {"figure-eight": "best"},
+        minutes=5.0,
     ),
     "feasible-ring-jammed": feasible_study(
-        "residual trained on the first half of jammed episodes compared with the tuned expert",
-        *(("ring-jammed",), 20.0, "first-150-seconds"),
+        "residual trained on the first half of jammed episodes compared with the tuned expert, in ideal cars",
+        {"ring-jammed": "first-150-seconds"},
+        minutes=20.0,
     ),
     "on-ramp-trained": on_ramp_study({"ramp-long": "residual on the expert tuned with the larger budget"}),
     "on-ramp-alternating": on_ramp_study({"ramp-alternating": "residual on unjam:on-ramp-tuned, alternating updates"}),

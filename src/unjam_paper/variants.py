@@ -9,6 +9,9 @@ STEP_BUDGET, MILLION_STEPS, PAPER_STEP_BUDGET = 300_000, 1_000_000, 4_000_000
 """environment steps of a training; the larger budget where it takes less than an hour; those of the paper"""
 RINGS_EXPERT, SHARED_RINGS_EXPERT = "unjam:rings-tuned", "unjam:shared-rings-tuned"
 """best experts for all rings of the family, and for rings that several CAVs share"""
+RING_IDEAL: dict[str, Any] = {"expert": "unjam:ring-gap-tuned-ideal"}
+JAMMED_IDEAL: dict[str, Any] = {"expert": "unjam:ring-jammed-tuned-ideal"}
+"""changes to `best`, whose experts are tuned for usual cars: experts tuned for vehicles that obey at once"""
 ON_RAMP_JAM_AHEAD = (
     "jam-ahead:first_section=3,last_section=4,speed_margin=-1.536,margin_by_penetration=19.83,min_speed=2.568,"
     "max_deceleration=1.106,time_constant=1.681"
@@ -48,7 +51,7 @@ def reduced_step_variants(
     }
 
 
-BEST_VARIANTS = reduced_step_variants("best", 12_000, 756_000)
+BEST_VARIANTS = reduced_step_variants("best", 12_000, 756_000, **RING_IDEAL)
 ROAD_MODEL = BEST_VARIANTS["best-road-model"]
 WRONG_BASES: dict[str, tuple[str, dict[str, Any]]] = {
     "slow": ("other IDM parameters", {"model.humans": {"time_headway": 1.5, "max_acceleration": 2.0}}),
@@ -86,6 +89,7 @@ FROM_SCRATCH = {
 }
 """learning without an expert on many roads: with the small exploration noise of a residual, CAVs learn to stand"""
 FIRST_150_SECONDS = {
+    **JAMMED_IDEAL,
     **{"scenario_options.horizon": 1500, "trpo.steps_per_iteration": 48_000, "trpo.target_kl": 0.016},
     **{"trpo.gamma": 0.996, "trpo.gae_lambda": 0.96, "policy.exploration_std": 0.05, "policy.action_duration": 1.5},
 }
@@ -118,6 +122,8 @@ VARIANTS: dict[str, Variant] = {
     "ours": Variant("unjam residual", "quick", {}),
     "ours-without-model": Variant("unjam residual without model", "quick", {"model.model_ratio": 0.0}),
     "best": Variant("unjam residual, all steps", "best", {}, None),
+    "best-ideal": Variant("unjam residual, all steps", "best", RING_IDEAL, None),
+    "jammed-ideal": Variant("unjam residual, all steps", "best", JAMMED_IDEAL, None),
     **BEST_VARIANTS,
     **{
         f"best-road-model-{name}": replace(
@@ -125,7 +131,7 @@ VARIANTS: dict[str, Variant] = {
         )
         for name, (base, changes) in WRONG_BASES.items()
     },
-    **reduced_step_variants("jammed", 24_000, 768_000),
+    **reduced_step_variants("jammed", 24_000, 768_000, **JAMMED_IDEAL),
     **reduced_step_variants("eight", 6_000, 612_000, horizon=1500),
     **ON_RAMP_VARIANTS,
     "ramp-road-model": replace(ON_RAMP_VARIANTS["ramp-road-model"], changes=WEAK_EXPERT, steps=28_800),
@@ -151,8 +157,8 @@ REFERENCE_DRIVERS: dict[str, str] = {
 }
 """drivers of all roads: label, and name as in `unjam drive`; the last one is the best expert on the merge"""
 TUNED_REFERENCES: dict[str, dict[str, str]] = {
-    "ring": {"tuned PI": "unjam:ring-tuned", "tuned gap PI": "unjam:ring-gap-tuned"},
-    "ring-jammed": {"tuned gap PI": "unjam:ring-jammed-tuned"},
+    "ring": {"tuned PI": "unjam:ring-tuned", "tuned gap PI": "unjam:ring-gap-tuned-ideal"},
+    "ring-jammed": {"tuned gap PI": "unjam:ring-jammed-tuned-ideal"},
     "ring-5": {
         "tuned jam absorber": "jam-absorber:gap_gain=0.2656,speed_gain=0.9472,time_gap=0.7288,"
         "standstill_gap=8.556,extra_acceleration=0.4562"
@@ -163,7 +169,7 @@ TUNED_REFERENCES: dict[str, dict[str, str]] = {
     },
     "figure-eight": {
         "tuned pacer": "pacer:lap_time=88.83,gap_gain=0.006993,target_gap=0.4577,time_constant=0.2108",
-        "tuned varying pacer": "unjam:figure-eight-tuned",
+        "tuned varying pacer": "unjam:figure-eight-tuned-ideal",
     },
     "on-ramp": {"tuned jam-ahead": "unjam:on-ramp-tuned"},
 }

@@ -29,7 +29,7 @@ from unjam.controller.verify import verify_controller_file
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.drivers.car_following import Constant
 from unjam.drivers.registry import driver_from_recipe, driver_recipe
-from unjam.drivers.safety import Actuator
+from unjam.drivers.safety import STANDARD_ACTUATOR, Actuator
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError
 from unjam.measures.metrics import measure
@@ -93,7 +93,10 @@ def test_manifest_has_origin_and_metrics(run: Path, exported_file: Path) -> None
 def test_sample_has_the_local_states_of_an_episode(exported_file: Path) -> None:
     states, answers = read_sample(unpack_parts(exported_file)[SAMPLE_PART])
     assert len(answers) == 100  # the horizon of the run
-    np.testing.assert_allclose(np.diff(states.speed), 0.1 * answers[:-1], atol=1e-6)
+    response = STANDARD_ACTUATOR.initial_state(states.speed[0], 0.1)
+    for speed, command, following_speed in zip(states.speed, answers, states.speed[1:], strict=False):
+        response = STANDARD_ACTUATOR.apply_command(command, speed, response, 0.1)
+        assert following_speed - speed == pytest.approx(0.1 * response.acceleration, abs=1e-6)
     assert set(states.loop_length) <= set(range(120, 131))
 
 

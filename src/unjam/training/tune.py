@@ -295,15 +295,9 @@ def _run_in_sumo(workers: WorkerPool, tasks: list[list[EpisodeTask]]) -> list[Ep
 
 
 def _run_in_batch(tasks: list[list[EpisodeTask]]) -> list[EpisodeRows]:
-    import torch
-
     all_tasks = [*chain(*tasks)]
-    if required_batch_kind(all_tasks[0].scenario).has_own_drivers:
-        episodes = iter(run_batches(all_tasks, allow_statistical=True))
-    else:
-        needs_numpy = any(task.driver.requirements().needs_numpy for task in all_tasks)
-        to_array = np.asarray if needs_numpy else torch.as_tensor
-        episodes = iter(run_batch(all_tasks, to_array, allow_statistical=True))
+    run = run_batches if required_batch_kind(all_tasks[0].scenario).has_own_drivers else run_batch
+    episodes = iter(run(all_tasks, allow_statistical=True))
     return [[measure(next(episodes)) for _ in each] for each in tasks]
 
 
