@@ -27,7 +27,9 @@ from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 
-SINGLE_ROADS = ("ring-best", "ring-jammed-best", "figure-eight-best")
+IDEAL_BEST = ("ring-best-ideal", "ring-jammed-best-ideal")
+"""controllers that were trained for vehicles that obey at once"""
+SINGLE_ROADS = ("ring-best", "ring-jammed-best", "figure-eight-best", *IDEAL_BEST)
 """controllers that are verified in make test-all alone, as each takes seconds"""
 CERTIFIED = Path(__file__).parents[2] / "results/all-roads-controllers.zip"
 
@@ -40,12 +42,12 @@ def test_each_is_whole_and_says_what_it_was_trained_on(name: str) -> None:
     verify_controller_file(packaged_file(name))
     driver = make_driver(f"{PACKAGED_PREFIX}{name}", 0.1)
     driver = driver.driver if isinstance(driver, FilteredDriver) else driver
-    assert isinstance(driver, ResidualDriver) == name.endswith("-best")
+    assert isinstance(driver, ResidualDriver) == ("-best" in name)
 
 
 def test_there_is_one_for_each_preset_that_is_known_to_reach_furthest() -> None:
     best = {f"{scenario}-best" for scenario in {*all_presets()["best"]["on"]} - {"merge"}}  # where nothing is drivable
-    assert {name for name in packaged_names() if not name.endswith("-tuned")} == {"best", *best}
+    assert {name for name in packaged_names() if "-tuned" not in name} == {"best", *best, *IDEAL_BEST}
 
 
 @pytest.mark.parametrize("name", ["nothing", "", "../ring-best", "ring-best.unjam"])

@@ -32,7 +32,7 @@ from unjam_paper.results_file import read_part
 
 COUNTS = (3, 5, 10, 20)
 REPEATS = 500
-FEASIBLE_RING = Path(__file__).parents[2] / "results" / "feasible-ring.json"
+FEASIBLE_RING = Path(__file__).parents[2] / "results" / "feasible-ring-ideal.json"
 NUMBERS = st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=12)
 
 

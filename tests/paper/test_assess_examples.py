@@ -47,7 +47,7 @@ def test_a_road_is_assessed_once_and_its_results_have_all_drivers(
     assert (human["driver"], acc["driver"]) == ("human", "cruise")
     assert controller["driver"] in found["rejection_reasons"]
     assert controller["difference"]["count"] == found["test_seeds"] == 3
-    assert controller["verdict"].startswith("3 test seeds are too few")
+    assert controller["verdict"].startswith("3 test seeds, where 10 are needed")
     assert acc["travel_time"] == pytest.approx(human["travel_time"] + acc["difference"]["mean"])
     assert len(found["sentences"]) == 2
     assert list(examples_table(out)["driver"]) == ["human", "cruise", controller["driver"]]
