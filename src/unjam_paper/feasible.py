@@ -5,7 +5,7 @@ study `envelope` takes packaged controllers to other sizes, roads without SUMO's
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -19,7 +19,7 @@ from unjam.controller.certificate import make_certificate
 from unjam.controller.file import SUFFIX, read_controller
 from unjam.drivers.car_following import FollowerStopper
 from unjam.drivers.driver import Driver
-from unjam.drivers.safety import INSTANT_ACTUATOR, Actuator, SafetyFilter
+from unjam.drivers.safety import INSTANT_ACTUATOR, STANDARD_ACTUATOR, Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL
@@ -96,23 +96,31 @@ ENVELOPE_SEEDS, RAW_ACTUATION_SEEDS, IMPAIRED_SEEDS = 2, 5, 8
 """test seeds of each driver on each road"""
 CONTROLLER_ROADS: dict[str, str] = {
     "unjam:best": "ring-jammed",
-    **{f"unjam:{name}": "ring" for name in ("ring-best", "ring-gap-tuned", "ring-tuned")},
+    **{f"unjam:{name}": "ring" for name in ("ring-best-ideal", "ring-gap-tuned-ideal", "ring-tuned")},
     **{f"unjam:{name}": "ring" for name in ("rings-tuned", "shared-rings-tuned")},
-    **{f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
-    **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned")},
+    **{f"unjam:{name}-ideal": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
+    **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned-ideal")},
 }
-"""packaged controllers for closed roads, and the road of each"""
+"""packaged controllers for closed roads that were tuned or trained for ideal cars, and the road of each"""
+USUAL_CAR_ROADS: dict[str, str] = {
+    **{f"unjam:{name}": "ring" for name in ("ring-best", "ring-gap-tuned")},
+    **{f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
+}
+"""those for usual cars"""
 LANE_CONTROLLERS = ("unjam:on-ramp-tuned",)
 RING_CONTROLLERS = tuple(name for name, road in CONTROLLER_ROADS.items() if road != "figure-eight")
 RING_STEPS: dict[str, Any] = {"simulation_step": 0.1, "steps_per_control_step": 1}
 """those of the rings, which their controllers need on any road"""
 LANE_SECONDS = 900.0
 """duration of an episode on a motorway lane [s]"""
-IMPAIRED_DRIVERS = ("unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned")
+IMPAIRED_DRIVERS = (
+    "unjam:best",
+    *(f"unjam:{name}-ideal" for name in ("ring-best", "ring-jammed-best", "ring-jammed-tuned")),
+)
 VEHICLE_SPACINGS = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
 """range of the road length per vehicle [m]"""
-WORST_PART = "worst"
-"""part with the worst cases of the certificates"""
+WORST_PART, USUAL_CAR_WORST_PART = "worst", "worst-usual-car"
+"""parts with the worst cases of the certificates"""
 ENVELOPE_METRICS = ("return", "mean_speed", "min_time_gap", "cav_max_braking", "steps", "collisions")
 LANE_CONDITIONS: dict[str, dict[str, Any]] = {
     "a free lane": {"inflow": 1200.0, "off_peak_inflow": 1200.0},
@@ -312,7 +320,7 @@ def envelope_rings(**changes: Any) -> Iterator[tuple[str, Ring]]:
         name = f"{vehicles} vehicles, {cavs} automated, {words}{', jammed' if warmup else ''}"
         length = low * vehicles, high * vehicles
         size: dict[str, Any] = {"vehicles": vehicles, "cavs": cavs, "length": length, "warmup": warmup}
-        yield name, Ring(actuator=INSTANT_ACTUATOR, **size, **changes)
+        yield name, Ring(**{"actuator": INSTANT_ACTUATOR, **size, **changes})
 
 
 def envelope_figure_eights() -> Iterator[tuple[str, FigureEight]]:
@@ -338,12 +346,17 @@ def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
 def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     """Return the parts of the study `envelope`."""
     closed, parts = tuple(CONTROLLER_ROADS), dict[str, StudyPart]()
-    for driver, road in CONTROLLER_ROADS.items():
-        parts[f"{WORST_PART}/{driver}"] = _certify_worst_cases, (driver, road)
+    for part, road_by_driver in ((WORST_PART, CONTROLLER_ROADS), (USUAL_CAR_WORST_PART, USUAL_CAR_ROADS)):
+        actuator = INSTANT_ACTUATOR if part == WORST_PART else STANDARD_ACTUATOR
+        for driver, road in road_by_driver.items():
+            parts[f"{part}/{driver}"] = _certify_worst_cases, (driver, road, actuator)
+    usual_cars: dict[str, Any] = {"actuator": STANDARD_ACTUATOR}
     tests: tuple[tuple[str, Iterator[tuple[str, Scenario]], tuple[str, ...], int], ...] = (
         ("rings", envelope_rings(), closed, ENVELOPE_SEEDS),
         ("figure-eights", envelope_figure_eights(), closed, ENVELOPE_SEEDS),
         ("rings-raw", envelope_rings(actuation="raw"), closed, RAW_ACTUATION_SEEDS),
+        ("rings-usual-car", envelope_rings(**usual_cars), tuple(USUAL_CAR_ROADS), ENVELOPE_SEEDS),
+        ("rings-raw-usual-car", envelope_rings(actuation="raw", **usual_cars), tuple(USUAL_CAR_ROADS), ENVELOPE_SEEDS),
         ("lanes-raw", envelope_lanes(), LANE_CONTROLLERS, RAW_ACTUATION_SEEDS),
         ("lanes-raw", envelope_lanes(**RING_STEPS), RING_CONTROLLERS, RAW_ACTUATION_SEEDS),
         ("impaired", impaired_rings(0), IMPAIRED_DRIVERS, IMPAIRED_SEEDS),
@@ -356,18 +369,19 @@ def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart
     return parts
 
 
-def _certify_worst_cases(controller: str, road: str, workers: int) -> dict[str, Any]:
+def _certify_worst_cases(controller: str, road: str, actuator: Actuator, workers: int) -> dict[str, Any]:
     with TemporaryDirectory() as folder:
         file = Path(folder, f"controller{SUFFIX}")
-        export_controller(controller, file, scenario=road)
+        export_controller(controller, file, scenario=road, settings={"actuator": asdict(actuator)})
         return make_certificate(read_controller(file))["worst_cases"]
 
 
-def worst_table(folder: Path) -> pd.DataFrame:
+def worst_table(part: str, folder: Path) -> pd.DataFrame:
     """Return how close each controller came to leaders that brake to a stop and to leaders found by a search."""
     rows: list[dict[str, Any]] = []
-    for controller, worst in read_part(folder, WORST_PART).items():
-        row = {"controller": controller, "road": CONTROLLER_ROADS[controller], "stops": f"{worst['leader_stops']:,}"}
+    for controller, worst in read_part(folder, part).items():
+        road = {**CONTROLLER_ROADS, **USUAL_CAR_ROADS}[controller]
+        row = {"controller": controller, "road": road, "stops": f"{worst['leader_stops']:,}"}
         row |= {"steps": f"{worst['steps']:,}", "contacts": worst["contacts"], "min gap [m]": f"{worst['min_gap']:.2f}"}
         row["min time gap [s]"] = f"{worst['min_time_gap']:.2f}"
         rows.append({**row, "max braking [m/s²]": f"{worst['max_braking']:.1f}"})
@@ -425,9 +439,9 @@ ENVELOPE = Study(
     make_parts=envelope_parts,
     minutes=30.0,
     tables={
-        WORST_PART: worst_table,
-        **{part: partial(domain_table, part) for part in ("rings", "figure-eights")},
-        **{part: partial(contact_table, part) for part in ("rings-raw", "lanes-raw")},
+        **{part: partial(worst_table, part) for part in (WORST_PART, USUAL_CAR_WORST_PART)},
+        **{part: partial(domain_table, part) for part in ("rings", "rings-usual-car", "figure-eights")},
+        **{part: partial(contact_table, part) for part in ("rings-raw", "rings-raw-usual-car", "lanes-raw")},
         **{part: partial(impaired_table, part) for part in ("impaired", "impaired-jammed")},
     },
 )

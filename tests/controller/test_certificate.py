@@ -121,7 +121,7 @@ def test_a_state_outside_of_the_domain_is_told_from_one_within() -> None:
 
 def written(folder: Path, driver: Driver | None = None) -> Path:
     driver = driver or filter_driver(PISaturation())
-    file, ring = folder / "ring.unjam", Ring()
+    file, ring = folder / "ring.unjam", Ring(actuator=INSTANT_ACTUATOR)
     sample = sample_bytes(driver, visited_states(), 6.0)
     file.write_bytes(controller_bytes(driver, controller_origin(ring, driver), {SAMPLE_PART: sample}))
     return file

@@ -17,7 +17,9 @@ from tests.faults.processes import SETTINGS, TINY
 from tests.recordings.synthetic_trajectories import write_table
 from tests.system.conftest import UNJAM, Run
 from tests.worlds.sumo.user_networks import game, straight
-from unjam.controller.file import packaged_file
+from unjam.controller.file import load_controller, packaged_file
+from unjam.drivers.safety import Actuator
+from unjam.drivers.wrappers import FilteredDriver
 
 SMALL = ["--length", "60", "--vehicles", "5", "--set", "horizon=80"]
 TINY_RUN = [
@@ -518,7 +520,24 @@ def test_packaged_controllers_are_certified_and_stay_as_they_are(unjam: Run, tmp
     before = file.read_bytes()
     done = unjam("certify", "unjam:ring-tuned")
     assert "0 contacts" in done.stdout
-    assert done.stdout.count("string stable, largest gain") == 3
+    assert done.stdout.startswith("not string stable, in a vehicle that obeys at once: amplifies oscillations up to ")
+    assert done.stdout.count(" m/s: gain ") == 3
     assert "not string stable" in (tmp_path / "ring-tuned.html").read_text()
     assert file.read_bytes() == before
     assert not file.with_suffix(".html").exists()
+
+
+@pytest.mark.long
+def test_controllers_are_certified_and_exported_for_another_car(unjam: Run, tmp_path: Path) -> None:
+    car = ("--set", "actuator.delay=0.4", "--set", "actuator.lag=0.5")
+    done = unjam("certify", "unjam:ring-tuned", *car)
+    assert ", in a vehicle with 0.4 s delay and 0.5 s lag" in done.stdout.splitlines()[0]
+    assert unjam("export", "unjam:ring-best", *car, "--out", "car.unjam").returncode == 0
+    driver = load_controller(tmp_path / "car.unjam")
+    assert isinstance(driver, FilteredDriver)
+    assert driver.actuator == Actuator(0.4, 0.5)
+    assert not isinstance(driver.driver, FilteredDriver)
+    for wrong in (("certify", "car.unjam", *car), ("export", "pi", "--set", "actuator.delay=-1", "--out", "x.unjam")):
+        refused = unjam(*wrong)
+        assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+        assert "allowed" in refused.stderr

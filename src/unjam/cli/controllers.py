@@ -5,12 +5,12 @@ import os
 import warnings
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from rich.markup import escape
 from typer import Argument, Option
 
-from unjam.cli.options import JsonOption, check_page_path
+from unjam.cli.options import JsonOption, ScenarioSettingsOption, check_page_path, parse_settings
 from unjam.cli.output import console, err_console, print_json
 from unjam.controller.file import (
     PACKAGED_PREFIX,
@@ -42,6 +42,7 @@ def export_command(
     scenario: Annotated[
         str, Option(help="Scenario that defines control step and limits of a plain driver.", show_default="ring")
     ] = "",
+    settings: ScenarioSettingsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Write a controller into one file that contains everything to run it elsewhere.
@@ -54,11 +55,13 @@ def export_command(
     - unjam export runs/ring-001 --out ring.unjam
     - unjam export runs/ring-001 --out ring.unjam --onnx --sb3
     - unjam export pi:window=30 --scenario merge --out pi.unjam
+    - unjam export unjam:ring-best --set actuator.delay=0.4 --out my-car.unjam     (with the filter for this car)
     """
     if onnx:  # messages of the exporter are of no use to users
         warnings.simplefilter("ignore")
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-    result = export_controller(source, out, onnx, scenario, stable_baselines3)
+    changes = parse_settings(settings)
+    result = export_controller(source, out, onnx, scenario, stable_baselines3, changes)
     if json:
         files = {"file": result.file, "onnx": result.graph, "stable_baselines3": result.model}
         names = {name: str(file) if file else None for name, file in files.items()}
@@ -80,6 +83,9 @@ def certify_command(
     out: Annotated[
         Path | None, Option("--out", help="HTML file to write.", show_default="the name of the file with .html")
     ] = None,
+    settings: Annotated[
+        list[str] | None, Option("--set", help="Setting of the road of a packaged controller: actuator.delay=0.4.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Certify a controller: proven properties, worst cases, comfort, string stability, operating domain.
@@ -93,13 +99,18 @@ def certify_command(
 
     - unjam certify ring.unjam
     - unjam certify unjam:ring-tuned
+    - unjam certify unjam:ring-best --set actuator.delay=0.4     (with the filter for this car)
     """
-    from unjam.controller.certificate import describe_worst_cases, make_certificate
+    from unjam.controller.certificate import describe_string_stability, describe_worst_cases, make_certificate
 
     if out is not None:
         check_page_path(out)
     is_packaged = str(file).startswith(PACKAGED_PREFIX)
-    controller, file = _read_with_filter(str(file)) if is_packaged else read_controller(file), controller_file(file)
+    if settings and not is_packaged:
+        raise invalid_value("set", settings[0], "a packaged controller, or a file of unjam export --set")
+    changes = parse_settings(settings)
+    source, file = str(file), controller_file(file)
+    controller = _read_with_filter(source, changes) if is_packaged else read_controller(file)
     target = out or (Path(file.name) if is_packaged else file).with_suffix(".html")
     check_parent_folder(target)
     check_unsigned(controller)
@@ -113,21 +124,20 @@ def certify_command(
     if json:
         print_json({"file": str(file), "page": str(target), "certificate": certificate})
         return
-    console.print(describe_worst_cases(certificate, controller.driver), soft_wrap=True)
+    console.print(describe_string_stability(certificate, controller.driver))
     for each in certificate["string_stability"]:
-        verdict = "not string stable" if each["amplified_band"] else "string stable"
-        largest = f"largest gain {max(each['gains']):.2f} at {each['peak_frequency']:.3g} Hz"
-        console.print(f"at {each['speed']:g} m/s: {verdict}, {largest}", soft_wrap=True)
+        console.print(f"  at {each['speed']:g} m/s: gain {max(each['gains']):.2f} at {each['peak_frequency']:.3g} Hz")
+    console.print(describe_worst_cases(certificate, controller.driver))
     err_console.print(f"page: {target}")
 
 
-def _read_with_filter(name: str) -> Controller:
+def _read_with_filter(name: str, settings: dict[str, Any]) -> Controller:
     """Return a packaged controller with the safety filter of its road and a sample of it."""
     controller = read_controller(Path(name))
-    if isinstance(controller.driver, FilteredDriver):
+    if isinstance(controller.driver, FilteredDriver) and not settings:
         return controller
     with PrivateFolder() as private:
-        return read_controller(export_controller(name, Path(private, f"filtered{SUFFIX}")).file)
+        return read_controller(export_controller(name, Path(private, f"filtered{SUFFIX}"), settings=settings).file)
 
 
 def verify_command(

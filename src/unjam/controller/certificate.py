@@ -112,6 +112,17 @@ def describe_worst_cases(certificate: dict[str, Any], driver: FilteredDriver) ->
     )
 
 
+def describe_string_stability(certificate: dict[str, Any], driver: FilteredDriver) -> str:
+    """Return in one line whether a controller amplifies oscillations of its leader, and in which vehicle."""
+    results, vehicle = certificate["string_stability"], driver.actuator.describe()
+    if not results:
+        return f"string stability was not tested, {vehicle}"
+    worst = max(results, key=lambda each: max(each["gains"]))
+    if not any(each["amplified_band"] for each in results):
+        return f"string stable, {vehicle}"
+    return f"not string stable, {vehicle}: amplifies oscillations up to {max(worst['gains']):.2f} times"
+
+
 FollowingSimulator = Callable[[FollowingState, Floats], FollowingState]
 """simulates a controller behind leaders, from initial states and the leaders' accelerations, shape (steps, rows)"""
 

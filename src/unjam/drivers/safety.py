@@ -54,6 +54,12 @@ class Actuator(Subclassable):
         """Whether there is neither delay nor lag."""
         return self.delay == 0.0 == self.lag
 
+    def describe(self) -> str:
+        """Return the vehicle in words."""
+        if self.is_instant:
+            return "in a vehicle that obeys at once"
+        return f"in a vehicle with {self.delay:g} s delay and {self.lag:g} s lag"
+
     def initial_state(self, like: Array, step: float) -> ActuatorState:
         """Return the state without acceleration and commands, for vehicles in the shape of `like`."""
         return ActuatorState(0.0 * like, (0.0 * like,) * self.delay_steps(step))

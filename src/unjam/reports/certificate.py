@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from unjam.controller.certificate import describe_string_stability
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.files import atomic_write
 from unjam.reports.figures import CAV_PLOT_COLOR, LINE_COLORS, MUTED_COLOR, PLOT_STYLE, data_uri, new_figure
@@ -30,6 +31,7 @@ def write_certificate_page(name: str, driver: FilteredDriver, certificate: dict[
         driver=driver.describe(),
         worst_cases=worst,
         cards=cards,
+        verdict=describe_string_stability(certificate, driver),
         notes=_certificate_notes(certificate),
         safety=driver.safety,
         step=f"{driver.time_step:g}",

@@ -22,7 +22,7 @@ from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarize
 from unjam.processes import PrivateFolder
 from unjam.reports.results import EVALUATION_FILE, read_evaluation
-from unjam.scenarios import example_scenario, scenario_from_recipe
+from unjam.scenarios import example_scenario, make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_scenario import CODE_ENTRY, class_reference
 from unjam.seeds import held_out_seeds
@@ -90,7 +90,12 @@ class ExportResult:
 
 @expecting_code()
 def export_controller(
-    source: str | Path, out: str | Path, onnx: bool = False, scenario: str = "", stable_baselines3: bool = False
+    source: str | Path,
+    out: str | Path,
+    onnx: bool = False,
+    scenario: str = "",
+    stable_baselines3: bool = False,
+    settings: dict[str, Any] | None = None,
 ) -> ExportResult:
     """Write a controller into a self-contained file `.unjam`, and optionally an ONNX graph and a model of others.
 
@@ -102,6 +107,8 @@ def export_controller(
         onnx: whether to write the graph of the whole controller.
         scenario: the scenario for time step and bounds of a driver; a run and a controller's file have their own.
         stable_baselines3: whether to write the residual as a model of Stable-Baselines3, with the same name and `.zip`.
+        settings: changes to the scenario, such as `{"actuator.delay": 0.5}`; a controller with a safety filter gets
+            that of the changed scenario, or of the one named, in its place.
 
     Raises:
         InputError: there is no such controller, or it is Python code; with `onnx` it has no graph; with
@@ -120,7 +127,7 @@ def export_controller(
     if not out.exists() and (others := [str(file) for file in siblings if os.path.lexists(file)]):
         raise InputError(f"out: {', '.join(others)} exists and belongs to no {out.name}; allowed: another name")
     read_origin = _read_run_origin if source.is_dir() else _read_driver_origin
-    road, driver, metadata = read_origin(str(source), scenario)
+    road, driver, metadata = read_origin(str(source), scenario, settings or {})
     code = user_code_recipes(driver_recipe(driver)[0])
     if driver.is_native or code:
         reason = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
@@ -166,12 +173,15 @@ def driver_with_filter(driver: Driver, road: Scenario) -> FilteredDriver:
     return FilteredDriver(driver, max_acceleration, road.safety, road.control_step, road.actuator)
 
 
+def _without_filter(driver: Driver) -> Driver:
+    return driver.driver if isinstance(driver, FilteredDriver) else driver
+
+
 def _residual_model(driver: Driver, metadata: dict[str, Any]) -> bytes:
     """Return the residual of a controller as a model of the algorithm that trained it; SAC if that is unknown."""
     from unjam.adapters.stable_baselines3_export import ALGORITHMS, stable_baselines3_bytes
 
-    if isinstance(driver, FilteredDriver):
-        driver = driver.driver
+    driver = _without_filter(driver)
     if not isinstance(driver, ResidualDriver):
         raise invalid_value("stable_baselines3", driver.describe(), "a residual, such as a training run")
     agent = metadata.get("run", {}).get("agent")
@@ -184,13 +194,13 @@ def _is_signed(file: Path) -> bool:
     return False
 
 
-def _read_run_origin(run: str, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
+def _read_run_origin(run: str, scenario: str, settings: dict[str, Any]) -> tuple[Scenario, Driver, dict[str, Any]]:
     if scenario:
         raise invalid_value("scenario", scenario, "none for a run, which has its own")
     folder = Path(run)
     config = read_config(folder)
     check_run_files(folder, config, "export")
-    road, controller = config.make_scenario(), read_controller(folder)
+    road, controller = make_scenario(config.make_scenario(), settings), read_controller(folder)
     metadata = {
         **controller_origin(road, config.make_expert()),
         "run": {"scenario": config.scenario, "agent": config.agent, "seed": config.seed},
@@ -200,16 +210,22 @@ def _read_run_origin(run: str, scenario: str) -> tuple[Scenario, Driver, dict[st
     return road, controller.driver, metadata
 
 
-def _read_driver_origin(driver_name: str, scenario: str) -> tuple[Scenario, Driver, dict[str, Any]]:
-    """Return the road, driver and origin of a driver; a controller's file keeps its own."""
+def _read_driver_origin(
+    driver_name: str, scenario: str, settings: dict[str, Any]
+) -> tuple[Scenario, Driver, dict[str, Any]]:
+    """Return the road, driver and origin of a driver; a controller's file keeps its own, with changed settings."""
     file = None if scenario else controller_path(driver_name)
     if file is not None:
         controller = read_controller(file)
         metadata = {name: controller.manifest[name] for name in PROVENANCE_ENTRIES if name in controller.manifest}
-        road = _read_scenario(file, metadata.get("scenario"))
-        return road, controller.driver, metadata
-    road = example_scenario(scenario or "ring")
-    driver = make_driver(driver_name, road.control_step)
+        road, driver = _read_scenario(file, metadata.get("scenario")), controller.driver
+        if not settings:
+            return road, driver, metadata
+        road = make_scenario(road, settings)
+        metadata["scenario"] = scenario_recipe(road)
+        return road, _without_filter(driver), metadata
+    road = make_scenario(example_scenario(scenario or "ring"), settings)
+    driver = _without_filter(make_driver(driver_name, road.control_step))
     expert = driver.expert if isinstance(driver, ResidualDriver) else driver
     return road, driver, controller_origin(road, expert)
 
