@@ -67,7 +67,7 @@ JAM_AHEAD_TUNED_ON_ALL = (
 """results of `unjam tune all-roads` for three experts (results/tuned.json)"""
 FAMILY_EXPERTS: dict[str, tuple[str, ...]] = {
     "rings": (
-        *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned-ideal", "unjam:ring-jammed-tuned-ideal", "unjam:rings-tuned"),
+        *("pi", "unjam:ring-tuned", "unjam:ring-gap-tuned", "unjam:ring-jammed-tuned-ideal", "unjam:rings-tuned"),
         *("unjam:shared-rings-tuned", "follower-stopper", PI_TUNED_ON_ALL, GAP_PI_TUNED_ON_ALL),
     ),
     "figure-eights": ("unjam:figure-eight-tuned-ideal", "pacer:use_tuned=true", PI_TUNED_ON_ALL),

@@ -87,7 +87,8 @@ ON_RAMP_EFFICIENCY_STEPS = (28_800,)
 STEP_MULTIPLES = (1, 2, 3)
 """multiples of the environment steps that variants without the model use"""
 MODEL_FREE_VARIANTS = {
-    **{each: (f"{each}-few", f"{each}-double", f"{each}-ideal") for each in ("best", "jammed")},
+    "best": ("best-few", "best-double", "best"),
+    "jammed": ("jammed-few", "jammed-double", "jammed-ideal"),
     "eight": ("eight-few", "eight-double", "best-in-batches"),
     "ramp": ("ramp-few",) * len(STEP_MULTIPLES) + ("ramp-small",) * len(STEP_MULTIPLES),
 }

@@ -49,24 +49,30 @@ SEEDS_PER_SIZE = 10
 """test seeds for each length or radius"""
 PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL = "PI, tuned", "gap PI, tuned", "gap PI, tuned on the jammed ring"
 GAP_PI_JAMMED_LONG_LABEL = f"{GAP_PI_JAMMED_LABEL}, double budget"
-GAP_PI_LARGER_LABEL = "gap PI, tuned on this road, larger budget"
-IDEAL_EXPERT_LABEL, IDEAL_RESIDUAL_LABEL = "gap PI, tuned for ideal cars", "residual, trained for ideal cars"
+GAP_PI_RETUNED_LABEL, GAP_PI_IDEAL_LABEL = (
+    "gap PI, tuned for usual cars",
+    "gap PI, tuned on the jammed ring for ideal cars",
+)
+IDEAL_RESIDUAL_LABEL = "residual trained for ideal cars"
 PI_LONG_TUNED = (
     "pi:window=13.31,catch_up_speed=1.193,gap_lower=5.997,gap_upper=58.76,"
     "safe_gap=1.037,safe_gap_rule=closing,time_constant=0.8318,first_command=own-speed"
 )
 """result of `unjam tune ring --expert pi --max-string-gain 0 --steps 12000000` for vehicles that obey at once; that of
-`pi-from-gap` is `unjam:ring-gap-tuned-ideal`"""
+`pi-from-gap` is `unjam:ring-gap-tuned`"""
 GAP_PI_JAMMED_LONG_TUNED = (
     "pi-from-gap:window=23,catch_up_speed=2.916,gap_lower=6,gap_upper=80,safe_gap=2,"
     "time_constant=2.976,fade_time=26,history_factor=0"
 )
 """result of `unjam tune ring-jammed --expert pi-from-gap --max-string-gain 0 --steps 12000000` within the ranges of
 `unjam:ring-jammed-tuned-ideal`, which had half of these steps: results/tuned.json has both commands"""
-GAP_PI_RING_LARGER_TUNED = ""
-GAP_PI_JAMMED_LARGER_TUNED = ""
-"""results of both tunings of `pi-from-gap` for usual cars with 18,000,000 steps, as many as expert and residual
-together had (results/tuned.json)"""
+GAP_PI_RETUNED = (
+    "pi-from-gap:window=9.933,catch_up_speed=0.3504,gap_lower=5.84,gap_upper=30.25,safe_gap=1.177,"
+    "safe_gap_rule=closing,time_constant=9.995,human_time_headway=0.4,human_standstill_gap=2.634,"
+    "fade_time=14.6,history_factor=0.3465"
+)
+"""result of `unjam tune ring --expert pi-from-gap --max-string-gain 0 --steps 12000000` for usual cars: on tuning seeds
+it has the return of `unjam:ring-gap-tuned`, which was tuned for ideal cars"""
 PACER_LONG_TUNED = (
     "pacer:use_tuned=true,gathering_speed=1.96,gathering_gap=0.319,regathering_gap=0.1595,time_constant=0.0966"
 )
@@ -96,17 +102,17 @@ ENVELOPE_SEEDS, RAW_ACTUATION_SEEDS, IMPAIRED_SEEDS = 2, 5, 8
 """test seeds of each driver on each road"""
 CONTROLLER_ROADS: dict[str, str] = {
     "unjam:best": "ring-jammed",
-    **{f"unjam:{name}": "ring" for name in ("ring-best-ideal", "ring-gap-tuned-ideal", "ring-tuned")},
+    **{f"unjam:{name}": "ring" for name in ("ring-best-ideal", "ring-gap-tuned", "ring-tuned")},
     **{f"unjam:{name}": "ring" for name in ("rings-tuned", "shared-rings-tuned")},
     **{f"unjam:{name}-ideal": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
     **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned-ideal")},
 }
 """packaged controllers for closed roads that were tuned or trained for ideal cars, and the road of each"""
 USUAL_CAR_ROADS: dict[str, str] = {
-    **{f"unjam:{name}": "ring" for name in ("ring-best", "ring-gap-tuned")},
+    **{"unjam:ring-best": "ring", "unjam:ring-gap-tuned": "ring"},
     **{f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
 }
-"""those for usual cars"""
+"""those that are evaluated in usual cars"""
 LANE_CONTROLLERS = ("unjam:on-ramp-tuned",)
 RING_CONTROLLERS = tuple(name for name, road in CONTROLLER_ROADS.items() if road != "figure-eight")
 RING_STEPS: dict[str, Any] = {"simulation_step": 0.1, "steps_per_control_step": 1}
@@ -169,49 +175,45 @@ def _limit_leader(ring: Ring) -> Driver:
 
 CEILING: dict[str, DriverSource] = {"speed-limit leader": _limit_leader}
 """a driver that leads all vehicles to the speed limit of the road, which no vehicle can know"""
-RING_SIZES = (220, 230, 240, 250, 260, 270)
+RING_LENGTHS = (220, 230, 240, 250, 260, 270)
 RING_DRIVERS: dict[str, DriverSource] = {
     **{HUMAN_LABEL: "human", "PI": "pi", "PI (paper)": "pi:time_constant=0", PI_TUNED_LABEL: PI_LONG_TUNED},
-    **{GAP_PI_LABEL: "unjam:ring-gap-tuned-ideal", GAP_PI_JAMMED_LABEL: "unjam:ring-jammed-tuned-ideal"},
+    **{GAP_PI_LABEL: "unjam:ring-gap-tuned", GAP_PI_JAMMED_LABEL: "unjam:ring-jammed-tuned-ideal"},
 }
 USUAL_CAR_DRIVERS: dict[str, DriverSource] = {
     **{HUMAN_LABEL: "human", "PI": "pi", "PI (paper)": "pi:time_constant=0"},
     **{GAP_PI_LABEL: "unjam:ring-gap-tuned", GAP_PI_JAMMED_LABEL: "unjam:ring-jammed-tuned"},
 }
-USUAL_CAR_BASELINES = GAP_PI_LABEL, GAP_PI_JAMMED_LABEL, GAP_PI_LARGER_LABEL
 FEASIBLE_ROADS = {
     "ring": EvaluationRoad(
-        sizes=RING_SIZES,
+        sizes=RING_LENGTHS,
         make_scenario=lambda length: Ring(length=(length, length), actuator=INSTANT_ACTUATOR),
         drivers=RING_DRIVERS | CEILING,
         baselines=(PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL),
     ),
     "ring-jammed": EvaluationRoad(
-        sizes=RING_SIZES,
+        sizes=RING_LENGTHS,
         make_scenario=lambda length: Ring(length=(length, length), warmup=LONG_WARM_UP, actuator=INSTANT_ACTUATOR),
         drivers={**RING_DRIVERS, GAP_PI_JAMMED_LONG_LABEL: GAP_PI_JAMMED_LONG_TUNED, **CEILING},
         baselines=(GAP_PI_LABEL, GAP_PI_JAMMED_LABEL, GAP_PI_JAMMED_LONG_LABEL),
     ),
     "ring-usual-car": EvaluationRoad(
-        sizes=RING_SIZES,
+        sizes=RING_LENGTHS,
         make_scenario=lambda length: Ring(length=(length, length)),
         drivers={
-            **{**USUAL_CAR_DRIVERS, GAP_PI_LARGER_LABEL: GAP_PI_RING_LARGER_TUNED},
-            **{IDEAL_EXPERT_LABEL: "unjam:ring-gap-tuned-ideal", IDEAL_RESIDUAL_LABEL: "unjam:ring-best-ideal"},
-            **CEILING,
+            **{**USUAL_CAR_DRIVERS, GAP_PI_RETUNED_LABEL: GAP_PI_RETUNED},
+            **{IDEAL_RESIDUAL_LABEL: "unjam:ring-best-ideal", **CEILING},
         },
-        baselines=USUAL_CAR_BASELINES,
+        baselines=(GAP_PI_LABEL, GAP_PI_RETUNED_LABEL),
     ),
     "ring-jammed-usual-car": EvaluationRoad(
-        sizes=RING_SIZES,
+        sizes=RING_LENGTHS,
         make_scenario=lambda length: Ring(length=(length, length), warmup=LONG_WARM_UP),
         drivers={
-            **{**USUAL_CAR_DRIVERS, GAP_PI_LARGER_LABEL: GAP_PI_JAMMED_LARGER_TUNED},
-            IDEAL_EXPERT_LABEL: "unjam:ring-jammed-tuned-ideal",
-            IDEAL_RESIDUAL_LABEL: "unjam:ring-jammed-best-ideal",
-            **CEILING,
+            **{**USUAL_CAR_DRIVERS, GAP_PI_IDEAL_LABEL: "unjam:ring-jammed-tuned-ideal"},
+            **{IDEAL_RESIDUAL_LABEL: "unjam:ring-jammed-best-ideal", **CEILING},
         },
-        baselines=USUAL_CAR_BASELINES,
+        baselines=(GAP_PI_JAMMED_LABEL, GAP_PI_IDEAL_LABEL),
     ),
     "figure-eight": EvaluationRoad(
         sizes=(32, 33, 34, 35),

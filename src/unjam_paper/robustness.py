@@ -69,7 +69,7 @@ ROAD_CONDITIONS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 ROAD_CONTROLLERS = {
-    "ring": ("unjam:ring-best-ideal", "unjam:ring-gap-tuned-ideal"),
+    "ring": ("unjam:ring-best-ideal", "unjam:ring-gap-tuned"),
     "ring-jammed": ("unjam:ring-jammed-best-ideal", "unjam:ring-jammed-tuned-ideal"),
     "figure-eight": ("unjam:figure-eight-best", "unjam:figure-eight-tuned-ideal"),
 }

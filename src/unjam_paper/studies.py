@@ -96,7 +96,7 @@ STUDIES: dict[str, Study] = {
     ),
     "feasible-ring-ideal": feasible_study(
         "feasible residual compared with tuned experts in ideal cars, on the ring and the jammed ring",
-        {"ring": "best-ideal", "ring-jammed": "jammed-ideal"},
+        {"ring": "best", "ring-jammed": "jammed-ideal"},
         minutes=20.0,
     ),
     "feasible-figure-eight": feasible_study(

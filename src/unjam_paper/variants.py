@@ -9,9 +9,8 @@ STEP_BUDGET, MILLION_STEPS, PAPER_STEP_BUDGET = 300_000, 1_000_000, 4_000_000
 """environment steps of a training; the larger budget where it takes less than an hour; those of the paper"""
 RINGS_EXPERT, SHARED_RINGS_EXPERT = "unjam:rings-tuned", "unjam:shared-rings-tuned"
 """best experts for all rings of the family, and for rings that several CAVs share"""
-RING_IDEAL: dict[str, Any] = {"expert": "unjam:ring-gap-tuned-ideal"}
 JAMMED_IDEAL: dict[str, Any] = {"expert": "unjam:ring-jammed-tuned-ideal"}
-"""changes to `best`, whose experts are tuned for usual cars: experts tuned for vehicles that obey at once"""
+"""change to `best`, whose expert on the jammed ring is tuned for usual cars: the one tuned for ideal cars"""
 ON_RAMP_JAM_AHEAD = (
     "jam-ahead:first_section=3,last_section=4,speed_margin=-1.536,margin_by_penetration=19.83,min_speed=2.568,"
     "max_deceleration=1.106,time_constant=1.681"
@@ -51,7 +50,7 @@ def reduced_step_variants(
     }
 
 
-BEST_VARIANTS = reduced_step_variants("best", 12_000, 756_000, **RING_IDEAL)
+BEST_VARIANTS = reduced_step_variants("best", 12_000, 756_000)
 ROAD_MODEL = BEST_VARIANTS["best-road-model"]
 WRONG_BASES: dict[str, tuple[str, dict[str, Any]]] = {
     "slow": ("other IDM parameters", {"model.humans": {"time_headway": 1.5, "max_acceleration": 2.0}}),
@@ -122,7 +121,6 @@ VARIANTS: dict[str, Variant] = {
     "ours": Variant("unjam residual", "quick", {}),
     "ours-without-model": Variant("unjam residual without model", "quick", {"model.model_ratio": 0.0}),
     "best": Variant("unjam residual, all steps", "best", {}, None),
-    "best-ideal": Variant("unjam residual, all steps", "best", RING_IDEAL, None),
     "jammed-ideal": Variant("unjam residual, all steps", "best", JAMMED_IDEAL, None),
     **BEST_VARIANTS,
     **{
@@ -157,7 +155,7 @@ REFERENCE_DRIVERS: dict[str, str] = {
 }
 """drivers of all roads: label, and name as in `unjam drive`; the last one is the best expert on the merge"""
 TUNED_REFERENCES: dict[str, dict[str, str]] = {
-    "ring": {"tuned PI": "unjam:ring-tuned", "tuned gap PI": "unjam:ring-gap-tuned-ideal"},
+    "ring": {"tuned PI": "unjam:ring-tuned", "tuned gap PI": "unjam:ring-gap-tuned"},
     "ring-jammed": {"tuned gap PI": "unjam:ring-jammed-tuned-ideal"},
     "ring-5": {
         "tuned jam absorber": "jam-absorber:gap_gain=0.2656,speed_gain=0.9472,time_gap=0.7288,"

@@ -11,7 +11,7 @@ from unjam_paper.study import StudyFolder
 
 def test_all_packaged_controllers_for_closed_roads_are_tested() -> None:
     closed = {f"{PACKAGED_PREFIX}{name}" for name in packaged_names() if not name.startswith(("on-ramp", "recorded"))}
-    assert set(feasible.CONTROLLER_ROADS) == closed
+    assert {*feasible.CONTROLLER_ROADS, *feasible.USUAL_CAR_ROADS} == closed
 
 
 def test_rings_have_the_documented_range() -> None:
@@ -34,7 +34,8 @@ def test_without_the_safety_checks_of_sumo_the_safety_filter_is_active() -> None
 @pytest.mark.slow
 def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = "unjam:ring-gap-tuned"
-    monkeypatch.setattr(feasible, "CONTROLLER_ROADS", {one: "ring"})
+    for name in ("CONTROLLER_ROADS", "USUAL_CAR_ROADS"):
+        monkeypatch.setattr(feasible, name, {one: "ring"})
     for name in ("IMPAIRED_DRIVERS", "RING_CONTROLLERS"):
         monkeypatch.setattr(feasible, name, (one,))
     for name in ("ENVELOPE_SEEDS", "RAW_ACTUATION_SEEDS", "IMPAIRED_SEEDS"):
