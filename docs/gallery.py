@@ -17,7 +17,9 @@ def card(name: str) -> str:
         if domain
         else "none: the file has no certificate (unjam certify), nothing is proven of it"
     )
+    stability = {"string stability": found["string_stability"]} if found["string_stability"] else {}
     rows = {
+        **stability,
         "compared with the human baseline": f"{found['compared with the human baseline']}; {found['seeds']} seeds",
         "minimum time gap": f"{found['min_time_gap']:.2f} s",
         "maximum braking": f"{found['max_braking']:.1f} m/s²",

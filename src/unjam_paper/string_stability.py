@@ -16,7 +16,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from optuna.distributions import FloatDistribution
 
-from unjam.controller import make_driver
+from unjam.controller import PACKAGED_PREFIX, make_driver
 from unjam.drivers.registry import driver_from_name
 from unjam.drivers.safety import INSTANT_ACTUATOR, STANDARD_ACTUATOR
 from unjam.measures.feasibility import FEASIBLE
@@ -38,11 +38,11 @@ STRING_ROADS = tuple(OTHER_EXPERT)
 GAIN_LIMITS = {"ring": (1.02, 0.0, 1.1, 1.3), "ring-jammed": (1.02, 0.0, 1.1, 1.3), "figure-eight": (1.02, 0.0)}
 """largest allowed string gains, by road; 0: any"""
 PACKAGED = {
-    "ring": ("unjam:ring-gap-tuned", "unjam:ring-best"),
-    "ring-jammed": ("unjam:ring-jammed-tuned", "unjam:ring-jammed-best"),
-    "figure-eight": ("unjam:figure-eight-tuned", "unjam:figure-eight-best"),
+    "ring": ("ring-tuned", "ring-gap-tuned", "rings-tuned", "shared-rings-tuned", "ring-best-ideal", "ring-best"),
+    "ring-jammed": ("ring-jammed-tuned-ideal", "ring-jammed-best-ideal", "ring-jammed-tuned", "ring-jammed-best"),
+    "figure-eight": ("figure-eight-tuned-ideal", "figure-eight-best", "figure-eight-tuned"),
 }
-"""packaged controllers that were tuned and trained for ideal vehicles, by road"""
+"""packaged controllers, by the road on which they are compared"""
 EXPERT_COLUMNS = "largest gain allowed", "string gain", "set time gap [s]"
 """headings of what a tuned expert has, and human drivers do not"""
 SHOWN_METRICS = ("return", "return", 0), ("mean_speed", "mean speed [m/s]", 2)
@@ -102,7 +102,7 @@ def measure_car(road: str, car: str, workers: int) -> Table:
     rows: Table = []
     with WorkerPool(workers) as pool:
         point = find_operating_points({road: scenario}, pool)[road]
-    for name in ("pi", *PACKAGED[road], "unjam:best"):
+    for name in ("pi", *(f"{PACKAGED_PREFIX}{each}" for each in PACKAGED[road]), "unjam:best"):
         driver = make_driver(name, scenario.control_step)
         gain = None if name == "unjam:best" else point.string_gain(driver)  # it selects its controller on the road
         rows.append({"car": car, "driver": name, "gain": gain, "episodes": measure_episodes(scenario, name, workers)})
