@@ -9,8 +9,11 @@ STEP_BUDGET, MILLION_STEPS, PAPER_STEP_BUDGET = 300_000, 1_000_000, 4_000_000
 """environment steps of a training; the larger budget where it takes less than an hour; those of the paper"""
 RINGS_EXPERT, SHARED_RINGS_EXPERT = "unjam:rings-tuned", "unjam:shared-rings-tuned"
 """best experts for all rings of the family, and for rings that several CAVs share"""
-JAMMED_IDEAL: dict[str, Any] = {"expert": "unjam:ring-jammed-tuned-ideal"}
-"""change to `best`, whose expert on the jammed ring is tuned for usual cars: the one tuned for ideal cars"""
+JAMMED_IDEAL: dict[str, Any] = {
+    "expert": "unjam:ring-jammed-tuned-ideal",
+    **{"policy.exploration_std": 0.013, "trpo.target_kl": 0.0086},
+}
+"""changes to `best`, whose expert and exploration on the jammed ring are those for usual cars: those for ideal cars"""
 ON_RAMP_JAM_AHEAD = (
     "jam-ahead:first_section=3,last_section=4,speed_margin=-1.536,margin_by_penetration=19.83,min_speed=2.568,"
     "max_deceleration=1.106,time_constant=1.681"
@@ -129,7 +132,7 @@ VARIANTS: dict[str, Variant] = {
         )
         for name, (base, changes) in WRONG_BASES.items()
     },
-    **reduced_step_variants("jammed", 24_000, 768_000, **JAMMED_IDEAL),
+    **reduced_step_variants("jammed", 24_000, 768_000, horizon=3000, **JAMMED_IDEAL),
     **reduced_step_variants("eight", 6_000, 612_000, horizon=1500),
     **ON_RAMP_VARIANTS,
     "ramp-road-model": replace(ON_RAMP_VARIANTS["ramp-road-model"], changes=WEAK_EXPERT, steps=28_800),
