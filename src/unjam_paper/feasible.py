@@ -39,6 +39,7 @@ from unjam_paper.study import (
     PlannedRun,
     Study,
     StudyFolder,
+    evaluate_in_batches,
     evaluate_metrics,
     mean_text,
     planned_runs,
@@ -119,10 +120,7 @@ RING_STEPS: dict[str, Any] = {"simulation_step": 0.1, "steps_per_control_step": 
 """those of the rings, which their controllers need on any road"""
 LANE_SECONDS = 900.0
 """duration of an episode on a motorway lane [s]"""
-IMPAIRED_DRIVERS = (
-    "unjam:best",
-    *(f"unjam:{name}-ideal" for name in ("ring-best", "ring-jammed-best", "ring-jammed-tuned")),
-)
+IMPAIRED_DRIVERS = "unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned"
 VEHICLE_SPACINGS = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
 """range of the road length per vehicle [m]"""
 WORST_PART, USUAL_CAR_WORST_PART = "worst", "worst-usual-car"
@@ -136,12 +134,10 @@ LANE_CONDITIONS: dict[str, dict[str, Any]] = {
 """demand on one lane of a motorway without cut-ins"""
 SENSED = ("gap_error", "speed_error")
 IMPAIRMENTS: dict[str, dict[str, Any]] = {
-    "at once, exact": {},
-    "lag 0.2 s": {"actuator": Actuator(lag=0.2)},
-    "lag 0.5 s": {"actuator": Actuator(lag=0.5)},
-    "delay 0.2 s": {"actuator": Actuator(delay=0.2)},
-    "delay 0.5 s": {"actuator": Actuator(delay=0.5)},
-    "lag 0.3 s, delay 0.2 s": {"actuator": Actuator(lag=0.3, delay=0.2)},
+    "usual car, exact sensors": {},
+    "ideal car": {"actuator": INSTANT_ACTUATOR},
+    "delay 0.2 s, lag 0.5 s": {"actuator": Actuator(delay=0.2, lag=0.5)},
+    "delay 0.5 s, lag 0.5 s": {"actuator": Actuator(delay=0.5, lag=0.5)},
     **{
         label: {
             "sensors": Sensors(**dict.fromkeys(SENSED, error)),
@@ -152,7 +148,7 @@ IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "every tenth reading missing": {"sensors": Sensors(dropout=0.1)},
     "every third reading missing": {"sensors": Sensors(dropout=1.0 / 3.0)},
 }
-"""changes to the actuation and the sensors of CAVs"""
+"""changes to the actuation and the sensors of CAVs, which else are usual cars"""
 
 
 @dataclass(frozen=True)
@@ -167,6 +163,7 @@ class EvaluationRoad:
     """labels of the tuned experts to which drivers are compared"""
     metric: str = "return"
     """the return that the trainings maximize"""
+    evaluate: Callable[..., dict[str, Any]] = evaluate_metrics
 
 
 def _limit_leader(ring: Ring) -> Driver:
@@ -205,6 +202,7 @@ FEASIBLE_ROADS = {
             **{IDEAL_RESIDUAL_LABEL: "unjam:ring-best-ideal", **CEILING},
         },
         baselines=(GAP_PI_LABEL, GAP_PI_RETUNED_LABEL),
+        evaluate=evaluate_in_batches,
     ),
     "ring-jammed-usual-car": EvaluationRoad(
         sizes=RING_LENGTHS,
@@ -214,6 +212,7 @@ FEASIBLE_ROADS = {
             **{IDEAL_RESIDUAL_LABEL: "unjam:ring-jammed-best-ideal", **CEILING},
         },
         baselines=(GAP_PI_JAMMED_LABEL, GAP_PI_IDEAL_LABEL),
+        evaluate=evaluate_in_batches,
     ),
     "figure-eight": EvaluationRoad(
         sizes=(32, 33, 34, 35),
@@ -239,7 +238,7 @@ def _feasible_parts(variants: Mapping[str, str], study_folder: StudyFolder, seed
         drivers = road.drivers | {label: study_folder.run_folder(run) for label, run in trained.items()}
         for size in road.sizes:
             arguments = road.make_scenario(size), drivers, SEEDS_PER_SIZE, FEASIBILITY_STUDY_METRICS
-            parts[f"{name}/{size}"] = evaluate_metrics, arguments
+            parts[f"{name}/{size}"] = road.evaluate, arguments
     return parts
 
 
@@ -342,7 +341,7 @@ def envelope_lanes(**changes: Any) -> Iterator[tuple[str, Motorway]]:
 def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
     """Yield the default ring with each impairment, by its name."""
     for name, changes in IMPAIRMENTS.items():
-        yield name, replace(Ring(warmup=warmup, actuator=INSTANT_ACTUATOR), **changes)
+        yield name, replace(Ring(warmup=warmup), **changes)
 
 
 def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
@@ -357,7 +356,6 @@ def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart
         ("rings", envelope_rings(), closed, ENVELOPE_SEEDS),
         ("figure-eights", envelope_figure_eights(), closed, ENVELOPE_SEEDS),
         ("rings-raw", envelope_rings(actuation="raw"), closed, RAW_ACTUATION_SEEDS),
-        ("rings-usual-car", envelope_rings(**usual_cars), tuple(USUAL_CAR_ROADS), ENVELOPE_SEEDS),
         ("rings-raw-usual-car", envelope_rings(actuation="raw", **usual_cars), tuple(USUAL_CAR_ROADS), ENVELOPE_SEEDS),
         ("lanes-raw", envelope_lanes(), LANE_CONTROLLERS, RAW_ACTUATION_SEEDS),
         ("lanes-raw", envelope_lanes(**RING_STEPS), RING_CONTROLLERS, RAW_ACTUATION_SEEDS),
@@ -442,7 +440,8 @@ ENVELOPE = Study(
     minutes=30.0,
     tables={
         **{part: partial(worst_table, part) for part in (WORST_PART, USUAL_CAR_WORST_PART)},
-        **{part: partial(domain_table, part) for part in ("rings", "rings-usual-car", "figure-eights")},
+        **{part: partial(domain_table, part) for part in ("rings", "figure-eights")},
+        "rings-usual-car": partial(domain_table, "rings-raw-usual-car"),
         **{part: partial(contact_table, part) for part in ("rings-raw", "rings-raw-usual-car", "lanes-raw")},
         **{part: partial(impaired_table, part) for part in ("impaired", "impaired-jammed")},
     },

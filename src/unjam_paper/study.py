@@ -28,6 +28,7 @@ from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import TRAINED_LABEL, evaluate, raise_failure, raise_failures
 from unjam.training.run_folder import read_config
+from unjam.worlds.batch.run import run_batches
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 from unjam_paper.results_file import CONTROLLERS, StudyPart, measure_parts, write_figure, write_part
@@ -223,21 +224,39 @@ def evaluate_drivers(
     scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, workers: int
 ) -> dict[str, Table]:
     """Return the rows of drivers on the same test seeds, by label."""
-    made = {
+    with WorkerPool(workers) as pool:
+        evaluation = evaluate(scenario, _make_drivers(scenario, drivers), held_out_seeds(seeds), pool)
+    raise_failures(evaluation)
+    return evaluation.rows
+
+
+def _make_drivers(scenario: Scenario, drivers: Mapping[str, DriverSource]) -> dict[str, Driver]:
+    return {
         label: source(scenario) if callable(source) else make_driver(str(source), scenario.control_step)
         for label, source in drivers.items()
     }
-    with WorkerPool(workers) as pool:
-        evaluation = evaluate(scenario, made, held_out_seeds(seeds), pool)
-    raise_failures(evaluation)
-    return evaluation.rows
 
 
 def evaluate_metrics(
     scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, metrics: Sequence[str], workers: int
 ) -> dict[str, Any]:
     """Return the verdict on each driver, relative to `human`, and these metrics of its episodes on test seeds."""
-    rows = evaluate_drivers(scenario, drivers, seeds, workers)
+    return _metrics_of(evaluate_drivers(scenario, drivers, seeds, workers), metrics)
+
+
+def evaluate_in_batches(
+    scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, metrics: Sequence[str], workers: int
+) -> dict[str, Any]:
+    """Return what `evaluate_metrics` does, without fuel, from batches, whose episodes equal those of SUMO."""
+    test_seeds = held_out_seeds(seeds)
+    rows = {
+        label: [*map(measure, run_batches([EpisodeTask(scenario, driver, seed) for seed in test_seeds]))]
+        for label, driver in _make_drivers(scenario, drivers).items()
+    }
+    return _metrics_of(rows, metrics)
+
+
+def _metrics_of(rows: dict[str, Table], metrics: Sequence[str]) -> dict[str, Any]:
     verdicts = feasibility_by_driver(rows)
     return {
         label: {"feasibility": verdicts[label], "episodes": [{name: row[name] for name in metrics} for row in own]}

@@ -1,0 +1,54 @@
+"""The table of packaged controllers for closed roads, made from results/string-stability.json."""
+
+from typing import Any
+
+import pandas as pd
+from tables import results_part, show
+
+from unjam.controller.string_stability import GAIN_TOLERANCE
+from unjam.measures.feasibility import FEASIBLE
+from unjam.measures.metric_table import estimate_cell
+from unjam.measures.statistics import paired_difference
+
+REASONS = {
+    "ring-best": "the largest return from a standstill",
+    "ring-best-ideal": "the same for ideal cars, the ablation",
+    "ring-gap-tuned": "the largest return of a formula from a standstill",
+    "ring-tuned": "dissolves waves by a formula of few parameters",
+    "rings-tuned": "for many rings, the expert of `unjam:best`",
+    "shared-rings-tuned": "for rings that several CAVs share, the expert of `unjam:best`",
+    "ring-jammed-best": "the largest return in a developed wave",
+    "ring-jammed-best-ideal": "the same for ideal cars, the ablation",
+    "ring-jammed-tuned": "the largest return of a formula in a developed wave",
+    "ring-jammed-tuned-ideal": "the same for ideal cars, the ablation",
+    "figure-eight-best": "the fastest figure eight; trained for ideal cars",
+    "figure-eight-tuned": "the largest return of a formula by Eq. 16",
+    "figure-eight-tuned-ideal": "the same for ideal cars, the ablation",
+}
+"""why a controller that is not string stable is part of the package"""
+
+
+def packaged_table() -> str:
+    """Return for each controller in a usual car its road, string gain, speed, feasibility, and why it ships."""
+    rows: list[dict[str, Any]] = []
+    for road in ("ring", "ring-jammed", "figure-eight"):
+        measured = [row for row in results_part(f"string-stability/packaged-{road}") if row["car"] == "usual"]
+        human = next(row["episodes"] for row in results_part(f"string-stability/{road}") if row["expert"] == "human")
+        for row in measured:
+            name = row["driver"].removeprefix("unjam:")
+            if name not in REASONS:
+                continue
+            feasible = sum(each["feasibility"] == FEASIBLE for each in row["episodes"])
+            difference = paired_difference(row["episodes"], human, "mean_speed")
+            rows.append(
+                {
+                    "unjam:": name,
+                    "measured on": road,
+                    "string stable": "yes" if row["gain"] <= 1.0 + GAIN_TOLERANCE else "no",
+                    "string gain": f"{row['gain']:.2f}",
+                    "mean speed [m/s], difference to human": str(estimate_cell(difference, 2, sign="+")),
+                    "feasible": f"{feasible} of {len(row['episodes'])}",
+                    "why it ships": REASONS[name],
+                }
+            )
+    return show(pd.DataFrame(rows))
