@@ -7,7 +7,6 @@ from unjam.controller import packaged_file
 from unjam.controller.domain import controller_notes, outside_domain_share, road_description, road_mismatch
 from unjam.controller.file import read_controller
 from unjam.drivers import LocalState
-from unjam.road_family import IDEAL_VEHICLES
 from unjam.scenarios import Ring, Scenario, make_scenario, scenario_recipe
 
 TRAINED = {"scenario": scenario_recipe(Ring())}
@@ -46,7 +45,7 @@ def test_states_outside_of_the_certified_domain_are_counted() -> None:
 
 
 def test_controllers_on_another_road_and_models_without_their_control_step_get_a_note() -> None:
-    road = scenario_recipe(make_scenario("figure-eight", IDEAL_VEHICLES))
+    road = scenario_recipe(make_scenario("figure-eight"))
     names = ["pi", "human", "unjam:figure-eight-tuned", "unjam:ring-tuned", "ppo.zip"]
     assert controller_notes(road, names, {}) == [
         "unjam:ring-tuned was tuned on the ring road, not on the figure-eight road",

@@ -27,7 +27,15 @@ from unjam_paper.comparison import comparison_study
 from unjam_paper.reproduce import drive_references, estimated_seconds, find_studies, make_plan, run_plan
 from unjam_paper.results_file import read_parts
 from unjam_paper.studies import STUDIES, STUDY_GROUPS
-from unjam_paper.study import STUDY_ROADS, DriverSource, PlannedRun, Study, StudyFolder, evaluate_metrics
+from unjam_paper.study import (
+    STUDY_ROADS,
+    DriverSource,
+    PlannedRun,
+    Study,
+    StudyFolder,
+    evaluate_in_batches,
+    evaluate_metrics,
+)
 from unjam_paper.variants import TUNED_REFERENCES, VARIANTS
 
 Made = tuple[Path, list[str]]
@@ -84,7 +92,7 @@ def test_drivers_of_every_study_can_drive_its_roads(name: str, tmp_path: Path) -
         if function is measure_road:
             _, road, experts, drivers, _, _ = arguments
             scenario, sources = make_scenario(road.scenario, road.options), [*experts, *drivers.values()]
-        elif function is evaluate_metrics:
+        elif function in (evaluate_metrics, evaluate_in_batches):
             scenario, sources = arguments[0], [*arguments[1].values()]
         else:
             continue

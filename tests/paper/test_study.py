@@ -14,7 +14,7 @@ from unjam.scenarios import Ring
 from unjam.training.evaluate import Evaluation
 from unjam_paper import results_file, study
 from unjam_paper.results_file import StudyPart, measure_parts
-from unjam_paper.study import evaluate_metrics, write_manifest
+from unjam_paper.study import evaluate_in_batches, evaluate_metrics, write_manifest
 
 MEASURED: list[object] = []
 """arguments of the functions below, in calls of this process"""
@@ -151,3 +151,16 @@ def test_a_failed_episode_raises_instead_of_being_left_out(monkeypatch: pytest.M
     monkeypatch.setattr(study, "evaluate", lambda *given: Evaluation({"pi": [failed]}, {}))
     with pytest.raises(EpisodeError, match=r"SUMO cannot start \(seed \[1, 0\]\)"):
         evaluate_metrics(Ring(), {}, 1, (), 1)
+
+
+def test_batches_have_the_metrics_of_sumo_except_fuel() -> None:
+    road = Ring(vehicles=8, length=(85, 85), warmup=100, horizon=200)
+    metrics = ("seed", "return", "mean_speed", "outflow_veh_per_h", "min_time_gap", "cav_max_braking", "steps")
+    given = road, {"human": "human", "pi": "pi", "gap PI": "unjam:ring-gap-tuned"}, 2, metrics, 1
+    in_batches, in_sumo = evaluate_in_batches(*given), evaluate_metrics(*given)
+    assert in_batches.keys() == in_sumo.keys()
+    for label, measured in in_sumo.items():
+        assert in_batches[label]["feasibility"] == measured["feasibility"]
+        for found, expected in zip(in_batches[label]["episodes"], measured["episodes"], strict=True):
+            assert found.pop("seed") == expected.pop("seed")
+            assert found == pytest.approx(expected, rel=1e-6, nan_ok=True)

@@ -118,13 +118,15 @@ def certify_command(
 
     certificate = make_certificate(controller)
     assert isinstance(controller.driver, FilteredDriver)  # only such drivers are certified
-    write_certificate_page(file.name, controller.driver, certificate, target)  # may be refused: before the file changes
+    verdict = describe_string_stability(certificate, controller.driver)
+    # The page may be refused: before the file changes.
+    write_certificate_page(file.name, controller.driver, certificate, verdict, target)
     if not is_packaged:
         add_certificate(file, controller, certificate)
     if json:
         print_json({"file": str(file), "page": str(target), "certificate": certificate})
         return
-    console.print(describe_string_stability(certificate, controller.driver))
+    console.print(verdict)
     for each in certificate["string_stability"]:
         console.print(f"  at {each['speed']:g} m/s: gain {max(each['gains']):.2f} at {each['peak_frequency']:.3g} Hz")
     console.print(describe_worst_cases(certificate, controller.driver))

@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from unjam.controller.certificate import describe_string_stability
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.files import atomic_write
 from unjam.reports.figures import CAV_PLOT_COLOR, LINE_COLORS, MUTED_COLOR, PLOT_STYLE, data_uri, new_figure
@@ -16,8 +15,10 @@ from unjam.reports.html import render_template
 DOMAIN_QUANTITIES = (("own speed", "speed", "m/s"), ("leader speed", "leader_speed", "m/s"), ("gap", "leader_gap", "m"))
 
 
-def write_certificate_page(name: str, driver: FilteredDriver, certificate: dict[str, Any], target: Path) -> None:
-    """Write the page of a controller; `certificate` is that of its file."""
+def write_certificate_page(
+    name: str, driver: FilteredDriver, certificate: dict[str, Any], verdict: str, target: Path
+) -> None:
+    """Write the page of a controller, with the verdict on its string stability first."""
     worst, strings, comfort = (certificate[key] for key in ("worst_cases", "string_stability", "comfort"))
     cards = [
         ("Min gap", f"{worst['min_gap']:.2f} m", "in all tests"),
@@ -31,7 +32,7 @@ def write_certificate_page(name: str, driver: FilteredDriver, certificate: dict[
         driver=driver.describe(),
         worst_cases=worst,
         cards=cards,
-        verdict=describe_string_stability(certificate, driver),
+        verdict=verdict,
         notes=_certificate_notes(certificate),
         safety=driver.safety,
         step=f"{driver.time_step:g}",
