@@ -1,37 +1,32 @@
-"""Feasible controllers: their gain over tuned experts, and their feasibility far from their training roads.
+"""Feasible controllers: their gain over tuned experts, on closed roads of every size and on the on-ramp.
 
-Residuals are compared with tuned experts on the same test seeds, on closed roads of every size and on the on-ramp. The
-study `envelope` takes packaged controllers to other sizes, roads without SUMO's safety checks, and impaired vehicles.
+Residuals are compared with tuned experts on the same test seeds.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from unjam.controller.certificate import make_certificate
-from unjam.controller.file import SUFFIX, read_controller
 from unjam.drivers.car_following import FollowerStopper
 from unjam.drivers.driver import Driver
-from unjam.drivers.safety import INSTANT_ACTUATOR, STANDARD_ACTUATOR, Actuator, SafetyFilter
-from unjam.drivers.sensors import Sensors
+from unjam.drivers.safety import INSTANT_ACTUATOR
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.physics.arrays import Floats
 from unjam.road_family import LONG_WARM_UP
 from unjam.scenarios.figure_eight import FigureEight
-from unjam.scenarios.motorway import ON_RAMP, Motorway, Ramp
+from unjam.scenarios.motorway import ON_RAMP
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
-from unjam.training.export import export_controller
 from unjam.training.presets import preset_values
 from unjam_paper.results_file import StudyPart, read_part
+from unjam_paper.string_stability import measure_string_gains
 from unjam_paper.study import (
     NO_VALUE_TEXT,
     DriverComparison,
@@ -41,11 +36,12 @@ from unjam_paper.study import (
     StudyFolder,
     evaluate_in_batches,
     evaluate_metrics,
-    mean_text,
     planned_runs,
 )
 from unjam_paper.variants import ON_RAMP_JAM_AHEAD
 
+GAINS_SUFFIX = "-string-gains"
+"""suffix of the part with the string gains of drivers on a road"""
 SEEDS_PER_SIZE = 10
 """test seeds for each length or radius"""
 PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL = "PI, tuned", "gap PI, tuned", "gap PI, tuned on the jammed ring"
@@ -99,56 +95,6 @@ ON_RAMP_METRICS = (
     *(ON_RAMP_TIME, ON_RAMP_FLOW, "human_braking_beyond_4_5", "mean_speed", "fuel_ml_per_km"),
     *("feasibility", "min_time_gap", "cav_max_braking"),
 )
-ENVELOPE_SEEDS, RAW_ACTUATION_SEEDS, IMPAIRED_SEEDS = 2, 5, 8
-"""test seeds of each driver on each road"""
-CONTROLLER_ROADS: dict[str, str] = {
-    "unjam:best": "ring-jammed",
-    **{f"unjam:{name}": "ring" for name in ("ring-best-ideal", "ring-gap-tuned", "ring-tuned")},
-    **{f"unjam:{name}": "ring" for name in ("rings-tuned", "shared-rings-tuned")},
-    **{f"unjam:{name}-ideal": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
-    **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned-ideal")},
-}
-"""packaged controllers for closed roads that were tuned or trained for ideal cars, and the road of each"""
-USUAL_CAR_ROADS: dict[str, str] = {
-    **{"unjam:ring-best": "ring", "unjam:ring-gap-tuned": "ring"},
-    **{f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
-}
-"""those that are evaluated in usual cars"""
-LANE_CONTROLLERS = ("unjam:on-ramp-tuned",)
-RING_CONTROLLERS = tuple(name for name, road in CONTROLLER_ROADS.items() if road != "figure-eight")
-RING_STEPS: dict[str, Any] = {"simulation_step": 0.1, "steps_per_control_step": 1}
-"""those of the rings, which their controllers need on any road"""
-LANE_SECONDS = 900.0
-"""duration of an episode on a motorway lane [s]"""
-IMPAIRED_DRIVERS = "unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned"
-VEHICLE_SPACINGS = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
-"""range of the road length per vehicle [m]"""
-WORST_PART, USUAL_CAR_WORST_PART = "worst", "worst-usual-car"
-"""parts with the worst cases of the certificates"""
-ENVELOPE_METRICS = ("return", "mean_speed", "min_time_gap", "cav_max_braking", "steps", "collisions")
-LANE_CONDITIONS: dict[str, dict[str, Any]] = {
-    "a free lane": {"inflow": 1200.0, "off_peak_inflow": 1200.0},
-    "a full lane": {"inflow": 2400.0, "off_peak_inflow": 2000.0},
-    "a full lane, half of all automated": {"inflow": 2400.0, "off_peak_inflow": 2000.0, "penetration_rate": 0.5},
-}
-"""demand on one lane of a motorway without cut-ins"""
-SENSED = ("gap_error", "speed_error")
-IMPAIRMENTS: dict[str, dict[str, Any]] = {
-    "usual car, exact sensors": {},
-    "ideal car": {"actuator": INSTANT_ACTUATOR},
-    "delay 0.2 s, lag 0.5 s": {"actuator": Actuator(delay=0.2, lag=0.5)},
-    "delay 0.5 s, lag 0.5 s": {"actuator": Actuator(delay=0.5, lag=0.5)},
-    **{
-        label: {
-            "sensors": Sensors(**dict.fromkeys(SENSED, error)),
-            "safety": SafetyFilter(**dict.fromkeys(SENSED, error)),
-        }
-        for label, error in {"gap and speed off by up to 0.3": 0.3, "off by up to 1.0": 1.0}.items()
-    },
-    "every tenth reading missing": {"sensors": Sensors(dropout=0.1)},
-    "every third reading missing": {"sensors": Sensors(dropout=1.0 / 3.0)},
-}
-"""changes to the actuation and the sensors of CAVs, which else are usual cars"""
 
 
 @dataclass(frozen=True)
@@ -164,6 +110,8 @@ class EvaluationRoad:
     metric: str = "return"
     """the return that the trainings maximize"""
     evaluate: Callable[..., dict[str, Any]] = evaluate_metrics
+    gain_road: str = ""
+    """scenario on which string gains are measured; empty: they are not"""
 
 
 def _limit_leader(ring: Ring) -> Driver:
@@ -203,6 +151,7 @@ FEASIBLE_ROADS = {
         },
         baselines=(GAP_PI_LABEL, GAP_PI_RETUNED_LABEL),
         evaluate=evaluate_in_batches,
+        gain_road="ring",
     ),
     "ring-jammed-usual-car": EvaluationRoad(
         sizes=RING_LENGTHS,
@@ -213,6 +162,7 @@ FEASIBLE_ROADS = {
         },
         baselines=(GAP_PI_JAMMED_LABEL, GAP_PI_IDEAL_LABEL),
         evaluate=evaluate_in_batches,
+        gain_road="ring-jammed",
     ),
     "figure-eight": EvaluationRoad(
         sizes=(32, 33, 34, 35),
@@ -239,12 +189,16 @@ def _feasible_parts(variants: Mapping[str, str], study_folder: StudyFolder, seed
         for size in road.sizes:
             arguments = road.make_scenario(size), drivers, SEEDS_PER_SIZE, FEASIBILITY_STUDY_METRICS
             parts[f"{name}/{size}"] = road.evaluate, arguments
+        if road.gain_road:
+            measured = {label: source for label, source in drivers.items() if label not in (HUMAN_LABEL, *CEILING)}
+            parts[f"{name}{GAINS_SUFFIX}"] = measure_string_gains, (road.gain_road, measured)
     return parts
 
 
 def feasible_table(road: str, folder: Path) -> pd.DataFrame:
     """Return for each driver the metrics over all sizes, and the differences to the tuned experts."""
     comparison, about = DriverComparison([*read_part(folder, road).values()]), FEASIBLE_ROADS[road]
+    gains: dict[str, float] = read_part(folder, f"{road}{GAINS_SUFFIX}") if about.gain_road else {}
     rows = []
     for label, group in comparison.groups({"training": "residual"}).items():
         row = {"driver": label, "return": comparison.mean(group, about.metric, 0)}
@@ -256,6 +210,12 @@ def feasible_table(road: str, folder: Path) -> pd.DataFrame:
         row["fuel [ml/km]"] = comparison.mean(group, "fuel_ml_per_km", 0)
         row["dissolved after [s]"] = _dissolution_text(comparison.values(group, "time_to_dissolve"))
         row["min time gap [s]"] = comparison.min_time_gap(group)
+        own_gains = [gains[each] for each in group if each in gains]
+        row["string gain"] = (
+            " to ".join(f"{gain:.2f}" for gain in sorted({min(own_gains), max(own_gains)}))
+            if own_gains
+            else NO_VALUE_TEXT
+        )
         rows.append({**row, "feasible": comparison.feasibility(group)})
     table = pd.DataFrame(rows)
     return table.loc[:, (table != NO_VALUE_TEXT).any()]
@@ -312,137 +272,3 @@ def _on_ramp_table(variants: Mapping[str, str], folder: Path) -> pd.DataFrame:
         several = f"{comparison.verdicts(group).count(FEASIBLE)} of {len(group)}"
         rows.append({**row, "feasible": comparison.feasibility(group) if len(group) == 1 else several})
     return pd.DataFrame(rows)
-
-
-def envelope_rings(**changes: Any) -> Iterator[tuple[str, Ring]]:
-    """Yield the rings by name, with changes to all of them."""
-    each = product((5, 11, 22, 44), (1, 2, 3), VEHICLE_SPACINGS.items(), (0, LONG_WARM_UP))
-    for vehicles, cavs, (words, (low, high)), warmup in each:
-        name = f"{vehicles} vehicles, {cavs} automated, {words}{', jammed' if warmup else ''}"
-        length = low * vehicles, high * vehicles
-        size: dict[str, Any] = {"vehicles": vehicles, "cavs": cavs, "length": length, "warmup": warmup}
-        yield name, Ring(**{"actuator": INSTANT_ACTUATOR, **size, **changes})
-
-
-def envelope_figure_eights() -> Iterator[tuple[str, FigureEight]]:
-    """Yield the figure eights by name."""
-    for low, high in ((27, 29), (30, 31), (32, 35), (36, 40), (41, 50)):
-        yield f"radius {low} to {high} m", FigureEight(radius=(low, high), actuator=INSTANT_ACTUATOR)
-
-
-def envelope_lanes(**changes: Any) -> Iterator[tuple[str, Motorway]]:
-    """Yield motorway lanes by name on which the safety filter is active and the checks of SUMO are not."""
-    lane = Motorway(lanes=1, ramps=(Ramp(position=2000.0, inflow=0.0, off_peak_inflow=0.0),), **changes)
-    lane = replace(lane, horizon=round(LANE_SECONDS / lane.control_step), actuation="raw", safety=SafetyFilter())
-    for name, demand in LANE_CONDITIONS.items():
-        yield f"{name}, control step {lane.control_step:g} s", replace(lane, **demand)
-
-
-def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
-    """Yield the default ring with each impairment, by its name."""
-    for name, changes in IMPAIRMENTS.items():
-        yield name, replace(Ring(warmup=warmup), **changes)
-
-
-def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
-    """Return the parts of the study `envelope`."""
-    closed, parts = tuple(CONTROLLER_ROADS), dict[str, StudyPart]()
-    for part, road_by_driver in ((WORST_PART, CONTROLLER_ROADS), (USUAL_CAR_WORST_PART, USUAL_CAR_ROADS)):
-        actuator = INSTANT_ACTUATOR if part == WORST_PART else STANDARD_ACTUATOR
-        for driver, road in road_by_driver.items():
-            parts[f"{part}/{driver}"] = _certify_worst_cases, (driver, road, actuator)
-    usual_cars: dict[str, Any] = {"actuator": STANDARD_ACTUATOR}
-    tests: tuple[tuple[str, Iterator[tuple[str, Scenario]], tuple[str, ...], int], ...] = (
-        ("rings", envelope_rings(), closed, ENVELOPE_SEEDS),
-        ("figure-eights", envelope_figure_eights(), closed, ENVELOPE_SEEDS),
-        ("rings-raw", envelope_rings(actuation="raw"), closed, RAW_ACTUATION_SEEDS),
-        ("rings-raw-usual-car", envelope_rings(actuation="raw", **usual_cars), tuple(USUAL_CAR_ROADS), ENVELOPE_SEEDS),
-        ("lanes-raw", envelope_lanes(), LANE_CONTROLLERS, RAW_ACTUATION_SEEDS),
-        ("lanes-raw", envelope_lanes(**RING_STEPS), RING_CONTROLLERS, RAW_ACTUATION_SEEDS),
-        ("impaired", impaired_rings(0), IMPAIRED_DRIVERS, IMPAIRED_SEEDS),
-        ("impaired-jammed", impaired_rings(LONG_WARM_UP), IMPAIRED_DRIVERS, IMPAIRED_SEEDS),
-    )
-    for part, roads, controllers, count in tests:
-        drivers = {driver: driver for driver in (HUMAN_LABEL, *controllers)}
-        for name, scenario in roads:
-            parts[f"{part}/{name}"] = evaluate_metrics, (scenario, drivers, count, ENVELOPE_METRICS)
-    return parts
-
-
-def _certify_worst_cases(controller: str, road: str, actuator: Actuator, workers: int) -> dict[str, Any]:
-    with TemporaryDirectory() as folder:
-        file = Path(folder, f"controller{SUFFIX}")
-        export_controller(controller, file, scenario=road, settings={"actuator": asdict(actuator)})
-        return make_certificate(read_controller(file))["worst_cases"]
-
-
-def worst_table(part: str, folder: Path) -> pd.DataFrame:
-    """Return how close each controller came to leaders that brake to a stop and to leaders found by a search."""
-    rows: list[dict[str, Any]] = []
-    for controller, worst in read_part(folder, part).items():
-        road = {**CONTROLLER_ROADS, **USUAL_CAR_ROADS}[controller]
-        row = {"controller": controller, "road": road, "stops": f"{worst['leader_stops']:,}"}
-        row |= {"steps": f"{worst['steps']:,}", "contacts": worst["contacts"], "min gap [m]": f"{worst['min_gap']:.2f}"}
-        row["min time gap [s]"] = f"{worst['min_time_gap']:.2f}"
-        rows.append({**row, "max braking [m/s²]": f"{worst['max_braking']:.1f}"})
-    return pd.DataFrame(rows)
-
-
-def domain_table(part: str, folder: Path) -> pd.DataFrame:
-    """Return on how many roads each controller is feasible, and its gain in speed in the mean and on the worst road."""
-    roads, rows = read_part(folder, part), []
-    comparison = DriverComparison([*roads.values()])
-    for driver in (driver for driver in comparison.roads[0] if driver != HUMAN_LABEL):
-        speeds = (comparison.values([label], "mean_speed").mean((1, 2)) for label in (driver, HUMAN_LABEL))
-        gains = np.subtract(*speeds)
-        least = int(np.argmin(gains))
-        feasible = f"{comparison.verdicts([driver]).count(FEASIBLE)} of {len(roads)} roads"
-        row = {"controller": driver, "feasible on": feasible, **_safety_cells(comparison, driver)}
-        row["mean difference to human baseline [m/s]"] = f"{gains.mean():+.2f}"
-        rows.append({**row, "smallest difference [m/s]": f"{gains[least]:+.2f} ({list(roads)[least]})"})
-    return pd.DataFrame(rows)
-
-
-def contact_table(part: str, folder: Path) -> pd.DataFrame:
-    """Return the contacts and the smallest time gap of each controller where SUMO's safety checks are off."""
-    roads = [*read_part(folder, part).values()]
-    rows = []
-    for driver in dict.fromkeys(label for road in roads for label in road if label != HUMAN_LABEL):
-        comparison = DriverComparison([road for road in roads if driver in road])
-        steps, contacts = (comparison.values([driver], name) for name in ("steps", "collisions"))
-        row = {"controller": driver, "episodes": steps.size, "control steps": f"{steps.sum():,.0f}"}
-        rows.append(row | {"in contact": int(contacts.sum()), **_safety_cells(comparison, driver)})
-    return pd.DataFrame(rows)
-
-
-def _safety_cells(comparison: DriverComparison, driver: str) -> dict[str, str]:
-    max_braking = comparison.values([driver], "cav_max_braking").max()
-    return {"min time gap [s]": comparison.min_time_gap([driver]), "max braking [m/s²]": f"{max_braking:.1f}"}
-
-
-def impaired_table(part: str, folder: Path) -> pd.DataFrame:
-    """Return the return of each controller with impaired vehicles, its minimum time gap, and why it is infeasible."""
-    rows: list[dict[str, Any]] = []
-    for name, results in read_part(folder, part).items():
-        comparison, row = DriverComparison([results]), {"impairment": name}
-        for driver in results:
-            row[driver] = mean_text(comparison.values([driver], "return"), 0)
-            time_gap, verdict = comparison.min_time_gap([driver]), comparison.feasibility([driver])
-            if driver != HUMAN_LABEL and time_gap != NO_VALUE_TEXT:
-                row[driver] += f"; {time_gap} s" + ("" if verdict == "yes" else f", {verdict}")
-        rows.append(row)
-    return pd.DataFrame(rows)
-
-
-ENVELOPE = Study(
-    title="feasibility of packaged controllers far from their training roads, with actuation delay and sensor errors",
-    make_parts=envelope_parts,
-    minutes=30.0,
-    tables={
-        **{part: partial(worst_table, part) for part in (WORST_PART, USUAL_CAR_WORST_PART)},
-        **{part: partial(domain_table, part) for part in ("rings", "figure-eights")},
-        "rings-usual-car": partial(domain_table, "rings-raw-usual-car"),
-        **{part: partial(contact_table, part) for part in ("rings-raw", "rings-raw-usual-car", "lanes-raw")},
-        **{part: partial(impaired_table, part) for part in ("impaired", "impaired-jammed")},
-    },
-)

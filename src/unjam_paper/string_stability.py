@@ -30,7 +30,7 @@ from unjam.training.string_limit import MAX_STRING_GAIN, find_operating_points
 from unjam.training.tune import tune
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, Table, evaluate_drivers
+from unjam_paper.study import NO_VALUE_TEXT, DriverSource, Study, Table, evaluate_drivers, make_drivers
 
 OTHER_EXPERT = {"ring": "pi-from-gap", "ring-jammed": "pi-from-gap", "figure-eight": "pacer"}
 """expert that is tuned without a limit, by road"""
@@ -107,6 +107,14 @@ def measure_car(road: str, car: str, workers: int) -> Table:
         gain = None if name == "unjam:best" else point.string_gain(driver)  # it selects its controller on the road
         rows.append({"car": car, "driver": name, "gain": gain, "episodes": measure_episodes(scenario, name, workers)})
     return rows
+
+
+def measure_string_gains(road: str, drivers: Mapping[str, DriverSource], workers: int) -> dict[str, float]:
+    """Return the string gains of drivers in usual cars on a closed road, by label."""
+    scenario = closed_road(road)
+    with WorkerPool(workers) as pool:
+        point = find_operating_points({road: scenario}, pool)[road]
+    return {label: point.string_gain(made) for label, made in make_drivers(scenario, drivers).items()}
 
 
 def car_table(road: str, folder: Path) -> pd.DataFrame:

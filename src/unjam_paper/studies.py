@@ -14,7 +14,8 @@ from unjam_paper.all_roads import (
 from unjam_paper.assess_examples import ASSESS_EXAMPLES
 from unjam_paper.comparison import FIGURE_5, comparison_study, paper_exact_study, road_model_study
 from unjam_paper.do_no_harm import DO_NO_HARM
-from unjam_paper.feasible import ENVELOPE, feasible_study, on_ramp_study
+from unjam_paper.envelope import ENVELOPE
+from unjam_paper.feasible import feasible_study, on_ramp_study
 from unjam_paper.figure_6 import FIGURE_6
 from unjam_paper.fuel import FUEL
 from unjam_paper.human_traffic import HUMAN_TRAFFIC_STUDY

@@ -225,12 +225,13 @@ def evaluate_drivers(
 ) -> dict[str, Table]:
     """Return the rows of drivers on the same test seeds, by label."""
     with WorkerPool(workers) as pool:
-        evaluation = evaluate(scenario, _make_drivers(scenario, drivers), held_out_seeds(seeds), pool)
+        evaluation = evaluate(scenario, make_drivers(scenario, drivers), held_out_seeds(seeds), pool)
     raise_failures(evaluation)
     return evaluation.rows
 
 
-def _make_drivers(scenario: Scenario, drivers: Mapping[str, DriverSource]) -> dict[str, Driver]:
+def make_drivers(scenario: Scenario, drivers: Mapping[str, DriverSource]) -> dict[str, Driver]:
+    """Return the drivers for a scenario, by label."""
     return {
         label: source(scenario) if callable(source) else make_driver(str(source), scenario.control_step)
         for label, source in drivers.items()
@@ -251,7 +252,7 @@ def evaluate_in_batches(
     test_seeds = held_out_seeds(seeds)
     rows = {
         label: [*map(measure, run_batches([EpisodeTask(scenario, driver, seed) for seed in test_seeds]))]
-        for label, driver in _make_drivers(scenario, drivers).items()
+        for label, driver in make_drivers(scenario, drivers).items()
     }
     return _metrics_of(rows, metrics)
 

@@ -4,18 +4,18 @@ import pytest
 
 from unjam.controller import PACKAGED_PREFIX, certificate, packaged_names, string_stability
 from unjam.scenarios import Ring
-from unjam_paper import feasible
-from unjam_paper.feasible import ENVELOPE
+from unjam_paper import envelope
+from unjam_paper.envelope import ENVELOPE
 from unjam_paper.study import StudyFolder
 
 
 def test_all_packaged_controllers_for_closed_roads_are_tested() -> None:
     closed = {f"{PACKAGED_PREFIX}{name}" for name in packaged_names() if not name.startswith(("on-ramp", "recorded"))}
-    assert {*feasible.CONTROLLER_ROADS, *feasible.USUAL_CAR_ROADS} == closed
+    assert {*envelope.CONTROLLER_ROADS, *envelope.USUAL_CAR_ROADS} == closed
 
 
 def test_rings_have_the_documented_range() -> None:
-    rings = [ring for _, ring in feasible.envelope_rings()]
+    rings = [ring for _, ring in envelope.envelope_rings()]
     assert {ring.vehicles for ring in rings} == {5, 11, 22, 44}
     assert {ring.cavs for ring in rings} == {1, 2, 3}
     assert {ring.warmup > 0 for ring in rings} == {True, False}
@@ -24,8 +24,8 @@ def test_rings_have_the_documented_range() -> None:
 
 
 def test_without_the_safety_checks_of_sumo_the_safety_filter_is_active() -> None:
-    lanes = feasible.envelope_lanes(), feasible.envelope_lanes(**feasible.RING_STEPS)
-    for roads in (feasible.envelope_rings(actuation="raw"), *lanes):
+    lanes = envelope.envelope_lanes(), envelope.envelope_lanes(**envelope.RING_STEPS)
+    for roads in (envelope.envelope_rings(actuation="raw"), *lanes):
         for _, road in roads:
             assert road.actuation == "raw"
             assert road.safety.active
@@ -35,16 +35,16 @@ def test_without_the_safety_checks_of_sumo_the_safety_filter_is_active() -> None
 def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one = "unjam:ring-gap-tuned"
     for name in ("CONTROLLER_ROADS", "USUAL_CAR_ROADS"):
-        monkeypatch.setattr(feasible, name, {one: "ring"})
+        monkeypatch.setattr(envelope, name, {one: "ring"})
     for name in ("IMPAIRED_DRIVERS", "RING_CONTROLLERS"):
-        monkeypatch.setattr(feasible, name, (one,))
+        monkeypatch.setattr(envelope, name, (one,))
     for name in ("ENVELOPE_SEEDS", "RAW_ACTUATION_SEEDS", "IMPAIRED_SEEDS"):
-        monkeypatch.setattr(feasible, name, 1)
+        monkeypatch.setattr(envelope, name, 1)
     short = Ring(length=(60, 60), vehicles=5, horizon=60)
     for name in ("envelope_rings", "envelope_figure_eights"):
-        monkeypatch.setattr(feasible, name, lambda **changes: iter([("a short ring", short)]))
-    monkeypatch.setattr(feasible, "LANE_SECONDS", 60.0)
-    monkeypatch.setattr(feasible, "impaired_rings", lambda warmup: iter([("late", short)]))
+        monkeypatch.setattr(envelope, name, lambda **changes: iter([("a short ring", short)]))
+    monkeypatch.setattr(envelope, "LANE_SECONDS", 60.0)
+    monkeypatch.setattr(envelope, "impaired_rings", lambda warmup: iter([("late", short)]))
     monkeypatch.setattr(certificate, "ATTACK_GENERATIONS", 1)
     monkeypatch.setattr(string_stability, "OPERATING_SPEED_RATIOS", ())
 
