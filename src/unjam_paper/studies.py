@@ -105,11 +105,6 @@ STUDIES: dict[str, Study] = {
         {"figure-eight": "best"},
         minutes=5.0,
     ),
-    "feasible-ring-jammed": feasible_study(
-        "residual trained on the first half of jammed episodes compared with the tuned expert, in ideal cars",
-        {"ring-jammed": "first-150-seconds"},
-        minutes=20.0,
-    ),
     "on-ramp-trained": on_ramp_study({"ramp-long": "residual on the expert tuned with the larger budget"}),
     "on-ramp-alternating": on_ramp_study({"ramp-alternating": "residual on unjam:on-ramp-tuned, alternating updates"}),
     "envelope": ENVELOPE,

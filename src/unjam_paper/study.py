@@ -285,8 +285,9 @@ class DriverComparison:
         return np.array(rows, np.float64)
 
     def mean(self, labels: Sequence[str], metric: str, digits: int) -> str:
-        """Return the mean over all episodes as text."""
-        return f"{np.nanmean(self.values(labels, metric)):.{digits}f}"
+        """Return the mean over all episodes as text; a dash if no episode has the metric."""
+        values = self.values(labels, metric)
+        return NO_VALUE_TEXT if np.isnan(values).all() else f"{np.nanmean(values):.{digits}f}"
 
     def difference(self, labels: Sequence[str], baseline: str, metric: str, digits: int) -> str:
         """Return the paired difference to another driver, averaged over the roads, with its 95 % CI."""

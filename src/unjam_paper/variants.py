@@ -90,12 +90,6 @@ FROM_SCRATCH = {
     **{"evaluation.validation_interval": 5, "evaluation.validation_episodes": 4},
 }
 """learning without an expert on many roads: with the small exploration noise of a residual, CAVs learn to stand"""
-FIRST_150_SECONDS = {
-    **JAMMED_IDEAL,
-    **{"scenario_options.horizon": 1500, "trpo.steps_per_iteration": 48_000, "trpo.target_kl": 0.016},
-    **{"trpo.gamma": 0.996, "trpo.gae_lambda": 0.96, "policy.exploration_std": 0.05, "policy.action_duration": 1.5},
-}
-"""found by a search on the first half of the episodes of the jammed ring; `best` was found on whole episodes"""
 EXACT_VERSIONS: tuple[tuple[str, dict[str, Any], int], ...] = (
     *(("", {}, PAPER_STEP_BUDGET), ("-filtered", {"scenario_options.safety.active": True}, PAPER_STEP_BUDGET)),
     ("-million", {}, MILLION_STEPS),
@@ -140,7 +134,6 @@ VARIANTS: dict[str, Variant] = {
     "ramp-long": Variant("unjam residual, expert tuned with the larger budget", "best", LONG_TRAINING, 4_608_000),
     "ramp-small": Variant("unjam residual, few steps in small iterations", "best", SMALL_ITERATIONS, 86_400),
     "best-in-batches": Variant("unjam residual, all steps", "best", {"backend": "batch"}, None),
-    "first-150-seconds": Variant("residual", "best", FIRST_150_SECONDS, None),
     **{name: Variant("residual", name, TWO_EPISODES_PER_ROAD, None) for name in ("rings", "shared-rings", "all-roads")},
     "rings-trpo": Variant("TRPO", "rings", FROM_SCRATCH, 1_200_000),
     "rings-ppo": Variant("PPO", "rings", {**PPO_AGENT, **FROM_SCRATCH}, 1_200_000),
