@@ -1,6 +1,7 @@
 """Tuning keeps to settings that do not amplify the oscillations of their leaders."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,10 @@ from optuna.distributions import FloatDistribution
 
 from tests.pictures import empty_pictures
 from tests.training.test_run import small_config
-from unjam.controller import load_controller, string_stability
+from unjam.controller import load_controller, make_driver, string_stability
 from unjam.drivers.registry import driver_from_name
+from unjam.drivers.safety import Actuator
+from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError, UnjamError
 from unjam.reports.results import read_progress
 from unjam.scenarios import Ring
@@ -52,6 +55,18 @@ def test_settings_that_amplify_are_never_tried_and_a_resumed_tuning_knows_them(t
     assert all(point.string_gain(driver_from_name(driver, 0.1)) > 1.02 for driver in refused)
     assert run() == tried
     assert (tmp_path / TRIALS_FILE).read_text() == log
+
+
+def test_the_gain_of_a_file_is_that_with_the_filter_and_the_actuator_of_the_road() -> None:
+    """The file has a filter for a car that obeys at once."""
+    controller = make_driver("unjam:ring-best-ideal", 0.1)
+    assert isinstance(controller, FilteredDriver)
+    gains = []
+    for lag in (0.0, 1.0):
+        point = OperatingPoint(replace(SMALL, actuator=Actuator(lag=lag)), 85.0, (4.0,))
+        gains.append(point.string_gain(controller))
+        assert gains[-1] == point.string_gain(controller.driver)
+    assert gains[0] != gains[1]
 
 
 def test_an_expert_that_always_amplifies_ends_the_tuning_with_its_smallest_gain(

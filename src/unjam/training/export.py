@@ -173,7 +173,8 @@ def driver_with_filter(driver: Driver, road: Scenario) -> FilteredDriver:
     return FilteredDriver(driver, max_acceleration, road.safety, road.control_step, road.actuator)
 
 
-def _without_filter(driver: Driver) -> Driver:
+def without_filter(driver: Driver) -> Driver:
+    """Return a driver without the safety filter of its own file, if it has one."""
     return driver.driver if isinstance(driver, FilteredDriver) else driver
 
 
@@ -181,7 +182,7 @@ def _residual_model(driver: Driver, metadata: dict[str, Any]) -> bytes:
     """Return the residual of a controller as a model of the algorithm that trained it; SAC if that is unknown."""
     from unjam.adapters.stable_baselines3_export import ALGORITHMS, stable_baselines3_bytes
 
-    driver = _without_filter(driver)
+    driver = without_filter(driver)
     if not isinstance(driver, ResidualDriver):
         raise invalid_value("stable_baselines3", driver.describe(), "a residual, such as a training run")
     agent = metadata.get("run", {}).get("agent")
@@ -223,9 +224,9 @@ def _read_driver_origin(
             return road, driver, metadata
         road = make_scenario(road, settings)
         metadata["scenario"] = scenario_recipe(road)
-        return road, _without_filter(driver), metadata
+        return road, without_filter(driver), metadata
     road = make_scenario(example_scenario(scenario or "ring"), settings)
-    driver = _without_filter(make_driver(driver_name, road.control_step))
+    driver = without_filter(make_driver(driver_name, road.control_step))
     expert = driver.expert if isinstance(driver, ResidualDriver) else driver
     return road, driver, controller_origin(road, expert)
 

@@ -14,7 +14,7 @@ from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import tuning_seeds
 from unjam.training.evaluate import raise_failure
-from unjam.training.export import driver_with_filter
+from unjam.training.export import driver_with_filter, without_filter
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 MAX_STRING_GAIN = 1.0 + GAIN_TOLERANCE
@@ -35,7 +35,8 @@ class OperatingPoint:
 
     def string_gain(self, driver: Driver) -> float:
         """Return the largest gain at any speed and frequency, with filter and actuator of the road."""
-        gains = string_gains(driver_with_filter(driver, self.road), self.speeds, self.road.humans, self.loop_length)
+        in_car = driver_with_filter(without_filter(driver), self.road)  # a file may have a filter for another car
+        gains = string_gains(in_car, self.speeds, self.road.humans, self.loop_length)
         return float(gains.max(initial=0.0))
 
 
