@@ -12,18 +12,18 @@ from unjam.measures.statistics import paired_difference
 
 REASONS = {
     "ring-best": "the largest return from a standstill",
-    "ring-best-ideal": "the same for ideal cars, the ablation",
+    "ring-best-ideal": "the controller of this name for ideal cars, the ablation",
     "ring-gap-tuned": "the largest return of a formula from a standstill",
-    "ring-tuned": "dissolves waves by a formula of few parameters",
+    "ring-tuned": "a formula of few parameters; for waves (`ring-jammed`), not for a start",
     "rings-tuned": "for many rings, the expert of `unjam:best`",
-    "shared-rings-tuned": "for rings that several CAVs share, the expert of `unjam:best`",
+    "shared-rings-tuned": "for rings that several CAVs share; the expert of `unjam:best` there",
     "ring-jammed-best": "the largest return in a developed wave",
-    "ring-jammed-best-ideal": "the same for ideal cars, the ablation",
+    "ring-jammed-best-ideal": "the controller of this name for ideal cars, the ablation",
     "ring-jammed-tuned": "the largest return of a formula in a developed wave",
-    "ring-jammed-tuned-ideal": "the same for ideal cars, the ablation",
+    "ring-jammed-tuned-ideal": "the controller of this name for ideal cars, the ablation",
     "figure-eight-best": "the fastest figure eight; trained for ideal cars",
     "figure-eight-tuned": "the largest return of a formula by Eq. 16",
-    "figure-eight-tuned-ideal": "the same for ideal cars, the ablation",
+    "figure-eight-tuned-ideal": "the controller of this name for ideal cars, the ablation",
 }
 """why a controller that is not string stable is part of the package"""
 

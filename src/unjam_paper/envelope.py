@@ -121,7 +121,6 @@ def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart
     tests: tuple[tuple[str, Iterator[tuple[str, Scenario]], tuple[str, ...], int], ...] = (
         ("rings", envelope_rings(), closed, ENVELOPE_SEEDS),
         ("figure-eights", envelope_figure_eights(), closed, ENVELOPE_SEEDS),
-        ("rings-raw", envelope_rings(actuation="raw"), closed, RAW_ACTUATION_SEEDS),
         ("rings-raw-usual-car", envelope_rings(actuation="raw", **usual_cars), USUAL_CAR_CONTROLLERS, ENVELOPE_SEEDS),
         ("lanes-raw", envelope_lanes(), LANE_CONTROLLERS, RAW_ACTUATION_SEEDS),
         ("lanes-raw", envelope_lanes(**RING_STEPS), RING_CONTROLLERS, RAW_ACTUATION_SEEDS),
@@ -208,7 +207,7 @@ ENVELOPE = Study(
         **{part: partial(worst_table, part) for part in (WORST_PART, USUAL_CAR_WORST_PART)},
         **{part: partial(domain_table, part) for part in ("rings", "figure-eights")},
         "rings-usual-car": partial(domain_table, "rings-raw-usual-car"),
-        **{part: partial(contact_table, part) for part in ("rings-raw", "rings-raw-usual-car", "lanes-raw")},
+        **{part: partial(contact_table, part) for part in ("rings-raw-usual-car", "lanes-raw")},
         **{part: partial(impaired_table, part) for part in ("impaired", "impaired-jammed")},
     },
 )

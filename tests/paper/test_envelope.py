@@ -54,6 +54,6 @@ def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert {name: len(table) for name, table in tables.items()} == {**dict.fromkeys(tables, 1), "lanes-raw": 2}
     assert tables["worst"].loc[0, "contacts"] == 0
     assert tables["rings"].loc[0, "feasible on"] == "1 of 1 roads"
-    assert tables["rings-raw"].loc[0, ["control steps", "in contact"]].tolist() == ["60", 0]
+    assert tables["rings-raw-usual-car"].loc[0, ["control steps", "in contact"]].tolist() == ["60", 0]
     assert tables["lanes-raw"]["control steps"].tolist() == ["180", "1,800"], "on three lanes for 60 s"
     assert tables["impaired"].columns.tolist() == ["impairment", "human", one]

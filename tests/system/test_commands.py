@@ -520,7 +520,7 @@ def test_packaged_controllers_are_certified_and_stay_as_they_are(unjam: Run, tmp
     before = file.read_bytes()
     done = unjam("certify", "unjam:ring-tuned")
     assert "0 contacts" in done.stdout
-    assert done.stdout.startswith("not string stable, in a vehicle that obeys at once: amplifies oscillations up to ")
+    assert done.stdout.startswith("not string stable, in a vehicle with 0.2 s delay and 0.3 s lag: amplifies ")
     assert done.stdout.count(" m/s: gain ") == 3
     assert "not string stable" in (tmp_path / "ring-tuned.html").read_text()
     assert file.read_bytes() == before

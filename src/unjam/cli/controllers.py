@@ -27,6 +27,7 @@ from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import invalid_value
 from unjam.files import check_parent_folder
 from unjam.processes import PrivateFolder, continue_in_limited_child
+from unjam.scenarios import scenario_from_recipe
 from unjam.training.export import export_controller
 
 
@@ -92,8 +93,8 @@ def certify_command(
 
     In the tests, leaders brake to a standstill from every state of the sample, an adversarial leader searches
     for contact, and leaders oscillate at many frequencies. The certificate becomes a part of the file, and
-    `unjam verify` checks it. A signed file is refused. A packaged controller stays as it is, and gets the filter of its
-    road if it has none.
+    `unjam verify` checks it. A signed file is refused. A packaged controller stays as it is, and is tested with the
+    filter and the car of its road, whatever car it was made for.
 
     Examples:
 
@@ -128,14 +129,18 @@ def certify_command(
         return
     console.print(verdict)
     for each in certificate["string_stability"]:
-        console.print(f"  at {each['speed']:g} m/s: gain {max(each['gains']):.2f} at {each['peak_frequency']:.3g} Hz")
+        console.print(f"  at {each['speed']:g} m/s: gain {max(each['gains']):.3f} at {each['peak_frequency']:.3g} Hz")
     console.print(describe_worst_cases(certificate, controller.driver))
     err_console.print(f"page: {target}")
 
 
 def _read_with_filter(name: str, settings: dict[str, Any]) -> Controller:
-    """Return a packaged controller with the safety filter of its road and a sample of it."""
+    """Return a packaged controller with the safety filter of its road, for the car of this road, and a sample of it."""
     controller = read_controller(Path(name))
+    if recipe := controller.manifest.get("scenario"):
+        car = asdict(scenario_from_recipe({"kind": recipe["kind"]}).actuator)
+        if car != recipe["actuator"]:  # it was made for a car that obeys at once
+            settings = {"actuator": car, **settings}
     if isinstance(controller.driver, FilteredDriver) and not settings:
         return controller
     with PrivateFolder() as private:

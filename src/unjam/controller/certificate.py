@@ -120,7 +120,7 @@ def describe_string_stability(certificate: dict[str, Any], driver: FilteredDrive
     worst = max(results, key=lambda each: max(each["gains"]))
     if not any(each["amplified_band"] for each in results):
         return f"string stable, {vehicle}"
-    return f"not string stable, {vehicle}: amplifies oscillations up to {max(worst['gains']):.2f} times"
+    return f"not string stable, {vehicle}: amplifies oscillations up to {max(worst['gains']):.3g} times"
 
 
 FollowingSimulator = Callable[[FollowingState, Floats], FollowingState]

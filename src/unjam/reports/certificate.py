@@ -54,7 +54,7 @@ def _certificate_notes(certificate: dict[str, Any]) -> list[str]:
             low, high = each["amplified_band"]
             notes.append(
                 f"At {each['speed']:g} m/s it amplifies oscillations between {low:.3g} and {high:.3g} Hz, by up to "
-                f"{max(each['gains']):.2f} times: it is not string stable."
+                f"{max(each['gains']):.3f} times: it is not string stable."
             )
     return notes
 
