@@ -70,6 +70,13 @@ GAP_PI_RETUNED = (
 )
 """result of `unjam tune ring --expert pi-from-gap --max-string-gain 0 --steps 12000000` for usual cars: on tuning seeds
 it has the return of `unjam:ring-gap-tuned`, which was tuned for ideal cars"""
+FIRST_GAP_LABEL = "speed of the first gap"
+FIRST_GAP_SPEED = (
+    "pi-from-gap:window=10.11,catch_up_speed=0.02,gap_lower=4,gap_upper=24.92,safe_gap=0.5,time_constant=3,"
+    "human_time_headway=1,human_standstill_gap=2,fade_time=1e6"
+)
+"""a driver that keeps the speed at which human drivers follow with the gap that it observes first: set by hand, outside
+the ranges of `unjam tune`. From an even standstill this is the limit speed"""
 PACER_LONG_TUNED = (
     "pacer:use_tuned=true,gathering_speed=1.96,gathering_gap=0.319,regathering_gap=0.1595,time_constant=0.0966"
 )
@@ -146,10 +153,10 @@ FEASIBLE_ROADS = {
         sizes=RING_LENGTHS,
         make_scenario=lambda length: Ring(length=(length, length)),
         drivers={
-            **{**USUAL_CAR_DRIVERS, GAP_PI_RETUNED_LABEL: GAP_PI_RETUNED},
+            **{**USUAL_CAR_DRIVERS, GAP_PI_RETUNED_LABEL: GAP_PI_RETUNED, FIRST_GAP_LABEL: FIRST_GAP_SPEED},
             **{IDEAL_RESIDUAL_LABEL: "unjam:ring-best-ideal", **CEILING},
         },
-        baselines=(GAP_PI_LABEL, GAP_PI_RETUNED_LABEL),
+        baselines=(GAP_PI_LABEL, GAP_PI_RETUNED_LABEL, FIRST_GAP_LABEL),
         evaluate=evaluate_in_batches,
         gain_road="ring",
     ),
