@@ -126,7 +126,7 @@ def _limit_leader(ring: Ring) -> Driver:
 
 
 CEILING: dict[str, DriverSource] = {"speed-limit leader": _limit_leader}
-"""a driver that leads all vehicles to the speed limit of the road; the first gap says it where all start evenly spaced"""
+"""a driver that leads all vehicles to the speed limit of the road; the first gap says it where all start evenly"""
 RING_LENGTHS = (220, 230, 240, 250, 260, 270)
 RING_DRIVERS: dict[str, DriverSource] = {
     **{HUMAN_LABEL: "human", "PI": "pi", "PI (paper)": "pi:time_constant=0", PI_TUNED_LABEL: PI_LONG_TUNED},
