@@ -14,7 +14,7 @@ import unjam.models
 from unjam.drivers import LocalState
 from unjam.drivers.check import random_state
 from unjam.drivers.local_state import MAX_OBSERVED_GAP
-from unjam.drivers.safety import FollowingState
+from unjam.drivers.safety import INSTANT_ACTUATOR, FollowingState
 from unjam.models.ensemble import torch_generator
 from unjam.models.rollouts import CLIPPED_QUANTITIES, ModelDynamics, tensor_reward
 from unjam.models.row_model import STATE_FIELDS, TARGET_NAMES, RowModel, base_reward, base_step
@@ -22,7 +22,7 @@ from unjam.models.settings import ModelSettings
 from unjam.scenarios import Ring
 from unjam.worlds.reward import Outcome, make_reward
 
-RING = Ring()
+RING = Ring(actuator=INSTANT_ACTUATOR)
 
 
 def model(members: int = 1, residual: dict[str, float] | None = None, drawn: int = 1) -> RowModel:

@@ -7,7 +7,7 @@ import numpy as np
 from unjam.drivers import IDM, LocalState
 from unjam.drivers.check import random_state
 from unjam.drivers.residual import EXPERT_KEY, ResidualDriver
-from unjam.drivers.safety import ActuatorState, SafetyFilter
+from unjam.drivers.safety import INSTANT_ACTUATOR, ActuatorState, SafetyFilter
 from unjam.models.environment_data import EnvironmentData, Recording
 from unjam.models.rollouts import AT_REST, ModelDynamics, ModelTransition
 from unjam.physics.arrays import Array, as_column, namespace, stack_columns
@@ -16,7 +16,7 @@ from unjam.tree import map_leaves
 from unjam.worlds.reward import Outcome, released_reward
 
 LOOP = 230.0
-RING = Ring(length=(int(LOOP), int(LOOP)), safety=SafetyFilter(active=False))
+RING = Ring(length=(int(LOOP), int(LOOP)), safety=SafetyFilter(active=False), actuator=INSTANT_ACTUATOR)
 
 
 class ToyDynamics(ModelDynamics):

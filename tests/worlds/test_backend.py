@@ -69,7 +69,8 @@ def test_a_users_backend_runs_the_same_episode_by_name_as_an_object_and_in_a_wor
 def test_environments_step_the_episodes_of_a_users_backend(own: str) -> None:
     expected = run_episode(RING, Constant(acceleration=0.3), 7, backend=own)
     rewards = []
-    with closing(gymnasium.make("unjam/Ring-v0", length=230, horizon=60, backend=backend_object(own))) as environment:
+    options: dict[str, Any] = {"length": 230, "horizon": 60, "actuator": {"delay": 0.0, "lag": 0.0}}
+    with closing(gymnasium.make("unjam/Ring-v0", backend=backend_object(own), **options)) as environment:
         environment.reset(seed=7)
         truncated = False
         while not truncated:

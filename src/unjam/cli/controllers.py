@@ -110,8 +110,8 @@ def certify_command(
     if settings and not is_packaged:
         raise invalid_value("set", settings[0], "a packaged controller, or a file of unjam export --set")
     changes = parse_settings(settings)
-    source, file = str(file), controller_file(file)
-    controller = _read_with_filter(source, changes) if is_packaged else read_controller(file)
+    controller = _read_with_filter(str(file), changes) if is_packaged else read_controller(file)
+    file = controller_file(file)
     target = out or (Path(file.name) if is_packaged else file).with_suffix(".html")
     check_parent_folder(target)
     check_unsigned(controller)
