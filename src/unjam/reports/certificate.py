@@ -52,10 +52,9 @@ def _certificate_notes(certificate: dict[str, Any]) -> list[str]:
     for each in certificate["string_stability"]:
         if each["amplified_band"]:
             low, high = each["amplified_band"]
-            notes.append(
-                f"At {each['speed']:g} m/s it amplifies oscillations between {low:.3g} and {high:.3g} Hz, by up to "
-                f"{max(each['gains']):.3f} times: it is not string stable."
-            )
+            band = f"of {low:.3g} Hz" if low == high else f"between {low:.3g} and {high:.3g} Hz"
+            gain = f"by up to {max(each['gains']):.3f} times"
+            notes.append(f"At {each['speed']:g} m/s it amplifies oscillations {band}, {gain}: it is not string stable.")
     return notes
 
 
