@@ -11,9 +11,9 @@ from unjam.measures.metric_table import estimate_cell
 from unjam.measures.statistics import paired_difference
 
 REASONS = {
-    "ring-best": "the largest return from a standstill",
+    "ring-best": "the largest return of the trained controllers from a standstill, with the smallest string gain",
     "ring-best-ideal": "the controller of this name for ideal cars, the ablation",
-    "ring-gap-tuned": "the largest return of a formula from a standstill",
+    "ring-gap-tuned": "a tuned formula for a start; the expert of `ring-best`",
     "ring-tuned": "a formula of few parameters; for waves (`ring-jammed`), not for a start",
     "rings-tuned": "for many rings, the expert of `unjam:best`",
     "shared-rings-tuned": "for rings that several CAVs share; the expert of `unjam:best` there",

@@ -5,14 +5,12 @@ from dataclasses import asdict, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from unjam.controller.certificate import make_certificate
-from unjam.controller.file import SUFFIX, read_controller
 from unjam.drivers.safety import INSTANT_ACTUATOR, STANDARD_ACTUATOR, Actuator, SafetyFilter
 from unjam.drivers.sensors import Sensors
 from unjam.measures.feasibility import FEASIBLE
@@ -22,7 +20,7 @@ from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.motorway import Motorway, Ramp
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
-from unjam.training.export import export_controller
+from unjam.training.export import read_in_car
 from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.study import NO_VALUE_TEXT, DriverComparison, Study, StudyFolder, evaluate_metrics, mean_text
 
@@ -77,7 +75,7 @@ IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "every tenth reading missing": {"sensors": Sensors(dropout=0.1)},
     "every third reading missing": {"sensors": Sensors(dropout=1.0 / 3.0)},
 }
-"""changes to the actuation and the sensors of CAVs, which else are usual cars"""
+"""changes to the actuation and the sensors of usual cars"""
 
 
 def envelope_rings(**changes: Any) -> Iterator[tuple[str, Ring]]:
@@ -113,8 +111,8 @@ def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
 def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     """Return the parts of the study `envelope`."""
     closed, parts = tuple(CONTROLLER_ROADS), dict[str, StudyPart]()
-    for part, road_by_driver in ((WORST_PART, CONTROLLER_ROADS), (USUAL_CAR_WORST_PART, USUAL_CAR_ROADS)):
-        actuator = INSTANT_ACTUATOR if part == WORST_PART else STANDARD_ACTUATOR
+    cars = (WORST_PART, CONTROLLER_ROADS, INSTANT_ACTUATOR), (USUAL_CAR_WORST_PART, USUAL_CAR_ROADS, STANDARD_ACTUATOR)
+    for part, road_by_driver, actuator in cars:
         for driver, road in road_by_driver.items():
             parts[f"{part}/{driver}"] = _certify_worst_cases, (driver, road, actuator)
     usual_cars: dict[str, Any] = {"actuator": STANDARD_ACTUATOR}
@@ -135,10 +133,7 @@ def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart
 
 
 def _certify_worst_cases(controller: str, road: str, actuator: Actuator, workers: int) -> dict[str, Any]:
-    with TemporaryDirectory() as folder:
-        file = Path(folder, f"controller{SUFFIX}")
-        export_controller(controller, file, scenario=road, settings={"actuator": asdict(actuator)})
-        return make_certificate(read_controller(file))["worst_cases"]
+    return make_certificate(read_in_car(controller, {"actuator": asdict(actuator)}, road))["worst_cases"]
 
 
 def worst_table(part: str, folder: Path) -> pd.DataFrame:

@@ -248,7 +248,7 @@ def evaluate_metrics(
 def evaluate_in_batches(
     scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, metrics: Sequence[str], workers: int
 ) -> dict[str, Any]:
-    """Return what `evaluate_metrics` does, without fuel, from batches, whose episodes equal those of SUMO."""
+    """Return the result of `evaluate_metrics` without fuel, from batches: their episodes equal those of SUMO."""
     test_seeds = held_out_seeds(seeds)
     rows = {
         label: [*map(measure, run_batches([EpisodeTask(scenario, driver, seed) for seed in test_seeds]))]

@@ -13,7 +13,7 @@ JAMMED_IDEAL: dict[str, Any] = {
     "expert": "unjam:ring-jammed-tuned-ideal",
     **{"policy.exploration_std": 0.013, "trpo.target_kl": 0.0086},
 }
-"""changes to `best`, whose expert and exploration on the jammed ring are those for usual cars: those for ideal cars"""
+"""expert and exploration for ideal cars on the jammed ring, as changes to `best`, which has those for usual cars"""
 ON_RAMP_JAM_AHEAD = (
     "jam-ahead:first_section=3,last_section=4,speed_margin=-1.536,margin_by_penetration=19.83,min_speed=2.568,"
     "max_deceleration=1.106,time_constant=1.681"
@@ -126,7 +126,7 @@ VARIANTS: dict[str, Variant] = {
         )
         for name, (base, changes) in WRONG_BASES.items()
     },
-    **reduced_step_variants("jammed", 24_000, 768_000, horizon=3000, **JAMMED_IDEAL),
+    **reduced_step_variants("jammed", 24_000, 768_000, **JAMMED_IDEAL),
     **reduced_step_variants("eight", 6_000, 612_000, horizon=1500),
     **ON_RAMP_VARIANTS,
     "ramp-road-model": replace(ON_RAMP_VARIANTS["ramp-road-model"], changes=WEAK_EXPERT, steps=28_800),

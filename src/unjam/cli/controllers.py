@@ -14,7 +14,6 @@ from unjam.cli.options import JsonOption, ScenarioSettingsOption, check_page_pat
 from unjam.cli.output import console, err_console, print_json
 from unjam.controller.file import (
     PACKAGED_PREFIX,
-    SUFFIX,
     Controller,
     add_certificate,
     add_signature,
@@ -26,9 +25,9 @@ from unjam.controller.verify import check_parts, require_complete
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import invalid_value
 from unjam.files import check_parent_folder
-from unjam.processes import PrivateFolder, continue_in_limited_child
+from unjam.processes import continue_in_limited_child
 from unjam.scenarios import scenario_from_recipe
-from unjam.training.export import export_controller
+from unjam.training.export import export_controller, read_in_car
 
 
 def export_command(
@@ -143,8 +142,7 @@ def _read_with_filter(name: str, settings: dict[str, Any]) -> Controller:
             settings = {"actuator": car, **settings}
     if isinstance(controller.driver, FilteredDriver) and not settings:
         return controller
-    with PrivateFolder() as private:
-        return read_controller(export_controller(name, Path(private, f"filtered{SUFFIX}"), settings=settings).file)
+    return read_in_car(name, settings)
 
 
 def verify_command(

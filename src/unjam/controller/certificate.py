@@ -117,10 +117,10 @@ def describe_string_stability(certificate: dict[str, Any], driver: FilteredDrive
     results, vehicle = certificate["string_stability"], driver.actuator.describe()
     if not results:
         return f"string stability was not tested, {vehicle}"
-    worst = max(results, key=lambda each: max(each["gains"]))
     if not any(each["amplified_band"] for each in results):
         return f"string stable, {vehicle}"
-    return f"not string stable, {vehicle}: amplifies oscillations up to {max(worst['gains']):.3g} times"
+    gain = max(max(each["gains"]) for each in results)
+    return f"not string stable, {vehicle}: amplifies oscillations up to {gain:.3g} times"
 
 
 FollowingSimulator = Callable[[FollowingState, Floats], FollowingState]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from unjam.controller import SUFFIX, controller_bytes, controller_path, make_driver
-from unjam.controller.file import GRAPH_PART, MAX_SAMPLE_STEPS, SAMPLE_PART, read_controller, sample_bytes
+from unjam.controller.file import GRAPH_PART, MAX_SAMPLE_STEPS, SAMPLE_PART, Controller, read_controller, sample_bytes
 from unjam.controller.manifest import PROVENANCE_ENTRIES
 from unjam.controller.verify import verify_controller_file
 from unjam.drivers.driver import Driver
@@ -163,6 +163,14 @@ def export_controller(
     if model is not None and model_file is not None:
         atomic_write(model_file, model)
     return ExportResult(out, graph_file, model_file, driver.describe(), len(states.speed))
+
+
+def read_in_car(source: str, settings: dict[str, Any], scenario: str = "") -> Controller:
+    """Return a controller as `export_controller` writes it, with the filter for a car and a sample; no file stays."""
+    with PrivateFolder() as private:
+        return read_controller(
+            export_controller(source, Path(private, f"in-car{SUFFIX}"), False, scenario, False, settings).file
+        )
 
 
 def driver_with_filter(driver: Driver, road: Scenario) -> FilteredDriver:
