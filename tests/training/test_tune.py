@@ -11,6 +11,7 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution, Int
 
 from unjam.controller import load_controller
 from unjam.drivers import PISaturation
+from unjam.drivers.driver import label_with_parameters
 from unjam.drivers.registry import driver_from_name
 from unjam.errors import InputError
 from unjam.measures.feasibility import overall_feasibility
@@ -48,7 +49,7 @@ def test_tuned_expert_is_written_and_not_worse(tmp_path: Path) -> None:
     assert found.best.score is not None
     assert found.default.score is not None
     assert found.best.score >= found.default.score
-    driver = load_controller(found.file)
+    driver = load_controller(Path(found.driver))
     assert isinstance(driver, PISaturation)
     assert found.best.values.items() <= vars(driver).items()
     written = json.loads((tmp_path / TUNING_FILE).read_text())
@@ -227,17 +228,42 @@ def test_unknown_parameter_is_refused(tmp_path: Path) -> None:
         tune({"ring": SMALL}, "pi", {"catch_up": FloatDistribution(0.5, 3.0)}, STEPS, tmp_path, workers)
 
 
-@pytest.mark.long
-def test_changed_reward_file_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "mine.py"
-    text = "import numpy as np\ndef calm(outcome): return {{'speed': {} * outcome.speeds.mean(-1)}}\n"
-    file.write_text(text.format(1))
+OWN_CODE = """
+class Calm:
+    def __init__(self, gain=0.2, time_gap=2.0):
+        self.gain, self.time_gap = gain, time_gap
+    def initial_memory(self, n):
+        return {}
+    def act(self, state, memory):
+        return self.gain * (state.leader_gap - self.time_gap * state.speed), memory
+
+def calm(outcome):
+    return {"speed": outcome.speeds.mean(-1)}
+"""
+
+
+@pytest.mark.parametrize("part", ["reward", "expert"])
+def test_own_file_is_tuned_and_not_continued_after_a_change(part: str, tmp_path: Path) -> None:
+    file, folder = tmp_path / "mine.py", tmp_path / "tuned"
+    file.write_text(OWN_CODE)
+    expert, reward = (f"{file}:Calm", "") if part == "expert" else ("pi", f"{file}:calm")
+    space = default_search_space(expert, 0.1) if part == "expert" else SPACE
     with WorkerPool(1) as workers:
-        arguments = {"ring": SMALL}, "pi", SPACE, STEPS, tmp_path / "tuned", workers, f"{file}:calm"
-        tune(*arguments)
-        file.write_text(text.format(-1000))
-        with pytest.raises(InputError, match="was made with other settings"):
-            tune(*arguments)
+        result = tune({"ring": SMALL}, expert, space, STEPS, folder, workers, reward)
+        if part == "expert":
+            assert set(result.best.values) == set(space) == {"gain", "time_gap"}
+            assert result.driver == result.best.driver
+            values = json.loads((folder / TUNING_FILE).read_text())["best"]["values"]
+            assert driver_from_name(result.driver, 0.1).describe() == label_with_parameters("mine.py:Calm", values)
+        file.write_text(f"{OWN_CODE}# changed")
+        with pytest.raises(InputError, match=r"other settings \(.*mine\.py has changed\)"):
+            tune({"ring": SMALL}, expert, space, STEPS, folder, workers, reward)
+
+
+def test_function_of_a_file_has_nothing_to_tune(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(OWN_CODE)
+    with pytest.raises(InputError, match=r"expert: '.*mine\.py:calm' has nothing to tune"):
+        default_search_space(f"{tmp_path / 'mine.py'}:calm", 0.1)
 
 
 @pytest.mark.slow

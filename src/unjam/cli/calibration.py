@@ -34,7 +34,9 @@ CALIBRATION_COLUMNS = {
 def tune_command(
     *,
     scenario: opt.ScenarioArgument,
-    expert: Annotated[str, Option("--expert", help="Name of the expert, as in unjam drivers.")] = "smooth-acc",
+    expert: Annotated[
+        str, Option("--expert", help="Name of the expert, as in unjam drivers, or path.py:YourClass.")
+    ] = "smooth-acc",
     steps: Annotated[int, Option(min=1, help="Maximum number of control steps of all trials together.")] = 2_000_000,
     vary: Annotated[
         list[str] | None,
@@ -105,7 +107,7 @@ def tune_command(
     best, default = result.best, result.default
     if json:
         counts = {"environment_steps": result.environment_steps, "batch_steps": result.batch_steps}
-        print_json({"file": str(result.file), "best": asdict(best), "default": asdict(default), **counts})
+        print_json({"driver": result.driver, "best": asdict(best), "default": asdict(default), **counts})
         return
     console.print(f"{result.environment_steps:,} environment steps, {result.batch_steps:,} batch steps")
     default_score = default.verdict if default.score is None else f"{default.score:.4g}"
@@ -113,7 +115,7 @@ def tune_command(
     console.print(scores, soft_wrap=True)
     road = FAMILY[next(iter(roads))].scenario if scenario in ROAD_GROUPS else scenario
     options = output.setting_options(changes, reward=reward, backend=backend)
-    output.print_next_command("drive with it", "drive", road, "--driver", result.file, "--test-seeds", *options)
+    output.print_next_command("drive with it", "drive", road, "--driver", result.driver, "--test-seeds", *options)
 
 
 def calibrate_command(

@@ -2,15 +2,17 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields
+from inspect import isclass, signature
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import optuna
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from unjam.drivers.registry import DRIVERS, driver_from_name
+from unjam.drivers.user_driver import FileReference, is_file_reference
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import parse_value
+from unjam.tree import named_parts
 
 optuna.logging.set_verbosity(optuna.logging.WARNING)
 
@@ -64,20 +66,31 @@ def default_search_space(expert: str, time_step: float) -> SearchSpace:
 
     Raise `InputError` if there is no such expert, or if it has nothing to vary.
     """
-    names = [name for name, kind in DRIVERS.items() if not kind.is_native]
-    if expert not in names:
-        raise unknown_name("expert", expert, names)
-    default = driver_from_name(expert, time_step)
-    hints = get_type_hints(type(default))
-    ranges = {
-        field.name: _default_range(getattr(default, field.name), hints[field.name])
-        for field in fields(default)  # pyright: ignore[reportArgumentType]
-        if field.name != "time_step"
-    }
+    parameters = tunable_parameters(expert, time_step)
+    ranges = {name: _default_range(value, hint) for name, (value, hint) in parameters.items()}
     space: SearchSpace = {name: values for name, values in ranges.items() if values is not None}
     if not space:
         raise InputError(f"expert: {expert!r} has nothing to tune")
     return space
+
+
+def tunable_parameters(expert: str, time_step: float) -> dict[str, tuple[Any, Any]]:
+    """Return default value and type of an expert's parameters by name, also of a class `path.py:name`.
+
+    Raise `InputError` if there is no such expert.
+    """
+    if is_file_reference(expert):
+        kind = FileReference.parse(expert).load_object()
+        parameters = signature(kind).parameters.values() if isclass(kind) else ()
+        found = {each.name: (each.default, each.annotation) for each in parameters if each.default is not each.empty}
+    else:
+        names = [name for name, kind in DRIVERS.items() if not kind.is_native]
+        if expert not in names:
+            raise unknown_name("expert", expert, names)
+        values = named_parts(driver_from_name(expert, time_step)) or {}
+        hints = get_type_hints(DRIVERS[expert])
+        found = {name: (value, hints[name]) for name, value in values.items()}
+    return {name: each for name, each in found.items() if name != "time_step"}
 
 
 def expert_search_space(texts: Sequence[str], defaults: SearchSpace) -> SearchSpace:

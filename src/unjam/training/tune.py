@@ -31,10 +31,9 @@ from unjam.seeds import tuning_seeds
 from unjam.training.evaluate import raise_failure
 from unjam.training.fingerprint import file_hashes
 from unjam.training.run_folder import controller_origin
-from unjam.training.search_space import SearchSpace
+from unjam.training.search_space import SearchSpace, tunable_parameters
 from unjam.training.string_limit import find_operating_points
 from unjam.training.trial_log import TrialLog, TrialVerdict, TuningTrial
-from unjam.tree import named_parts
 from unjam.worlds.backend import check_support, open_backend
 from unjam.worlds.batch.run import run_batch, run_batches
 from unjam.worlds.batch.support import required_batch_kind, statistically_unsupported_reason, unsupported_reason
@@ -68,7 +67,13 @@ class TuningResult:
     """control steps in SUMO"""
     batch_steps: int
     """control steps in batches"""
-    file: Path
+    file: Path | None
+    """the tuned controller; None for a class `path.py:name`, since a file by itself may run no code"""
+
+    @property
+    def driver(self) -> str:
+        """Name of the tuned driver for `--driver`."""
+        return str(self.file or self.best.driver)
 
 
 def invalid_reason(driver: str) -> str:
@@ -150,6 +155,7 @@ def tune(
 
     Args:
         roads: scenarios by name, with their limits and filters.
+        expert: name of a driver, or a class `path.py:name` whose parameters have defaults.
         steps: total budget of control steps.
         reward: objective on one road; empty: the scenario's own.
         seed: of the proposals.
@@ -161,7 +167,7 @@ def tune(
         InputError: too few steps, a wrong parameter, no road that supports batches, or another folder.
         UnjamError: all trials are infeasible, or too many settings in a row have too large string gains.
     """
-    known = named_parts(driver_from_name(expert, 1.0)) or {}
+    known = tunable_parameters(expert, 1.0)
     for key in space:
         if key not in known:
             raise unknown_name("vary", key, known)
@@ -185,7 +191,7 @@ def tune(
     screened = [road for road, reason in reasons.items() if screen is not False and not reason]
     recipes = {road: scenario_recipe(scenario) for road, scenario in roads.items()}
     request = {"roads": recipes, "expert": expert, "space": repr(space), "steps": steps, "reward": reward}
-    files = file_hashes([reward, backend], *roads.values())
+    files = file_hashes([expert, reward, backend], *roads.values())
     request |= {"files": files} if files else {}
     request |= {"max_string_gain": max_string_gain} if max_string_gain else {}
     log = TrialLog(folder, request | {"seed": seed, "screen": bool(screened), "backend": backend})
@@ -239,7 +245,8 @@ def tune(
     batch_steps = trial_runs * episodes * sum(roads[road].max_episode_steps for road in screened)
     unused_steps = (TUNING_FINALISTS - len(best_values)) * 2 * trial_steps
     sumo_steps = trial_runs * trial_steps + final_steps - unused_steps - batch_steps
-    result = TuningResult(best, default, trials, sumo_steps, batch_steps, folder / f"{expert}{SUFFIX}")
+    file = None if is_file_reference(expert) else folder / f"{expert}{SUFFIX}"
+    result = TuningResult(best, default, trials, sumo_steps, batch_steps, file)
     recipe = next(iter(recipes.values())) if is_single else recipes
     scenario = next(iter(roads.values()))
     tuning = {
@@ -251,8 +258,9 @@ def tune(
         "default": asdict(default),
         **({"string_gain": string_gain(best.driver), "max_string_gain": max_string_gain} if points else {}),
     }
-    driver = driver_from_name(best.driver, scenario.control_step)
-    atomic_write(result.file, controller_bytes(driver, {**controller_origin(scenario, driver), "tuning": tuning}))
+    if file is not None:
+        driver = driver_from_name(best.driver, scenario.control_step)
+        atomic_write(file, controller_bytes(driver, {**controller_origin(scenario, driver), "tuning": tuning}))
     facts = {"scenario": recipe, "expert": expert, **tuning, "manifest": {**manifest(), "starts": log.starts}}
     document = {**facts, "trials": [asdict(trial) for trial in trials]}
     atomic_write(folder / TUNING_FILE, to_json(document, indent=1))
