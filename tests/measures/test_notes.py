@@ -75,13 +75,12 @@ def test_insertion_backlog_is_noted(backlog: float, noted: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("unfinished", "delay_share", "words"),
-    [(2, 0.9, None), (20, 0.2, ""), (20, 0.9, " (traffic is still congested: human, pi)")],
+    ("unfinished", "delay_share", "words"), [(2, 0.9, None), (20, 0.2, ""), (20, 0.9, " (traffic is still congested)")]
 )
 def test_trips_that_have_not_ended_are_noted(unfinished: int, delay_share: float, words: str | None) -> None:
     rows = rows_of(2, unfinished_trips=unfinished, delay_share_at_end=delay_share)
     note = (
-        f"human, pi: up to 40 % of the vehicles are under way or waiting at the end{words}; their travel time counts "
+        f"human; pi: up to 40 % of the vehicles are under way or waiting at the end{words}; their travel time counts "
         "until then, and a later --end shows more of it"
     )
     assert episode_notes({"human": rows, "pi": rows}) == ([] if words is None else [note])

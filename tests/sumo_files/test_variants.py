@@ -15,11 +15,13 @@ ROUTES = (
 )
 
 
-def write_changed_variant(folder: Path, types: dict[str, dict[str, str]], scale: float, inside: str = "") -> Path:
+def write_changed_variant(
+    folder: Path, types: dict[str, dict[str, str]], scale: float, inside: str = "", routes: str = ROUTES
+) -> Path:
     """A variant of a network, next to the original."""
     (folder / "mine").mkdir()
     (folder / "new").mkdir()
-    files = read_sumo_files(configuration(folder / "mine", inside, routes=ROUTES))
+    files = read_sumo_files(configuration(folder / "mine", inside, routes=routes))
     return write_variant(files, types, scale, folder / "new" / "other.sumocfg")
 
 
@@ -30,6 +32,21 @@ def test_types_are_changed_wherever_they_are_defined(tmp_path: Path) -> None:
     assert found.types["van"] == {"id": "van"}
     assert found.types["DEFAULT_VEHTYPE"] == {"id": "DEFAULT_VEHTYPE", "accel": "2"}
     assert found.used_types == {"car", "van", "DEFAULT_VEHTYPE"}
+
+
+def test_changed_attributes_replace_those_of_nested_models(tmp_path: Path) -> None:
+    nested = '<carFollowing-IDM tau="1" accel="2"/>'
+    routes = (
+        f'<routes><vType id="car">{nested}</vType><vTypeDistribution id="all"><vType id="van">{nested}</vType>'
+        '</vTypeDistribution><vehicle id="v" type="car"/><vehicle id="w" type="van"/></routes>'
+    )
+    path = write_changed_variant(tmp_path, {"car": {"tau": "1.5"}}, 1.0, routes=routes)
+    found = read_sumo_files(path)
+    assert (found.types["car"]["tau"], found.types["car"]["accel"]) == ("1.5", "2")
+    assert (found.types["van"]["tau"], found.types["van"]["accel"]) == ("1", "2")
+    written = (path.parent / "0.rou.xml").read_text()
+    assert '<carFollowing-IDM accel="2">' in written
+    assert nested[:-2] in written
 
 
 def test_the_network_and_the_users_files_are_unchanged(tmp_path: Path) -> None:

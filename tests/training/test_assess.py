@@ -102,7 +102,7 @@ def test_acc_property_is_compared_with_unchanged_vehicles(name: str, file: str) 
 
 def test_lines_at_the_start_have_one_estimate_and_a_smaller_question(file: str) -> None:
     request = make_request(file, [0.1, 0.2], 60, 0.02, 5.0, ["acc", "unjam:best"])
-    budget = EpisodeBudget(59, 5.0, 2, clock=iter([0.0, *[6.0] * 9]).__next__)
+    budget = EpisodeBudget(59, 5.0, 2, clock=iter([0.0, *[6.0] * 99]).__next__)
     budget.spend(1)
     assert budget_lines(request, budget) == [
         "a verdict needs at least 10 test seeds: 86 episodes, about 4 min",
@@ -110,6 +110,7 @@ def test_lines_at_the_start_have_one_estimate_and_a_smaller_question(file: str) 
         "a smaller question, --penetration-rates 0.2 -d acc, needs at least 32 episodes, about 96 s",
     ]
     assert len(budget_lines(request.smallest_question, budget)) == 2
+    assert budget_lines(request, budget, 50)[0].endswith("86 episodes, 50 of them stored, about 2 min")
 
 
 def test_a_time_that_is_too_short_for_an_answer_is_said_at_the_start(file: str) -> None:
@@ -213,7 +214,7 @@ def test_document_equals_the_file_and_has_all_results(answer: Assessment) -> Non
     assert written["baseline"]["travel_time"]["count"] == written["seeds"]["test"] >= 5
     assert written["manifest"]["packages"]["libsumo"]
     unfinished, replaced = written["notes"]
-    assert unfinished.startswith("human, cruise, 50 %, acc, 50 %: up to 62 % of the vehicles are under way or waiting")
+    assert unfinished.startswith("human; cruise, 50 %; acc, 50 %: up to 62 % of the vehicles are under way or waiting")
     assert replaced == "straight.sumocfg: replaced by values of unjam: seed"
     page = render_assessment(answer.page.parent)
     lifted = "acc, 50 %: SUMO lifted 3 vehicles"
@@ -258,8 +259,15 @@ def test_an_assessment_continues_with_other_controllers_and_more_episodes(file: 
         assert repr(read_rows(folder)) == repr(read_rows(fresh.page.parent))
         assert stages[1].startswith("simulating test seed")
         assert not stages[1].startswith("simulating test seeds 1 ")
+        assert not (folder / "assessment-1.html").exists()  # the question was the same
+        document, messages = (folder / "assessment.json").read_text(), list[str]()
+        lower = make_request(file, [0.4], 20, 0.02, None, ["acc"], HELD)
+        assess(lower, folder, workers, on_message=messages.append)
+        assert (folder / "assessment-1.json").read_text() == document
+        assert f"the answer to the earlier question is now in {folder / 'assessment-1.html'}" in messages
+        assert json.loads((folder / "assessment.json").read_text())["penetration_rates"] == [0.4]
         other = make_request(file, [0.5], 20, 0.02, None, ["acc"], {**HELD, "horizon": 140})
-        with pytest.raises(InputError, match="was made with other settings; allowed: a new folder"):
+        with pytest.raises(InputError, match=r"other settings \(scenario\.horizon: 150 there, 140 now\)"):
             assess(other, folder, workers)
 
 

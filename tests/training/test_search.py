@@ -118,15 +118,15 @@ class Trainings:
     def __init__(self) -> None:
         self.done: list[Path] = []
         self.stop_at: int | None = None
-        self.failing = False
+        self.failing_code = 0
         self.seconds = 0.0
 
     def __call__(self, command: CommandLine) -> int:
         if len(self.done) == self.stop_at:
             raise KeyboardInterrupt
         time.sleep(self.seconds)
-        if self.failing:
-            return 2
+        if self.failing_code:
+            return self.failing_code
         config = load_config(Path(command.argv()[6]))
         folder = Path(command.arguments[-1])
         folder.mkdir(parents=True, exist_ok=True)
@@ -181,6 +181,32 @@ def test_a_search_shows_how_far_trainings_are(
     assert sum(message.startswith("2 of 2: trial ") for message in messages) == 1
 
 
+@pytest.mark.parametrize(("code", "exit_code"), [(74, 74), (3, 1), (143, 1), (-9, 1)])
+def test_trials_that_were_stopped_resume(code: int, exit_code: int, tmp_path: Path, trainings: Trainings) -> None:
+    trainings.failing_code = code
+    with pytest.raises(UnjamError, match=rf"trial 0 was stopped with exit code {code}; its log: .*0000\.log") as caught:
+        search(BASE, SPACE, 3, tmp_path, 1)
+    assert caught.value.exit_code == exit_code
+    trainings.failing_code = 0
+    assert [trial.gain for trial in search(BASE, SPACE, 3, tmp_path, 1)].count(None) == 0
+    assert len(trainings.done) == 3
+
+
+@pytest.mark.parametrize("varied", ["trpo.gamma=0.9..0.99", "expert=pi,{file}:calm"])
+def test_search_does_not_resume_after_a_file_has_changed(
+    varied: str, tmp_path: Path, trainings: Trainings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("unjam.trust.is_all_code_trusted", lambda: True)
+    file, space = tmp_path / "mine.py", parse_search_space([varied.format(file=tmp_path / "mine.py")])
+    file.write_text("def calm(state): return 0.0 * state.speed\n")
+    base = trial_config(BASE, {} if "mine" in repr(space) else {"reward": f"{file}:calm"})
+    search(base, space, 1, tmp_path / "out", 1)
+    file.write_text("def calm(state): return 1.0 * state.speed\n")
+    with pytest.raises(InputError, match=r"other settings \(.*mine\.py.* has changed\)"):
+        search(base, space, 2, tmp_path / "out", 1)
+    assert len(trainings.done) == 1
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_interrupted_search_resumes(tmp_path: Path, trainings: Trainings, workers: int) -> None:
     trainings.stop_at = 4
@@ -199,7 +225,7 @@ def test_search_resumes_only_with_the_same_settings(tmp_path: Path, trainings: T
     search(BASE, SPACE, 2, tmp_path, 1)
     assert len(search(BASE, SPACE, 5, tmp_path, 1)) == 5
     assert len(trainings.done) == 5
-    with pytest.raises(InputError, match="was made with other settings"):
+    with pytest.raises(InputError, match=r"was made with other settings \(space: .* there, .* now\); allowed"):
         search(BASE, parse_search_space(["trpo.target_kl=0.001..0.2"]), 6, tmp_path, 1)
     with pytest.raises(InputError, match="was made with other settings"):
         search(small_config(seed=1), SPACE, 6, tmp_path, 1)
@@ -259,7 +285,7 @@ def test_folder_with_other_files_is_not_changed(tmp_path: Path) -> None:
 
 
 def test_failure_of_all_trials_is_reported(tmp_path: Path, trainings: Trainings) -> None:
-    trainings.failing = True
+    trainings.failing_code = 2
     messages: list[str] = []
     with pytest.raises(UnjamError, match="no training of 3 trials ended; their logs are in"):
         search(BASE, SPACE, 3, tmp_path, 2, on_message=messages.append)

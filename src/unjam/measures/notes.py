@@ -119,10 +119,11 @@ def _unfinished_trip_notes(rows_by_driver: RowsByDriver) -> list[str]:
             delayed += [label] if sum(delay_shares) > MAX_DELAY_SHARE * len(delay_shares) else []
     if not shares:
         return []
-    congested = f" (traffic is still congested: {', '.join(delayed)})" if delayed else ""
+    which = "" if delayed == [*shares] else f" with {'; '.join(delayed)}"
+    congested = f" (traffic is still congested{which})" if delayed else ""
     most = 100 * max(shares.values())
     return [
-        f"{', '.join(shares)}: up to {most:.0f} % of the vehicles are under way or waiting at the end{congested}; "
+        f"{'; '.join(shares)}: up to {most:.0f} % of the vehicles are under way or waiting at the end{congested}; "
         "their travel time counts until then, and a later --end shows more of it"
     ]
 

@@ -97,6 +97,7 @@ class XmlReader:
         self._write = out.write if out else None
         self._dropped_depth = 0  # depth of open elements within a dropped one, itself included
         self._open_type = ""  # the outermost open type or distribution of types; empty: none
+        self._changed_attributes: XmlAttributes = {}  # those of the last type
         self._renamed_tags: dict[str, str] = {}  # names under which elements are written, if they differ
         self._harmless_names: set[str] = set()  # attributes that name no file, as far as known
         self._parsers: list[Any] = []
@@ -158,7 +159,7 @@ class XmlReader:
             self.root, self.version = tag, attributes.get("version", "")
         if (handler := self._handlers.get(tag)) is not None:
             handler(attributes)
-        if tag in CHECKED_ELEMENTS or not self._harmless_names.issuperset(attributes):
+        if tag in CHECKED_ELEMENTS or self._changed_attributes or not self._harmless_names.issuperset(attributes):
             self._process_element(tag, attributes)
         elif self._write is not None:
             self._write_start(tag, attributes)
@@ -190,7 +191,10 @@ class XmlReader:
             self._open_type = self._open_type or tag
             self._parsers[-1].EndElementHandler = self._on_end
         if tag == "vType":
-            harmless |= self._type_changes.get(harmless.get("id", ""), {})
+            self._changed_attributes = self._type_changes.get(harmless.get("id", ""), {})
+            harmless |= self._changed_attributes
+        elif tag.startswith(FOLLOWING_MODEL_PREFIX):  # its attributes would replace those of the type around it
+            harmless = {name: value for name, value in harmless.items() if name not in self._changed_attributes}
         self._write_start(tag, harmless)
         if tag in EXTERNAL_ELEMENTS and attributes.get("file"):
             self._renamed_tags = dict.fromkeys(EXTERNAL_ELEMENTS, "content")  # nested in itself it would crash SUMO

@@ -31,7 +31,7 @@ from unjam.measures.recommendation import (
     road_verdict,
 )
 from unjam.measures.statistics import metric_estimate
-from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, write_assessment
+from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, keep_earlier_answer, write_assessment
 from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
@@ -96,6 +96,11 @@ class AssessmentRequest:
     def options(self) -> list[Option]:
         """All penetration rates with all controllers."""
         return [Option(rate, driver) for rate in self.penetration_rates for driver in self.drivers]
+
+    @property
+    def compared_options(self) -> list[Option]:
+        """All that may be simulated: the human baseline, ACC vehicles and the controllers."""
+        return [HUMAN_BASELINE, *(Option(rate, ACC_DRIVER) for rate in self.penetration_rates), *self.options]
 
     @property
     def has_acc_properties(self) -> bool:
@@ -244,7 +249,9 @@ def assess(
     first = evaluate_options("simulating the human baseline, seed 1 of 1", [HUMAN_BASELINE], held_out_seeds(1), True)
     budget.spend(1)
     raise_failure(first.rows[HUMAN_BASELINE.label])
-    for line in budget_lines(request, budget):
+    setups = {log.setup_hash(*request.make_setup(option)) for option in request.compared_options}
+    stored_episodes = sum(setup in setups for setup, _ in log.episodes)
+    for line in budget_lines(request, budget, stored_episodes):
         on_message(line)
     selection = select_controllers(request.options, partial(run_options, "tuning"), budget, on_message)
     selection_episodes = budget.used_episodes - 1
@@ -276,28 +283,34 @@ def assess(
     }
     save_evaluation(folder / SELECTION_FOLDER, Evaluation(selection_rows, {}), metadata)
     save_evaluation(folder, Evaluation(test_rows, plot_episodes), metadata)
+    if kept_page := keep_earlier_answer(folder, rates, request.drivers):
+        on_message(f"the answer to the earlier question is now in {kept_page}")
     atomic_write(folder / ASSESSMENT_FILE, to_json(document, indent=1))
     page = write_assessment(folder, folder / ASSESSMENT_PAGE)
     return Assessment(findings.controller_results, findings.acc_results, json.loads(to_json(document)), page)
 
 
-def budget_lines(request: AssessmentRequest, budget: EpisodeBudget) -> list[str]:
+def budget_lines(request: AssessmentRequest, budget: EpisodeBudget, stored_episodes: int = 0) -> list[str]:
     """Return how long a verdict and the whole budget take, and a smaller question, one line each."""
 
+    def seconds(episodes: int) -> float:
+        return budget.estimate_seconds(max(0, episodes - stored_episodes))
+
     def duration(episodes: int) -> str:
-        return f"{format_count(episodes, 'episode')}, about {format_duration(budget.estimate_seconds(episodes))}"
+        stored = f", {min(stored_episodes, episodes):,} of them stored" if stored_episodes else ""
+        return f"{format_count(episodes, 'episode')}{stored}, about {format_duration(seconds(episodes))}"
 
     needed, limit = request.verdict_episodes, f" or {request.minutes:g} min" if request.minutes else ""
     lines = [f"a verdict needs at least {MIN_VERDICT_SEEDS} test seeds: {duration(needed)}"]
     too_small = ", which is too small for a verdict" if request.episodes < needed else ""
     lines.append(f"the budget is at most {duration(request.episodes)}{limit}{too_small}")
     fewest = min_episodes(len(request.penetration_rates), len(request.drivers), request.has_acc_properties)
-    if request.minutes and (seconds := budget.estimate_seconds(fewest)) > 60.0 * request.minutes:
+    if request.minutes and seconds(fewest) > 60.0 * request.minutes:
         lines.append(
-            f"an answer takes longer than {request.minutes:g} min: about {format_duration(seconds)}, "
+            f"an answer takes longer than {request.minutes:g} min: about {format_duration(seconds(fewest))}, "
             "as each option is simulated at least once"
         )
-    elif request.minutes and budget.estimate_seconds(needed) > 60.0 * request.minutes:
+    elif request.minutes and seconds(needed) > 60.0 * request.minutes:
         lines.append(f"{request.minutes:g} min are too short for a verdict")
     small = request.smallest_question
     if len(request.options) > 1:

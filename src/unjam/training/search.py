@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from optuna import Study, create_study
+from optuna.distributions import CategoricalDistribution
 from optuna.samplers import TPESampler
 from optuna.trial import TrialState, create_trial
 
-from unjam.errors import InputError, UnjamError, invalid_value
+from unjam.errors import DiskError, InputError, UnjamError, invalid_value
 from unjam.files import atomic_write, to_json
 from unjam.learners.settings import unused_tables
 from unjam.manifest import manifest
@@ -24,6 +25,7 @@ from unjam.reports.results import read_progress, validation_gains
 from unjam.text import format_count
 from unjam.training.config import CONFIG_FILE, RunConfig, load_config, to_toml
 from unjam.training.executors import CommandLine, Executor, MessageCallback, open_executor, training_command
+from unjam.training.fingerprint import fingerprint
 from unjam.training.run_folder import check_config
 from unjam.training.search_space import SearchSpace, boundary_values
 from unjam.training.trial_log import TRIALS_FILE, TrialLog
@@ -31,6 +33,10 @@ from unjam.training.trial_log import TRIALS_FILE, TrialLog
 SEARCH_FILE, BEST_CONFIG_FILE = "search.json", "best.toml"
 MESSAGE_INTERVAL = 30.0
 """time without a message after which the progress of trainings is shown [s]"""
+
+
+TRIAL_FAILURE_CODES = (UnjamError.exit_code, InputError.exit_code)
+"""exit codes with which a trial has failed for good; it resumes after others, as of a full disk"""
 
 
 def check_search_space(base: RunConfig, space: SearchSpace) -> None:
@@ -74,9 +80,9 @@ def search(
 
     The folder gets `search.json`, and `best.toml` for `unjam train --config`. An interrupted search resumes, also with
     more `trials` in total. `base` and `space` must pass `check_search_space`. Raise `InputError` if the folder has
-    another search, `UnjamError` if all trainings failed.
+    another search, `UnjamError` if all trainings failed or one was stopped: then the same search resumes.
     """
-    log = TrialLog(folder, {"config": asdict(base), "space": repr(space)})
+    log = TrialLog(folder, {"config": asdict(base), "space": repr(space), "files": _file_hashes(base, space)})
     atomic_write(folder / CONFIG_FILE, to_toml(base))  # below it, files may only name trusted code
     study = _restore_study(log, space)
     proposed = _propose_trials(study, log, space, trials, base.seed)
@@ -92,8 +98,10 @@ def search(
                 on_message(_running_line(folder, jobs.values(), base.steps))
             for done in ended_jobs:
                 number = jobs.pop(done)
-                has_failed = done.result() != 0
-                objective = None if has_failed else _objective(_trial_folder(folder, number), space)
+                if (code := done.result()) not in (0, *TRIAL_FAILURE_CODES):  # a full disk would end all others, too
+                    reason = f"trial {number} was stopped with exit code {code}; its log: {_log_file(folder, number)}"
+                    raise (DiskError if code == DiskError.exit_code else UnjamError)(reason)
+                objective = _objective(_trial_folder(folder, number), space) if code == 0 else None
                 log.append({"trial": number, "objective": objective})
                 study.tell(number, objective, state=TrialState.FAIL if objective is None else None)
                 on_message(_progress_line(study, number, trials))
@@ -113,6 +121,13 @@ def search(
     return results
 
 
+def _file_hashes(base: RunConfig, space: SearchSpace) -> dict[str, str]:
+    """Return the hashes of all experts and files of the user that a trial may use."""
+    choices = ((key, each) for key, each in space.items() if isinstance(each, CategoricalDistribution))
+    configs = [base, *(trial_config(base, {key: value}) for key, each in choices for value in each.choices)]
+    return {name: sha256 for config in configs for name, sha256 in fingerprint(config)["files"].items()}
+
+
 def _make_trial(folder: Path, number: int, values: dict[str, Any], has_failed: bool) -> SearchTrial:
     trial_folder = _trial_folder(folder, number)
     gains = None if has_failed else validation_gains(read_progress(trial_folder))
@@ -126,9 +141,13 @@ def _trial_folder(folder: Path, number: int) -> Path:
 def _trial_command(base: RunConfig, folder: Path, number: int, values: dict[str, Any]) -> CommandLine:
     config = trial_config(base, values)
     short_evaluation = replace(config.evaluation, baselines=(), episodes=1)  # test seeds do not count in a search
-    config_file, log = (folder / "configs" / f"{number:04d}{suffix}" for suffix in (".toml", ".log"))
+    log = _log_file(folder, number)
     config = replace(config, workers=1, evaluation=short_evaluation)
-    return training_command(config, _trial_folder(folder, number), config_file, log)
+    return training_command(config, _trial_folder(folder, number), log.with_suffix(".toml"), log)
+
+
+def _log_file(folder: Path, number: int) -> Path:
+    return folder / "configs" / f"{number:04d}.log"
 
 
 def _restore_study(log: TrialLog, space: SearchSpace) -> Study:

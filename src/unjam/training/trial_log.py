@@ -5,14 +5,17 @@ from contextlib import suppress
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
+from reprlib import repr as short_repr
 from typing import Any
 
 from unjam.errors import InputError
 from unjam.files import append_line, atomic_write, read_json_lines, to_json
 from unjam.manifest import manifest
+from unjam.parameters import flatten_keys
 from unjam.training.run_folder import make_new_folder
 
 REQUEST_FILE, TRIALS_FILE = "request.json", "trials.jsonl"
+FILES_PREFIX = "files."  # of the keys of hashes of files in a flat request
 
 TrialVerdict = tuple[float | None, str]
 """score and reason; no score if the trial does not count"""
@@ -39,8 +42,10 @@ class RowLog:
             stored = {}
             with suppress(ValueError, RecursionError, OSError):
                 stored = json.loads(path.read_text(encoding="utf-8"))
-            if not isinstance(stored, dict) or stored.get("request") != request:
-                raise InputError(f"out: {str(folder)!r} was made with other settings; allowed: a new folder")
+            stored = stored if isinstance(stored, dict) else {}
+            if (before := stored.get("request")) != request:
+                reason = f" ({_first_change(before, request)})" if isinstance(before, dict) else ""
+                raise InputError(f"out: {str(folder)!r} was made with other settings{reason}; allowed: a new folder")
             starts = stored.get("starts")
             if not isinstance(starts, list) or not all(isinstance(each, dict) for each in starts):
                 raise InputError(f"out: {REQUEST_FILE} in {str(folder)!r} is damaged; allowed: a new folder")
@@ -58,6 +63,15 @@ class RowLog:
         """Add a row; it is on the disk when this returns."""
         self.rows.append(row)
         append_line(self._path, to_json(row))
+
+
+def _first_change(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """Return the first setting or file in which two requests differ, as a clause."""
+    old, new = flatten_keys(before), flatten_keys(now)
+    name = next(key for key in {**new, **old} if key not in old or key not in new or old[key] != new[key])
+    if name.startswith(FILES_PREFIX):
+        return f"{name.removeprefix(FILES_PREFIX)} has changed"
+    return f"{name}: {short_repr(old.get(name))} there, {short_repr(new.get(name))} now"
 
 
 class TrialLog(RowLog):

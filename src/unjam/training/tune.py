@@ -19,6 +19,7 @@ from optuna.trial import Trial, TrialState
 from unjam.controller.file import SUFFIX, controller_bytes
 from unjam.drivers.driver import label_with_parameters
 from unjam.drivers.registry import driver_from_name
+from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import InputError, UnjamError, invalid_value, unknown_name
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
