@@ -9,11 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from unjam.controller.file import controller_bytes
 from unjam.drivers import IDM, LocalState, PISaturation, check_driver
 from unjam.drivers.driver import Driver, Memory
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.errors import InputError
-from unjam.files import to_json
+from unjam.files import sha256_of, to_json
 from unjam.measures.metrics import METRICS, measure
 from unjam.reports.results import read_results
 from unjam.scenarios import Ring
@@ -36,6 +37,18 @@ def test_every_driver_has_a_row_for_every_seed(drive_result: DriveResult) -> Non
     for rows in drive_result.rows.values():
         assert [row["seed"] for row in rows] == [4, 5, 6]
         assert {row["status"] for row in rows} == {"completed"}
+
+
+def test_hash_of_a_controller_is_that_of_the_file_that_drove(tmp_path: Path) -> None:
+    file, first = tmp_path / "mine.unjam", controller_bytes(PISaturation(), {})
+    file.write_bytes(first)
+
+    def replace_controller(episode: object, steps: int) -> None:
+        file.write_bytes(controller_bytes(PISaturation(window=20.0), {}))
+
+    drive("ring", str(file), 1, scenario_options=ROAD, workers=1, out=tmp_path / "out", progress=replace_controller)
+    assert file.read_bytes() != first
+    assert read_results(tmp_path / "out").metadata["controllers"] == {str(file): sha256_of(first)}
 
 
 def test_drivers_have_the_order_of_all_tables_and_the_mean_is_of_the_first_that_was_given() -> None:

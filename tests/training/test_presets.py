@@ -38,7 +38,7 @@ def test_preset_changes_only_its_keys(name: str) -> None:
 
 def test_demo_on_the_jammed_ring_is_short() -> None:
     made = load_config(preset="demo", changes={"scenario": "ring-jammed"})
-    assert (made.scenario, made.backend, made.steps) == ("ring-jammed", "batch", 288_000)
+    assert (made.scenario, made.backend, made.steps) == ("ring-jammed", "batch", 576_000)
     assert made.evaluation.baselines[0] == "human"
     assert load_config(preset="demo").backend == "sumo"
 

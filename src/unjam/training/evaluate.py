@@ -314,6 +314,7 @@ def evaluate_run(
     `config.evaluation` may be another than that of the run. The `notes` are stored before all others.
     """
     scenario, drivers = config.make_scenario(), drivers_to_compare(config, folder)
+    hashes = _controller_hashes({TRAINED_LABEL: str(folder)})  # now: files may change while episodes run
     seeds = held_out_seeds(config.evaluation.episodes)
     evaluation = evaluate(scenario, drivers, seeds, workers, config.reward, progress, config.episode_backend)
     metadata = {
@@ -322,7 +323,7 @@ def evaluate_run(
         "backend": config.episode_backend,
         "trained": TRAINED_LABEL,
         "expert": config.make_expert().describe() if config.expert != "none" else "none",
-        "controllers": _controller_hashes({TRAINED_LABEL: str(folder)}),
+        "controllers": hashes,
         "notes": [
             *notes,
             *episode_notes(evaluation.rows),
@@ -411,6 +412,7 @@ def drive(
         else:
             made = as_driver(entry, road.control_step)
             drivers[unique_label(made, drivers)] = made
+    hashes = _controller_hashes({label: label for label in drivers})  # now: files may change while episodes run
     for name, one in drivers.items():
         check_can_drive(one, road, f"driver {name}")
     if not drivers:
@@ -436,7 +438,6 @@ def drive(
         if folder is not None and has_results:
             name = reward_label(reward or road.reward)
             metadata = {"scenario": Path(scenario).name, "reward": name, "backend": backend_label(backend)}
-            hashes = _controller_hashes({label: label for label in drivers})
             contents = {"manifest": manifest(), "controllers": hashes, "notes": notes, "baseline": baseline}
             save_evaluation(folder, evaluation, {**metadata, **contents})
             from unjam.reports.html import write_report_page  # imported late: it draws
