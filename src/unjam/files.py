@@ -14,7 +14,7 @@ import time
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -223,6 +223,26 @@ def sha256_of_file(path: Path) -> str:
     """Return the SHA-256 of a file, without reading it into memory as a whole."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+class FileWatch:
+    """Notices when the content of files changes, so that no result mixes two versions of them."""
+
+    def __init__(self, paths: Iterable[Path]) -> None:
+        self._files = {path: (_stamp(path), sha256_of_file(path)) for path in paths}
+
+    def check(self) -> None:
+        """Raise `InputError` if a file has changed since the watch began."""
+        for path, (stamp, sha256) in self._files.items():
+            with suppress(OSError):
+                if _stamp(path) == stamp or sha256_of_file(path) == sha256:
+                    continue
+            raise InputError(f"{path.name}: has changed since the start; allowed: files that stay as they are")
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_mtime_ns, status.st_size
 
 
 def to_json(value: Any, indent: int | None = None) -> str:

@@ -16,7 +16,7 @@ from unjam.controller import DEFAULT_DRIVER, make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable
 from unjam.errors import InputError, NoCavError, invalid_value
-from unjam.files import atomic_write, to_json
+from unjam.files import FileWatch, atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import HARD_BRAKING_METRIC
 from unjam.measures.notes import check_baseline, episode_notes
@@ -206,6 +206,7 @@ def assess(
     if log.episodes:
         known = f"{format_count(len(log.episodes), 'episode')} of earlier calls in {folder}"
         on_message(f"{known}: not simulated again for the same controllers; data that their code reads is not compared")
+    watch = FileWatch(request.network.user_files)
     budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
 
     def evaluate_options(
@@ -230,6 +231,7 @@ def assess(
             numbers = f"seeds {first} to {last}" if first < last else f"seed {first}"
             stage = f"simulating {kind} {numbers} of {format_count(len(new_options), 'option')}"
             new_rows = evaluate_options(stage, [*new_options], new_seeds).rows
+            watch.check()
             for option in new_options:
                 log.add(hashes[option], new_seeds, new_rows[option.label])
         budget.spend(len(options) * len(seeds), len(new_options) * len(new_seeds))

@@ -17,7 +17,7 @@ from optuna.samplers import TPESampler
 from optuna.trial import TrialState
 
 from unjam.errors import EpisodeError, InputError, LostWorkerError, UnjamError, invalid_value, unknown_name
-from unjam.files import atomic_write, sha256_of_file, to_json
+from unjam.files import FileWatch, atomic_write, sha256_of_file, to_json
 from unjam.manifest import manifest
 from unjam.measures.detectors import Agreement, Measurement, aggregate_passages, compute_agreement, read_detectors
 from unjam.measures.metrics import UNBOUNDED
@@ -246,7 +246,7 @@ def calibrate(
     does not depend on the number of processes. Raise `UnjamError` if SUMO cannot simulate the original network, or if
     its process was lost repeatedly.
     """
-    original = dict.fromkeys(space, 1.0)
+    original, watch = dict.fromkeys(space, 1.0), FileWatch((corridor.detectors, *corridor.files.sources))
     log = TrialLog(folder, corridor.metadata() | {"space": repr(space), "seeds": seeds_per_trial, "seed": seed})
     measurements = corridor.measurements
 
@@ -254,6 +254,7 @@ def calibrate(
         with PrivateFolder() as private:
             scenario = corridor.scenario(_write_network(corridor, factors, Path(private) / CALIBRATED_NETWORK_FILE))
             runs = simulator.run(scenario, seeds, corridor.loops)
+        watch.check()
         flows_and_speeds = (aggregate_passages(measurements, corridor.loop_numbers, passages) for passages in runs)
         return [compute_agreement(measurements, *each) for each in flows_and_speeds]
 

@@ -20,7 +20,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_names, unique_label
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, error_from_name, invalid_value, unknown_name
-from unjam.files import atomic_write, make_folder, remove_leftovers, sha256_of, to_json
+from unjam.files import FileWatch, atomic_write, make_folder, remove_leftovers, sha256_of, to_json
 from unjam.manifest import manifest
 from unjam.measures.effect import effects_by_driver
 from unjam.measures.feasibility import feasibility_by_driver
@@ -224,11 +224,14 @@ def evaluate_on_roads(
     remote = [pair for pair in pairs if tasks[pair].is_serializable]
     local = [pair for pair in pairs if not tasks[pair].is_serializable]
 
+    watch = FileWatch({file for scenario, _ in drivers.values() for file in scenario.user_files})
+
     def on_progress(pair: tuple[str, int], steps: int) -> None:
         if progress is not None:
             progress(pair, steps)
 
     def measure_task(pair: tuple[str, int], episode: Episode) -> tuple[dict[str, Any], Episode | None]:
+        watch.check()
         return measure(episode), episode if with_plots and pair[1] == 0 and episode.has_run else None
 
     measured = workers.run_and_map(

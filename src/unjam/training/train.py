@@ -16,7 +16,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import InputError, invalid_value
-from unjam.files import UNREADABLE_ERRORS, append_line, atomic_write, make_folder, to_json
+from unjam.files import UNREADABLE_ERRORS, FileWatch, append_line, atomic_write, make_folder, to_json
 from unjam.kernels import needs_new_process
 from unjam.learners.agent import AgentSpec, check_network, check_state, learner_class, reporting_user_errors
 from unjam.learners.algorithm import (
@@ -196,6 +196,7 @@ class Trainer:
     ) -> None:
         self.folder, self.config, self.workers = folder, config, workers
         self.tasks = config.make_tasks()
+        self._watch = FileWatch({file for task in self.tasks for file in task.scenario.user_files})
         self.folders = [folder / task.name for task in self.tasks]
         string_gain = self._string_gain_function() if config.policy.max_string_gain else None
         self.spec = AgentSpec(self.tasks, config.policy, config.model, config.learner.gamma, config.seed, string_gain)
@@ -311,6 +312,7 @@ class Trainer:
             whole, *tasks = self._progress_rows(log, validation)
         now = self._fingerprint["files"] | code_hashes(self.config)
         check_file_hashes(self._fingerprint, {"files": now}, "train")  # an iteration of changed code is not stored
+        self._watch.check()
         for folder, row in [*zip(self.folders, tasks, strict=False), (self.folder, whole)]:
             append_line(folder / run_folder.PROGRESS_FILE, to_json(row))
         self._save_checkpoint()

@@ -21,7 +21,7 @@ from unjam.drivers.driver import label_with_parameters
 from unjam.drivers.registry import driver_from_name
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import InputError, UnjamError, invalid_value, unknown_name
-from unjam.files import atomic_write, to_json
+from unjam.files import FileWatch, atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, overall_feasibility
 from unjam.measures.gain import MEAN_GAIN, EpisodeRows, normalized_gain, performance_bound
@@ -196,6 +196,7 @@ def tune(
     request |= {"files": files} if files else {}
     request |= {"max_string_gain": max_string_gain} if max_string_gain else {}
     log = TrialLog(folder, request | {"seed": seed, "screen": bool(screened), "backend": backend})
+    watch = FileWatch({file for road in roads.values() for file in road.user_files})
     points = find_operating_points(roads, workers) if max_string_gain else {}
     sumo_runners = dict.fromkeys(roads, partial(_run_in_sumo, workers))
     trial_runners = sumo_runners | dict.fromkeys(screened, _run_in_batch)
@@ -212,6 +213,7 @@ def tune(
         new = [each for each in drivers if each not in scores and (first, each) not in log.verdicts]
         new = list(dict.fromkeys(new))
         for driver, rows in zip(new, _run_drivers(roads, new, first, count, (reward, backend), runners), strict=True):
+            watch.check()
             log.add(first, driver, _score_rows(rows, human_rows(first, count)))
         scores |= {each: log.verdicts[first, each] for each in drivers if each not in scores}
         return [TuningTrial(each, values, *scores[each]) for each, values in zip(drivers, settings, strict=True)]

@@ -1,0 +1,73 @@
+"""No result mixes two versions of a user's network: a file that changes while a command runs ends it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from optuna.distributions import FloatDistribution
+
+from tests.training.test_assess import FLOW, HELD
+from tests.training.test_run import small_config
+from tests.worlds.sumo.user_networks import straight
+from unjam.errors import InputError
+from unjam.scenarios import make_scenario
+from unjam.training.assess import assess, make_request
+from unjam.training.calibrate import FACTOR_RANGES, calibrate, load_corridor
+from unjam.training.evaluate import drive
+from unjam.training.train import train
+from unjam.training.tune import tune
+from unjam.worlds.sumo.detectors import DetectorPool
+from unjam.worlds.worker_pool import WorkerPool
+
+DETECTORS = "edge,position,begin,end,flow_veh_per_h,speed\nroad,100,0,30,1800,10\n"
+CommandRunner = Callable[[str, Path, Callable[[], object]], object]
+"""runs a command on a network with results in a folder, and calls the function while it runs"""
+
+
+def run_drive(file: str, out: Path, change: Callable[[], object]) -> None:
+    drive(file, "acc", 2, scenario_options={**HELD, "penetration_rate": 0.5}, out=out, progress=lambda *_: change())
+
+
+def run_assess(file: str, out: Path, change: Callable[[], object]) -> None:
+    with WorkerPool(1) as workers:
+        assess(make_request(file, [0.5], 40, 0.02, None, ["acc"], HELD), out, workers, on_stage=lambda *_: change())
+
+
+def run_tune(file: str, out: Path, change: Callable[[], object]) -> None:
+    roads = {"mine": make_scenario(file, {**HELD, "penetration_rate": 1.0, "horizon": 40})}
+    with WorkerPool(1) as workers:
+        space = {"time_gap": FloatDistribution(1.0, 2.0)}
+        tune(roads, "acc", space, 9000, out, workers, on_message=lambda _: change())
+
+
+def run_calibrate(file: str, out: Path, change: Callable[[], object]) -> None:
+    detectors = Path(file).with_name("detectors.csv")
+    detectors.write_text(DETECTORS)
+    space = {"tau": FACTOR_RANGES["tau"]}
+    with DetectorPool(1) as pool:
+        calibrate(load_corridor(file, detectors), out, pool, space, 3, 1, on_message=lambda _: change())
+
+
+def run_training(file: str, out: Path, change: Callable[[], object]) -> None:
+    options = {**HELD, "penetration_rate": 1.0, "horizon": 100}
+    config = small_config(scenario=file, scenario_options=options, model__model_ratio=0.0)
+    train(config, out, on_iteration=lambda _: change() is None)
+
+
+@pytest.mark.parametrize("run", [run_drive, run_assess, run_tune, run_calibrate, run_training])
+def test_command_ends_if_a_file_of_the_network_changes(run: CommandRunner, tmp_path: Path) -> None:
+    file = straight(tmp_path, FLOW, length=200.0, end=30.0)
+    demand = file.with_name("demand.rou.xml")
+
+    def change() -> None:
+        demand.write_text(demand.read_text().replace('period="2"', 'period="9"'))
+
+    with pytest.raises(InputError, match=r"^demand\.rou\.xml: has changed since the start; allowed"):
+        run(str(file), tmp_path / "out", change)
+    assert 'period="9"' in demand.read_text()
+
+
+def test_command_goes_on_if_the_content_is_the_same(tmp_path: Path) -> None:
+    file = straight(tmp_path, FLOW, length=200.0, end=30.0)
+    run_drive(str(file), tmp_path / "out", file.touch)
+    assert (tmp_path / "out" / "evaluation.json").is_file()
