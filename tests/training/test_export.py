@@ -12,6 +12,7 @@ from tests.pictures import empty_pictures
 from tests.training.test_run import small_config
 from unjam.adapters import onnx_driver
 from unjam.adapters.stable_baselines3_export import stable_baselines3_bytes
+from unjam.adapters.stable_baselines3_file import read_policy
 from unjam.controller import certificate, load_controller, packaged_file, string_stability
 from unjam.controller.file import (
     GRAPH_PART,
@@ -163,6 +164,7 @@ def test_stable_baselines3_loads_the_residual(agent: str, run: Path, tmp_path: P
     actions, _ = model.predict(observations, deterministic=True)
     np.testing.assert_allclose(actions[:, 0], controller.network(observations.astype(np.float64)), atol=1e-5)
     assert np.abs(actions).max() > 0.0
+    np.testing.assert_allclose(read_policy(path).predict(observations.astype(np.float64))[0], actions, atol=1e-5)
 
 
 def test_a_formula_is_no_model_of_stable_baselines3(tmp_path: Path) -> None:

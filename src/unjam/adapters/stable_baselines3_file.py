@@ -29,7 +29,17 @@ ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {"Tanh": np.tanh, "ReLU": l
 POLICY_PACKAGES = ("stable_baselines3.", "sb3_contrib.")
 HARMLESS_POLICY_OPTIONS = {
     *("net_arch", "log_std_init", "ortho_init", "optimizer_class", "optimizer_kwargs", "share_features_extractor"),
-    *("n_critics", "n_quantiles", "clip_mean", "full_std", "use_expln", "normalize_images", ":type:", ":serialized:"),
+    *(
+        "n_critics",
+        "n_quantiles",
+        "clip_mean",
+        "full_std",
+        "use_expln",
+        "normalize_images",
+        "use_sde",
+        ":type:",
+        ":serialized:",
+    ),
 }
 """options of policies that do not change their deterministic actions, or that the shapes of the weights show"""
 
@@ -92,7 +102,7 @@ def read_policy(path: Path) -> SavedPolicy:
         weights = _read_weights(parts[POLICY_PART])
         observed, acted = (_read_box(data[f"{name}_space"]) for name in ("observation", "action"))
         actor = _find_actor(weights)
-        activation = _read_activation(data, actor)
+        activation, is_squashed = _read_options(data, actor)
         layers = _read_layers(weights, actor)
         exported = dict(data.get("unjam", {}))
         if acted.shape != (1,) or layers[-1][1].shape != (1,):
@@ -104,7 +114,7 @@ def read_policy(path: Path) -> SavedPolicy:
     except Exception as error:  # damaged files cause any error, also in torch
         hint = "allowed: an MlpPolicy of Stable-Baselines3 with a Box of one action; others as Python objects"
         raise InputError(f"driver {path.name}: {type(error).__name__}: {one_line(error)}; {hint}") from None
-    return SavedPolicy(observed, acted, layers, activation, actor.is_squashed, exported)
+    return SavedPolicy(observed, acted, layers, activation, is_squashed, exported)
 
 
 def _read_parts(content: bytes, names: Sequence[str] | None = None) -> dict[str, bytes]:
@@ -167,18 +177,18 @@ def _find_actor(weights: dict[str, Floats]) -> _Actor:
     raise ValueError("its weights are not those of an MlpPolicy with continuous actions")
 
 
-def _read_activation(data: dict[str, Any], actor: _Actor) -> Callable[[Floats], Floats]:
+def _read_options(data: dict[str, Any], actor: _Actor) -> tuple[Callable[[Floats], Floats], bool]:
+    """Return the activation of the hidden layers, and whether the output is a tanh."""
     options = dict(data["policy_kwargs"])
     name = re.sub(r".*\.|'>", "", options.pop("activation_fn", actor.activation))
     if not data["policy_class"]["__module__"].startswith(POLICY_PACKAGES):
         raise ValueError("its policy class is not one of Stable-Baselines3")
-    if data.get("use_sde") or options.pop("use_sde", False):
-        raise ValueError("use_sde")
+    is_squashed = actor.is_squashed or options.pop("squash_output", False) is True
     if unknown := options.keys() - HARMLESS_POLICY_OPTIONS:
         raise ValueError(f"policy_kwargs {min(unknown)}")
     if name not in ACTIVATIONS:
         raise ValueError(f"activation {name}; known: {', '.join(ACTIVATIONS)}")
-    return ACTIVATIONS[name]
+    return ACTIVATIONS[name], is_squashed
 
 
 def _read_layers(weights: dict[str, Floats], actor: _Actor) -> list[tuple[Floats, Floats]]:
