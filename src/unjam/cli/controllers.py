@@ -92,8 +92,8 @@ def certify_command(
 
     In the tests, leaders brake to a standstill from every state of the sample, an adversarial leader searches
     for contact, and leaders oscillate at many frequencies. The certificate becomes a part of the file, and
-    `unjam verify` checks it. A signed file is refused. A packaged controller stays as it is, and is tested with the
-    filter and the car of its road, whatever car it was made for.
+    `unjam verify` checks it. A signed file is refused. A packaged controller is not modified: it is tested with
+    the safety filter and the actuator of its road.
 
     Examples:
 
@@ -119,7 +119,7 @@ def certify_command(
     certificate = make_certificate(controller)
     assert isinstance(controller.driver, FilteredDriver)  # only such drivers are certified
     verdict = describe_string_stability(certificate, controller.driver)
-    # The page may be refused: before the file changes.
+    # If the page cannot be written, the controller must stay unchanged.
     write_certificate_page(file.name, controller.driver, certificate, verdict, target)
     if not is_packaged:
         add_certificate(file, controller, certificate)
@@ -154,9 +154,9 @@ def verify_command(
 ) -> None:
     """Check each part of a controller: hashes, signature, driver, and that its forms agree on its sample.
 
-    A line for each part says that it was checked and how, that it is absent, or that it is stated by the maker
-    and cannot be checked. The exit code is 2 if a check fails or a folder names Python code that is not trusted,
-    and 3 if a package is missing that a check needs.
+    Each line gives the status of a part: checked and how, absent, or stated by the author and not verifiable. The
+    exit code is 2 if a check fails or a folder names Python code that is not trusted, and 3 if a package is missing
+    that a check needs.
 
     Examples:
 
@@ -184,8 +184,8 @@ def keys_command(
 ) -> None:
     """Make a key pair to sign controllers: NAME.key, which you keep secret, and NAME.pub for others.
 
-    Existing files are not overwritten. NAME.key has no password: only your user can read it, and anyone with a
-    copy can sign in your name.
+    Existing files are not overwritten. The key has no password: only your user can read it, and anyone with a copy
+    can sign in your name.
 
     Example:
 

@@ -58,8 +58,8 @@ DEFAULT_WORKERS = os.cpu_count() or 1
 def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Replace parameters of a command by groups of options.
 
-    A group is a function whose parameters are options. On the command line they replace the parameter that has
-    the name of the group; the command is called with the return value of the function for this parameter.
+    A group is a function whose parameters are options. They replace the command's parameter of the same name, which
+    receives the return value of the function.
     """
     members = {name: inspect.signature(group).parameters for name, group in groups.items()}
 
@@ -212,6 +212,6 @@ def merge_settings(options: dict[str, Any], settings: dict[str, Any]) -> dict[st
 
 
 def check_page_path(path: Path) -> None:
-    """Raise `InputError` unless a path ends in .html or .htm, so that no other file is overwritten by mistake."""
+    """Raise `InputError` unless a path ends in .html or .htm, which prevents overwriting another file."""
     if path.suffix.lower() not in (".html", ".htm"):
         raise invalid_value("out", str(path), "a file that ends in .html")
