@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
-from shutil import copyfile, rmtree
 from typing import Any, cast
 
 import numpy as np
@@ -27,31 +26,28 @@ from unjam.drivers.policy import PolicyDescription, PolicyInput
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.smooth_acc import SmoothACC
 from unjam.errors import InputError
-from unjam.files import make_folder
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
 from unjam.measures.metrics import METRICS, measure
 from unjam.measures.statistics import estimate_on_shared_seeds
 from unjam.onnx_models import parse_model
 from unjam.physics.arrays import Array, Floats
-from unjam.reports.results import read_progress
 from unjam.scenarios import Recorded
 from unjam.scenarios.road import RecordedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import raise_failure
-from unjam.training.train import train
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.fuel_optimal_plan import PlanLimits, PlannedDriver, plan_speeds
 from unjam_paper.parameter_search import SearchBudget, measure_candidates, search_parameters
+from unjam_paper.recorded_residuals import RESIDUALS_PART, planned_residuals, residuals_table, train_residual
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, trainings_text
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
 
 TUNED_METHOD = "smooth-acc"
 """the law that residuals are added to"""
-SEARCH_PART, RESIDUALS_PART, SUMO_FUEL_PART = "search", "residuals", "in SUMO"
+SEARCH_PART, SUMO_FUEL_PART = "search", "in SUMO"
 TRAINING_DRIVES_PART, TEST_DRIVES_PART = "training drives", "test drives"
 STANDARD_SETTING = "as tuned"
 DRIVE_SETTINGS: dict[str, dict[str, Any]] = {
@@ -113,20 +109,6 @@ PLAN_LABEL = "plan that knows the recording"
 DRIVES_PARTS = {TRAINING_DRIVES_PART: TRAINING_MONTH, TEST_DRIVES_PART: TEST_MONTH}
 SETTING_METRICS = "fuel_by_power", "cav_mean_gap", "min_time_gap", "feasibility"
 SUMO_METRICS = ("fuel_ml_per_km", "fuel_by_power")
-STEPS_PER_ITERATION, TRAINING_STEPS = 400_000, 4_000_000
-"""environment steps; with the model, model steps are a part of them"""
-TRAINING_CHANGES: dict[str, Any] = {
-    **{"scenario": "recorded", "backend": "batch", "scenario_options.window": 200.0, "workers": 1},
-    **{"policy.history_features": True, "policy.authority": 0.15},
-    **{"policy.exploration_std": 0.03, "policy.learn_exploration_std": False},
-    **{"trpo.target_kl": 0.01, "trpo.critic_batch_size": 2_000},
-    **{"evaluation.validation_episodes": 64, "evaluation.validation_interval": 3},
-    **{"evaluation.episodes": 2, "evaluation.baselines": []},
-}
-"""the best of nine trials in validation, one training each with up to 12,000,000 steps; windows are drawn from the
-training drives"""
-MODEL_RATIOS = {"without model": 0.0, "with model": 1.0}
-"""model steps for each environment step, by the name of the residual"""
 
 
 @dataclass(frozen=True)
@@ -266,57 +248,6 @@ def _entry(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class PlannedResidual:
-    """A training on recorded drives."""
-
-    folder: str
-    """of all residuals of the study"""
-    drives: str
-    """pattern of the files of the training drives"""
-    expert: str
-    label: str
-    """a name in `MODEL_RATIOS`"""
-    seed: int
-
-    @property
-    def name(self) -> str:
-        """Its name among all residuals."""
-        return f"{self.label} {self.seed}"
-
-    @property
-    def controller(self) -> Path:
-        """The file of the trained controller."""
-        return Path(self.folder, f"{self.name}.unjam")
-
-    @property
-    def config(self) -> RunConfig:
-        """Its configuration: with the model, there are as many updates of the policy from fewer environment steps."""
-        ratio = MODEL_RATIOS[self.label]
-        changes = {"scenario_options.recordings": self.drives, "expert": self.expert, "seed": self.seed}
-        changes |= {"trpo.steps_per_iteration": round(STEPS_PER_ITERATION / (1.0 + ratio)), "model.model_ratio": ratio}
-        return load_config(changes=TRAINING_CHANGES | changes | {"steps": round(TRAINING_STEPS / (1.0 + ratio))})
-
-
-def planned_residuals(folder: Path, drives: str, expert: str, seeds: int) -> list[PlannedResidual]:
-    """Return the trainings with and without the model, ordered by seed."""
-    planned = product(range(seeds), MODEL_RATIOS)
-    return [PlannedResidual(str(folder), drives, expert, label, seed) for seed, label in planned]
-
-
-def train_residual(run: PlannedResidual, workers: int) -> Table:
-    """Train a residual, store its controller, and return its validations."""
-    folder = Path(run.folder, run.name)
-    rmtree(folder, ignore_errors=True)
-    make_folder(folder.parent)
-    result = train(run.config, folder)
-    rows = [row for row in read_progress(folder) if row["return_validation"] is not None]
-    copyfile(result.controller, run.controller)
-    rmtree(folder)
-    names = "environment_steps", "return_validation", "return_expert"
-    return [{"residual": run.label, "seed": run.seed, **{name: row[name] for name in names}} for row in rows]
-
-
-@dataclass(frozen=True)
 class DriveResults:
     """The metrics of drivers behind the same drives; several trainings are one driver."""
 
@@ -400,21 +331,6 @@ def assumptions_table(folder: Path) -> pd.DataFrame:
         {"assumption": name, **{_short_name(label): results.change_text(label, metric) for label in labels}}
         for name, results, metric in rows
     )
-
-
-def residuals_table(folder: Path) -> pd.DataFrame:
-    """Return the gains of the trainings over their law on validation windows of the training drives."""
-    rows = read_part(folder, RESIDUALS_PART)
-    table: Table = []
-    for label in MODEL_RATIOS:
-        own = [row for row in rows if row["residual"] == label]
-        trainings = group_rows(own, "seed").values()
-        gains = [[row["return_validation"] - row["return_expert"] for row in each] for each in trainings]
-        steps = f"{max(row['environment_steps'] for row in own):,}"
-        cells = {"residual": label, "trainings": len(gains), "environment steps": steps}
-        cells["best gain in validation"] = trainings_text([max(each) for each in gains], 1, sign="+")
-        table.append({**cells, "last gain in validation": trainings_text([each[-1] for each in gains], 1, sign="+")})
-    return pd.DataFrame(table)
 
 
 def search_table(folder: Path) -> pd.DataFrame:

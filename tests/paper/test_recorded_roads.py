@@ -14,7 +14,7 @@ from unjam.errors import InputError
 from unjam.physics.fuel import fuel_rate
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.worker_pool import EpisodeTask
-from unjam_paper import fuel_optimal_plan, information_ahead, recorded_gaps, recorded_roads
+from unjam_paper import fuel_optimal_plan, information_ahead, recorded_gaps, recorded_residuals, recorded_roads
 from unjam_paper.fuel_optimal_plan import PlanLimits, plan_speeds
 from unjam_paper.information_ahead import (
     FIXED_PARAMETERS,
@@ -26,11 +26,11 @@ from unjam_paper.information_ahead import (
 )
 from unjam_paper.parameter_search import SearchBudget, measure_candidates
 from unjam_paper.recorded_gaps import FIXED_BY_LAW, LIMITED, RECORDED_GAPS, gap_limits, search_space
+from unjam_paper.recorded_residuals import MODEL_RATIOS, planned_residuals
 from unjam_paper.recorded_roads import (
     DRIVE_SETTINGS,
     DRIVES_PARTS,
     IDEAL_CAR,
-    MODEL_RATIOS,
     PLAN_LABEL,
     PUBLISHED_FILES,
     RECORDED_ROADS,
@@ -83,6 +83,13 @@ def test_missing_drives_are_named_with_their_source(tmp_path: Path) -> None:
         recorded_drives(tmp_path)
 
 
+def test_missing_recordings_of_other_roads_are_named(folder: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"openacc: .*openacc_astazero_pairs\.parquet does not exist; allowed: pairs of"
+    ):
+        planned_residuals(folder, str(folder / RECORDINGS_FOLDER / "2021-03*"), "smooth-acc", 1)
+
+
 @pytest.mark.parametrize("method", ["smooth-acc", "acc"])
 def test_candidates_that_drive_at_once_equal_those_that_drive_alone(folder: Path, method: str) -> None:
     scenarios = recorded_drives(folder)
@@ -116,11 +123,13 @@ def test_the_study_tunes_trains_and_then_compares_all_drivers(folder: Path, monk
     small_settings = {name: DRIVE_SETTINGS[name] for name in (*DRIVE_SETTINGS,)[:2]}
     monkeypatch.setattr(recorded_roads, "DRIVE_SETTINGS", small_settings)
     monkeypatch.setitem(fuel_optimal_plan.OPTIMIZER_OPTIONS, "maxiter", 20)
-    monkeypatch.setattr(recorded_roads, "STEPS_PER_ITERATION", 2000)
-    monkeypatch.setattr(recorded_roads, "TRAINING_STEPS", 4000)
-    small = {"evaluation.validation_episodes": 2, "evaluation.validation_interval": 1, "scenario_options.window": 30.0}
-    for name, value in small.items():
-        monkeypatch.setitem(recorded_roads.TRAINING_CHANGES, name, value)
+    monkeypatch.setattr(recorded_residuals, "STEPS_PER_ITERATION", 2000)
+    monkeypatch.setattr(recorded_residuals, "TRAINING_STEPS", 4000)
+    monkeypatch.setitem(recorded_residuals.TASK_OPTIONS, "window", 30.0)
+    for name, value in {"evaluation.validation_episodes": 2, "evaluation.validation_interval": 1}.items():
+        monkeypatch.setitem(recorded_residuals.TRAINING_CHANGES, name, value)
+    others = {"other": {"recordings": f"{RECORDINGS_FOLDER}/2021-03-01_a.csv", "window": 20.0}}
+    monkeypatch.setattr(recorded_residuals, "OTHER_RECORDINGS", others)
     study = folder / "recorded-roads"
     RECORDED_ROADS.run(StudyFolder(folder), 1, study, 1)
     laws = ["human", "follower-stopper", "published", "smooth-acc, tuned", "acc, tuned"]
@@ -129,13 +138,13 @@ def test_the_study_tunes_trains_and_then_compares_all_drivers(folder: Path, monk
         frame = pd.read_csv(study / f"{table}.csv")
         assert list(frame["driver"]) == [*laws, PLAN_LABEL, *trained]
         assert frame["fuel of the platoon [%]"].tolist()[0] == "–"
-        assert len(read_part(study, part)) == 8 * drives
+        assert len(read_part(study, part)) == 9 * drives
     assert list(pd.read_csv(study / "search.csv")["method"]) == ["smooth-acc", "acc"]
     settings = pd.read_csv(study / "assumptions.csv")
     assert list(settings.columns[1:]) == laws[1:]
     assert len(settings) == 3  # two settings, and fuel in SUMO
-    assert list(pd.read_csv(study / "residuals.csv")["trainings"]) == [1, 1]
-    assert len(pd.read_csv(study / "waves.csv")) == 8
+    assert list(pd.read_csv(study / "residuals.csv")["trainings"]) == [1, 1, 1]
+    assert len(pd.read_csv(study / "waves.csv")) == 9
 
 
 def test_several_trainings_are_one_driver_with_paired_drives() -> None:
