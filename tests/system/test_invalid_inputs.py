@@ -96,6 +96,8 @@ INVALID: dict[str, tuple[str, list[str]]] = {
     "controller that is missing": ("does not exist", ["drive ring --driver none.unjam"]),
     "file that is not a controller": ("not a controller", ["drive ring --driver torn.unjam"]),
     "folder that is not empty": ("full' is not empty", ["drive ring --driver pi --out full"]),
+    "parameter as an option": ("parameters of scenarios: --set actuator.delay=", ["drive ring --delay 0.4"]),
+    "parameter as an option of a training": ("--set scenario_options.actuator.delay=", ["train ring --delay 0.4"]),
     "missing configuration": ("none.toml: No such file", ["train ring --config none.toml"]),
     "configuration that is not TOML": ("not TOML", ["train ring --config torn.toml"]),
     "unknown key of the configuration": ("ghost: unknown name", ["train ring --set ghost=1"]),

@@ -168,6 +168,11 @@ def _run_app() -> int:
             options = getattr(getattr(error, "param", None), "opts", [])
             values = [value for word, value in pairwise(sys.argv) if word in options and value]
             given = f"; given: {values[0]!r}" if values else ""
+            command = getattr(getattr(error, "ctx", None), "command", None)
+            if hasattr(error, "option_name") and any("--set" in each.opts for each in command.params):  # pyright: ignore
+                from unjam.cli.catalog import suggest_setting  # imported late: it imports all scenarios
+
+                given += suggest_setting(error.option_name, command.name)  # pyright: ignore
             return _print_error(f"{error.format_message()}{given}", 2)  # pyright: ignore[reportAttributeAccessIssue]
         raise
 

@@ -22,6 +22,7 @@ from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, unknown_name
 from unjam.files import atomic_write, check_parent_folder
 from unjam.measures.gain import MEAN_GAIN
+from unjam.parameters import flatten_keys
 from unjam.road_family import FAMILY_PREFIX, FAMILY_SCENARIOS
 from unjam.scenarios import SCENARIOS, example_scenario, make_scenario, scenario_recipe
 from unjam.scenarios.road import format_drawn_values
@@ -173,6 +174,14 @@ def _packaged_summary(name: str, is_brief: bool) -> str:
     speed, expert_speed = (metrics[name]["mean_speed"]["mean"] for name in ("trained", described))
     seeds = f"{metrics['trained']['episodes']} test seeds"
     return f"{label}: mean speed {speed:.2f} m/s on {seeds}, expert {expert_speed:.2f} m/s"
+
+
+def suggest_setting(option: str, command: str) -> str:
+    """Return a hint at the scenario parameters with the name of an unknown option, such as `--delay`; or nothing."""
+    name, prefix = option.lstrip("-").replace("-", "_"), "scenario_options." if command in ("train", "search") else ""
+    recipes = (scenario_recipe(example_scenario(each)) for each in SCENARIOS)
+    keys = dict.fromkeys(key for recipe in recipes for key in flatten_keys(recipe) if f".{key}".endswith(f".{name}"))
+    return f"; parameters of scenarios: {', '.join(f'--set {prefix}{key}=' for key in keys)}" if keys else ""
 
 
 def parameter_entries(instance: Any) -> list[dict[str, Any]]:
