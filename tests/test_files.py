@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -249,6 +250,11 @@ def test_the_leftover_of_a_killed_write_has_a_name_that_cannot_be_guessed(
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf"), np.float64("nan")])
 def test_json_has_null_where_a_number_is_not_finite(value: float) -> None:
     assert to_json({"a": [value, 1.5, (value,)], "b": {"c": value}}) == '{"a": [null, 1.5, [null]], "b": {"c": null}}'
+
+
+def test_numbers_and_arrays_of_other_packages_are_plain_json() -> None:
+    values = {"a": np.int64(3), "b": np.float32(0.5), "c": torch.tensor(2.0), "d": np.array([1.0, np.nan])}
+    assert to_json(values) == '{"a": 3, "b": 0.5, "c": 2.0, "d": [1.0, null]}'
 
 
 @given(

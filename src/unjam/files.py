@@ -246,7 +246,7 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 def to_json(value: Any, indent: int | None = None) -> str:
-    """Return `value` as strict JSON: NaN and infinities, which JSON does not have, become null."""
+    """Return `value` as strict JSON: NaN and infinities become null, and arrays lists."""
     return json.dumps(_replace_nonfinite(value), indent=indent, allow_nan=False)
 
 
@@ -257,4 +257,5 @@ def _replace_nonfinite(value: Any) -> Any:
         return [_replace_nonfinite(entry) for entry in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    return value
+    to_list = getattr(value, "tolist", None)  # of NumPy and torch
+    return value if to_list is None else _replace_nonfinite(to_list())

@@ -107,6 +107,16 @@ def test_changed_files_of_a_training_are_refused(make: Callable[[Path], RunConfi
     check_run_files(run, config, "evaluate")  # what is damaged does not tell
 
 
+def test_changed_settings_of_a_training_are_refused_by_commands_that_read_the_run(tmp_path: Path) -> None:
+    config, run = small_config(), tmp_path / "run"
+    changed = small_config(scenario_options={**config.scenario_options, "horizon": 300})
+    with_checkpoint(run, config)
+    for command in ("evaluate", "export", "model"):
+        check_run_files(run, small_config(evaluation__episodes=3), command)
+        with pytest.raises(InputError, match=rf"^{command}: scenario_options\.horizon: 300 .*; allowed: 100"):
+            check_run_files(run, changed, command)
+
+
 def test_other_packages_and_kernels_give_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     now = fingerprint(small_config())
     check_fingerprint(now, now)

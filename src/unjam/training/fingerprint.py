@@ -41,14 +41,20 @@ def fingerprint(config: RunConfig) -> dict[str, Any]:
 
 def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
     """Raise `InputError` if a setting, the expert or a user file has changed; warn of other packages and kernels."""
-    _check_form(stored, "resume")
-    for name, value in current["settings"].items():
-        if name in stored["settings"] and _without_folders(stored["settings"][name]) != _without_folders(value):
-            raise invalid_value(f"resume: {name}", value, f"{stored['settings'][name]!r}, as in the checkpoint")
+    check_settings(stored, current, "resume")
     check_file_hashes(stored, current, "resume")
     for part in ("packages", "kernels"):
         if stored[part] != current[part]:
             _LOG.warning("resume: other %s than in the checkpoint: the result may differ", part)
+
+
+def check_settings(stored: dict[str, Any], current: dict[str, Any], command: str, ignored_prefix: str = "-") -> None:
+    """Raise `InputError` if a setting has changed whose name does not begin with `ignored_prefix`."""
+    _check_form(stored, command)
+    for name, value in current["settings"].items():
+        before = stored["settings"].get(name, value)
+        if not name.startswith(ignored_prefix) and _without_folders(before) != _without_folders(value):
+            raise invalid_value(f"{command}: {name}", value, f"{before!r}, as in the checkpoint")
 
 
 def code_hashes(config: RunConfig) -> dict[str, str]:

@@ -33,7 +33,7 @@ from unjam.reports.results import read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import CONFIG_FILE, MANIFEST_FILE, RunConfig, load_config, read_values, to_toml
-from unjam.training.fingerprint import check_file_hashes, check_fingerprint, fingerprint
+from unjam.training.fingerprint import check_file_hashes, check_fingerprint, check_settings, fingerprint
 from unjam.tree import map_leaves
 from unjam.trust import check_trusted_values
 from unjam.worlds.backend import check_support, open_backend
@@ -321,10 +321,12 @@ def _valid_checkpoints(folder: Path) -> Iterator[tuple[Path, dict[str, Any], byt
 
 
 def check_run_files(folder: Path, config: RunConfig, command: str) -> None:
-    """Raise `InputError` if files that a run was trained with have changed; unknown without a valid checkpoint."""
+    """Raise `InputError` if files or settings that a run was trained with have changed; not without a checkpoint."""
     newest = next((state for _, state, _ in _valid_checkpoints(folder / "checkpoint")), {})
     if stored := newest.get("fingerprint"):
-        check_file_hashes(stored, fingerprint(config), command)
+        current = fingerprint(config)
+        check_settings(stored, current, command, ignored_prefix="evaluation.")
+        check_file_hashes(stored, current, command)
 
 
 def _remove_old_checkpoints(folder: Path) -> None:
