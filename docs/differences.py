@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from people import figure_6
-from tables import driver_rows, metric_mean, results_part
+from tables import metric_mean, results_part
 
-from unjam.measures.statistics import paired_difference
+from unjam.measures.statistics import estimate
 from unjam.parameters import flatten_keys
 from unjam.training.config import load_config
-from unjam_paper.study import UNFILTERED_ROADS, interval_text, trainings_text
+from unjam_paper.study import UNFILTERED_ROADS, DriverComparison, interval_text, trainings_text
 from unjam_paper.variants import VARIANTS
 
 PRESETS = {"default": "", "`paper`": "paper", "`paper-exact`": "paper-exact"}
@@ -75,13 +75,19 @@ def noise_effect() -> str:
 
 
 def expert_effect() -> str:
-    """Return the differences of the return of PI as in the paper to the default one."""
+    """Return the differences of the return of PI as in the paper to the default one, in ideal and usual cars."""
+    parts = {
+        **{"on `ring`": "feasible-ring-ideal/ring", "on `ring-jammed`": "feasible-ring-ideal/ring-jammed"},
+        "on `ring` in a usual car, where it oscillates": "feasible-ring/ring-usual-car",
+    }
     texts = []
-    for road in ("ring", "ring-jammed"):
-        rows = driver_rows(f"experts/all-on-{road}")
-        difference = paired_difference(rows["pi:time_constant=0"], rows["pi"], "return")
-        texts.append(f"{interval_text(asdict(difference), 0, '+,')} on `{road}`")
-    return f"return of the paper's PI, difference to the default one: {', '.join(texts)} (`results/experts.json`)"
+    for road, part in parts.items():
+        comparison = DriverComparison([*results_part(part).values()])
+        paper, default = (comparison.values([label], "return") for label in ("PI (paper)", "PI"))
+        difference = asdict(estimate((paper - default).ravel().tolist()))
+        texts.append(f"{interval_text(difference, 0, '+,')} {road}")
+    source = "60 episodes each, `results/feasible-ring-ideal.json`, `results/feasible-ring.json`"
+    return f"return of the paper's PI, difference to the default one: {', '.join(texts)} ({source})"
 
 
 def selection_effect() -> str:

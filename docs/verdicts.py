@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from math import inf, isnan
+from math import inf, isnan, nan
 from typing import Any
 
 import numpy as np
 
-from unjam.measures.statistics import Estimate, estimate_over_trainings
+from unjam.measures.statistics import Estimate, estimate_over_trainings, is_bimodal
 from unjam_paper.study import interval_text, number_text
 
 HELD, NOT_HELD, UNDECIDED, INCONSISTENT = "held", "not held", "undecided", "inconsistent with its Table 1"
@@ -42,15 +42,20 @@ def compare(
 ) -> Finding:
     """Judge whether the values of a label are larger (or smaller) than those of all others, paired in their order.
 
-    Intervals are widened by the `resolution` of the values: equal differences of coarse values have no spread. The
-    numbers are the means of all, and the difference that decides: that to the other which contradicts most.
+    Intervals are widened by the `resolution` of the values: equal differences of coarse values have no spread. A
+    difference with both signs has no interval if what is compared forms two groups. The numbers are the means of all,
+    and the difference that decides: that to the other which contradicts most.
     """
     others = others or tuple(each for each in values if each != label)
     count = min(len(values[each]) for each in (label, *others))
     differences = dict[str, Estimate]()
     for other in others:
-        found = estimate_over_trainings((values[label][:count] - values[other][:count]).tolist())
-        differences[other] = replace(found, low=found.low - resolution, high=found.high + resolution)
+        own, found = values[label][:count], values[other][:count]
+        difference = estimate_over_trainings((own - found).tolist())
+        has_groups = is_bimodal(own.tolist()) or is_bimodal(found.tolist())
+        if has_groups and difference.smallest < 0.0 < difference.largest:
+            difference = replace(difference, low=nan, high=nan)
+        differences[other] = replace(difference, low=difference.low - resolution, high=difference.high + resolution)
     verdict, margins = judge(list(differences.values()), larger), {}
     for other, difference in differences.items():
         low, high = _margin(difference, larger)
