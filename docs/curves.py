@@ -8,7 +8,8 @@ from studies import study_rows
 from tables import results_part
 
 from unjam_paper.comparison import compared_variants
-from unjam_paper.study import PlannedRun, interval_text
+from unjam_paper.study import PlannedRun, interval_text, trainings_text
+from unjam_paper.variants import WRONG_BASES
 
 LABELS = {"ours": "with the virtual environment", "ours-without-model": "without"}
 COLORS = ("#2b6cb0", "#e07a1f", "#3a8f5c", "#7b8794")
@@ -64,6 +65,24 @@ def draw_validation(
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     return figure
+
+
+def wrong_base_text() -> str:
+    """Return how the return differs between trainings with wrong bases of the model and with twice the steps alone."""
+    gains = {
+        row["variant"]: np.array(row["gains"])
+        for study in ("road-model", "road-model-wrong-base")
+        for row in study_rows(study, "ring")
+        if row["is_learned"]
+    }
+    double = gains["best-double"]
+    texts = []
+    for name, (base, _) in WRONG_BASES.items():
+        own = gains[f"best-road-model-{name}"]
+        texts.append(f"{trainings_text(own - double[: len(own)], 0, '+')} with a model on {base}")
+    return (
+        f"Difference to twice the steps without a model, the cheapest alternative, paired by seed: {', '.join(texts)}."
+    )
 
 
 def step_count_table() -> pd.DataFrame:
