@@ -22,7 +22,7 @@ export PYTHONDONTWRITEBYTECODE =
 
 demo: $(VENV)/.installed
 	$(BIN)/unjam train ring-jammed --preset demo
-	$(BIN)/unjam drive ring-jammed -d human -d pi -d unjam:ring-jammed-best --test-seeds -n 4
+	$(BIN)/unjam drive ring-jammed -d human -d pi -d unjam:ring-jammed-tuned -d unjam:ring-jammed-best --test-seeds -n 4
 
 # The tests of a file share what they have made
 SPREAD := -n 2 --dist loadfile --no-loadscope-reorder

@@ -4,16 +4,18 @@ import shlex
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from tables import RESULTS, driver_rows, metric_table, results_part
 
 from unjam.measures.feasibility import FEASIBLE
-from unjam.measures.metric_table import with_no_break_spaces
+from unjam.measures.metric_table import HUMAN_LABEL, with_no_break_spaces
 from unjam.measures.statistics import estimate_over_trainings
 from unjam_paper.comparison import COMPARISON_METRICS, estimate_metrics
+from unjam_paper.feasible import GAP_PI_IDEAL_LABEL, GAP_PI_JAMMED_LABEL
 from unjam_paper.results_file import read_parts
 from unjam_paper.studies import STUDIES
-from unjam_paper.study import STUDY_ROADS, UNFILTERED_ROADS, interval_text, number_text
+from unjam_paper.study import STUDY_ROADS, UNFILTERED_ROADS, DriverComparison, interval_text, number_text
 from unjam_paper.variants import REFERENCE_DRIVERS, TUNED_REFERENCES, VARIANTS
 
 JAM_FREE_SPEED = 15.0
@@ -84,6 +86,46 @@ def difference_to_expert(rows: dict[str, dict[str, Any]], name: str, expert: str
     metric, best = row["gain_reference"]["metric"], row["gain_reference"]["expert"]
     more = rows[best][metric]["mean"] - rows[expert][metric]["mean"]
     return asdict(estimate_over_trainings([gain + more for gain in row["gains"]]))
+
+
+def jammed_ring_table() -> pd.DataFrame:
+    """Return differences on the jammed ring with usual cars by its length, of the tuned formulas and of residuals."""
+    parts, trainings = _jammed_ring()
+    formula, residuals = "tuned formula", "residuals"
+    columns = {
+        f"{formula} − human [m/s]": ([GAP_PI_JAMMED_LABEL], HUMAN_LABEL, "mean_speed", 2),
+        f"{residuals} − {formula}: return": (trainings, GAP_PI_JAMMED_LABEL, "return", 0),
+        "speed [m/s]": (trainings, GAP_PI_JAMMED_LABEL, "mean_speed", 3),
+        "speed, steady [m/s]": (trainings, GAP_PI_JAMMED_LABEL, "mean_speed_steady", 3),
+        f"{residuals} − formula for ideal cars: return": (trainings, GAP_PI_IDEAL_LABEL, "return", 0),
+        "speed, so compared [m/s]": (trainings, GAP_PI_IDEAL_LABEL, "mean_speed", 3),
+    }
+    roads = {f"{length} m": [part] for length, part in parts.items()} | {"these six": [*parts.values()]}
+    return pd.DataFrame(
+        {"length": length, **{name: DriverComparison(road).difference(*each) for name, each in columns.items()}}
+        for length, road in roads.items()
+    )
+
+
+def jammed_ring_text() -> str:
+    """Return how the gains of residuals on the jammed ring with usual cars are distributed over the episodes."""
+    parts, trainings = _jammed_ring()
+    comparison, texts = DriverComparison([*parts.values()]), list[str]()
+    for label, name in ((GAP_PI_JAMMED_LABEL, "this formula"), (GAP_PI_IDEAL_LABEL, "the formula for ideal cars")):
+        gains = comparison.values(trainings, "return") - comparison.values([label], "return")
+        means = np.sort(gains.mean(1).ravel())
+        texts.append(
+            f"Compared with {name}, the return differs by {np.median(means):+.0f} in the median episode, and is larger "
+            f"in {100 * (gains > 0).mean():.0f} % of the episodes of single controllers. Ten of {len(means)} episodes "
+            f"carry {100 * means[-10:].sum() / means.sum():.0f} % of the mean."
+        )
+    return " ".join(texts)
+
+
+def _jammed_ring() -> tuple[dict[str, Any], list[str]]:
+    """Return the results on the jammed ring with usual cars by length, and the labels of the trainings."""
+    parts = results_part("feasible-ring/ring-jammed-usual-car")
+    return parts, [label for label in parts["220"] if label.startswith("training ")]
 
 
 def paper_convention_table(study: str, road: str) -> pd.DataFrame:
