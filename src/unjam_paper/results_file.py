@@ -2,8 +2,9 @@
 
 A part is measured once, and again if its arguments, or the controllers that they name, have changed. Tables of rows
 with the same keys are stored by columns, `{"columns": {NAME: [VALUES]}}`; what is the same in all rows is stored once,
-`{NAME: VALUE}`, and numbers have seven digits. Figures and controllers are separate files: NAME-FIGURE.png and
-NAME-controllers.zip. Names in manifests are those of the commit that made the results (CONTRIBUTING.md).
+`{NAME: VALUE}`, and repeated texts as `{"texts": [TEXTS], "rows": [NUMBERS]}`. Numbers have seven digits. Figures and
+controllers are separate files: NAME-FIGURE.png and NAME-controllers.zip. Names in manifests are those of the commit
+that made the results (CONTRIBUTING.md).
 """
 
 import json
@@ -26,6 +27,8 @@ from unjam.reports.figures import png_bytes
 
 COLUMNS = "columns"
 """the only key of a table that is stored by columns"""
+TEXTS = "texts"
+"""key of the different texts of a column; `rows` has the number of the text in each row"""
 CONTROLLERS = "controllers"
 """subfolder with controllers, in the working folder of a study"""
 StudyPart = tuple[Callable[..., Any], tuple[Any, ...]]
@@ -101,9 +104,23 @@ def _by_columns(value: Any) -> Any:
             columns = {name: [row[name] for row in value] for name in names}
             constant = {name for name, entries in columns.items() if _is_constant(entries)}
             if len(constant) < len(names):  # the length of a column is the number of rows
-                values = {name: each[0] if name in constant else _by_columns(each) for name, each in columns.items()}
+                values = {name: each[0] if name in constant else _pack_column(each) for name, each in columns.items()}
                 return {COLUMNS: values}
     return [_by_columns(entry) for entry in value]
+
+
+def _pack_column(entries: list[Any]) -> Any:
+    """Return a column as stored: texts that repeat are stored once, and their numbers in each row."""
+    if not all(isinstance(entry, str) for entry in entries) or len(texts := dict.fromkeys(entries)) > len(entries) / 4:
+        return _by_columns(entries)
+    numbers = {text: number for number, text in enumerate(texts)}
+    return {TEXTS: [*texts], "rows": [numbers[entry] for entry in entries]}
+
+
+def _unpack_column(stored: Any) -> Any:
+    if isinstance(stored, dict) and TEXTS in stored:
+        return [stored[TEXTS][number] for number in stored["rows"]]
+    return _by_rows(stored)
 
 
 def _is_constant(entries: list[Any]) -> bool:
@@ -119,7 +136,7 @@ def _by_rows(value: Any) -> Any:
         return value
     if list(value) != [COLUMNS]:
         return {key: _by_rows(entry) for key, entry in value.items()}
-    columns = {name: _by_rows(entry) for name, entry in value[COLUMNS].items()}
+    columns = {name: _unpack_column(entry) for name, entry in value[COLUMNS].items()}
     rows = max(len(entries) for entries in columns.values() if isinstance(entries, list))
     full_columns = (entries if isinstance(entries, list) else [entries] * rows for entries in columns.values())
     return [dict(zip(columns, row, strict=True)) for row in zip(*full_columns, strict=True)]

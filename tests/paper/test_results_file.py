@@ -28,6 +28,18 @@ def test_a_results_file_gives_back_what_was_written(tmp_path: Path) -> None:
     assert '"same": {"columns":{"a":1.0,"b":null,"c":[[1],[1]]}}' in path.read_text()
 
 
+def test_repeated_texts_are_stored_once(tmp_path: Path) -> None:
+    rows = [
+        {"driver": f"driver {number // 8}", "drive": f"drive {number}", "speed": {"mean": number}}
+        for number in range(32)
+    ]
+    path = tmp_path / "study.json"
+    write_results(path, {"part": rows, "texts": [{"texts": "a", "rows": 1}]})
+    assert read_part(path, "part") == rows
+    assert read_part(path, "texts") == [{"texts": "a", "rows": 1}]
+    assert [path.read_text().count(text) for text in ("driver 3", 'drive 3"')] == [1, 1]
+
+
 def test_numbers_have_seven_digits(tmp_path: Path) -> None:
     write_results(
         tmp_path / "study.json", {"part": [1.0 / 3.0, 2.0e-9 / 3.0, 12345678901, 123456789.5, None, "0.123456789"]}
