@@ -215,7 +215,7 @@ def test_assess_prints_text_and_json_and_writes_a_page(unjam: Run, tmp_path: Pat
     assert headline.startswith(("Recommended: ", "Not recommended: ", "Not yet known "))
     assert acc_finding.startswith("ACC vehicles alone ")
     assert [line.split()[:2] for line in table[1:4]] == [["none", "human"], ["50", "%"], ["50", "%"]]
-    assert [line for line in table if line.startswith("- acc at a penetration rate of 50 %: ")]
+    (finding,) = re.findall(r"^- acc at a penetration rate of 50 %: .*(?:\n  .*)*", ran.stdout, re.MULTILINE)
     before, _, after = ran.stderr.partition("a verdict needs at least 10 test seeds: 32 episodes, about ")
     assert "simulating the human baseline, seed 1 of 1" in before
     assert "3 test seeds: CI of travel time at most ±" in after
@@ -224,12 +224,10 @@ def test_assess_prints_text_and_json_and_writes_a_page(unjam: Run, tmp_path: Pat
     found = document(unjam(*ASSESS, "-n", 36, "--json", pictures=False))
     assert found["folder"] == "runs/assess-straight-001"
     assert found["headline"] == headline
-    assert [f"- {each['summary']}" for each in found["controller_results"]] == [
-        line for line in table if line.startswith("- acc")
-    ]
+    assert [f"- {each['summary']}" for each in found["controller_results"]] == [" ".join(finding.split())]
     names = {path.name for path in (tmp_path / "answer").iterdir()}
     assert names == {
-        *("assessment.html", "assessment.json", "selection"),
+        *("assessment.html", "assessment.json", "selection", "request.json", "episodes.jsonl"),
         *("evaluation.json", "episodes.parquet", "plot_episodes.safetensors"),
     }
     assert unjam("report", "answer", pictures=False).returncode == 0, "it can read the rows"
@@ -237,16 +235,14 @@ def test_assess_prints_text_and_json_and_writes_a_page(unjam: Run, tmp_path: Pat
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("arguments", "first_words"),
+    ("arguments", "first_words", "kept_names"),
     [
-        pytest.param(
-            (*ASSESS, "-n", "5000", "--precision", "1e-9"), ("simulating", "a verdict needs"), marks=pytest.mark.slow
-        ),
-        (("drive", "ring", "-d", "pi", "-n", "5000"), ("driving",)),
+        ((*ASSESS, "-n", "5000", "--precision", "1e-9"), ("simulating", "a verdict needs"), ["request.json"]),
+        (("drive", "ring", "-d", "pi", "-n", "5000"), ("driving",), None),
     ],
 )
-def test_an_interrupted_command_leaves_no_folder(
-    arguments: Sequence[str], first_words: tuple[str, ...], unjam: Run, tmp_path: Path
+def test_an_interrupted_command_leaves_no_folder_but_what_resumes(
+    arguments: Sequence[str], first_words: tuple[str, ...], kept_names: list[str] | None, unjam: Run, tmp_path: Path
 ) -> None:
     straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="20" period="2"/>', length=100.0)
     command = [str(UNJAM), *arguments, "--out", "answer"]
@@ -259,7 +255,9 @@ def test_an_interrupted_command_leaves_no_folder(
     assert process.returncode == 130
     assert errors.splitlines()[-1] == "unjam: interrupted"
     assert "Traceback" not in errors
-    assert not (tmp_path / "answer").exists()
+    names = [path.name for path in (tmp_path / "answer").iterdir()] if (tmp_path / "answer").exists() else None
+    assert names == kept_names
+    assert ("resume with: unjam assess " in errors) == (names is not None)
     wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers))
 
 
