@@ -12,14 +12,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from unjam.benchmarks.episodes import (
-    EPISODES_PER_ROAD,
-    FAMILY_TEST_SEEDS,
-    Seeds,
-    drive_by_label,
-    family_metrics,
-    run_in_batches,
-)
+from unjam.benchmarks.result import EPISODES_PER_ROAD, FAMILY_TEST_SEEDS
+from unjam.benchmarks.run import Seeds, drive_by_label, family_metrics, run_in_batches
 from unjam.controller import PACKAGED_PREFIX
 from unjam.measures import gain
 from unjam.measures.feasibility import FEASIBLE, overall_feasibility

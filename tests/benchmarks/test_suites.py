@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import unjam
-from unjam.benchmarks.episodes import FAMILY_TEST_SEEDS, drive_by_label, run_in_batches
+from unjam.benchmarks.result import FAMILY_TEST_SEEDS
+from unjam.benchmarks.run import drive_by_label, run_in_batches
 from unjam.benchmarks.suites import SUITES, find_suite, references
 from unjam.errors import InputError
 from unjam.measures.gain import MIN_REFERENCE_GAIN, performance

@@ -1,16 +1,18 @@
 """Run a benchmark: the human baseline and a driver on the test seeds of each road of a suite."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from safetensors.numpy import save
 
-from unjam.benchmarks.episodes import FAMILY_TEST_SEEDS, family_metrics, make_tasks
 from unjam.benchmarks.result import (
+    FAMILY_METRICS,
+    FAMILY_TEST_SEEDS,
     MAX_LABEL_CHARACTERS,
     BenchmarkResult,
     RoadRecord,
@@ -38,17 +40,18 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.text import format_count, one_line
 from unjam.training.evaluate import raise_failure
-from unjam.worlds.backend import check_support, open_backend
+from unjam.worlds.backend import BackendLike, check_support, open_backend
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.batch.support import unsupported_reason
 from unjam.worlds.episode import check_can_drive, run_episode
 from unjam.worlds.record import Episode
-from unjam.worlds.worker_pool import WorkerPool
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 EXACT_BACKEND = "exact"
 """backend of benchmarks: the batch where its episodes are those of SUMO, else SUMO"""
 MAX_TRAINING_STEPS = 2**53
 """environment steps that a result can record"""
+Seeds = Sequence[tuple[int, ...]]
 
 
 def benchmark(
@@ -173,8 +176,43 @@ def _drive_road(scenario: Scenario, driver: Driver, backend: str, pool: WorkerPo
 
 
 def _measure_episode(index: int, episode: Episode) -> dict[str, Any]:
-    raise_failure([] if episode.has_run else [measure(episode)])
-    return family_metrics(index, episode)
+    raise_failure([row := measure(episode)])
+    return row
+
+
+def make_tasks(scenario: Scenario, driver: Driver, seeds: Seeds, backend: BackendLike = "sumo") -> list[EpisodeTask]:
+    """Return the episodes of a driver; together they cover the range of sizes of the road evenly."""
+    strata = (scenario.stratum(index, len(seeds)) for index in range(len(seeds)))
+    return [EpisodeTask(road, driver, seed, backend=backend) for road, seed in zip(strata, seeds, strict=True)]
+
+
+def drive_by_label(
+    scenario: Scenario,
+    drivers: Mapping[str, str],
+    seeds: Seeds,
+    run_episodes: Callable[[list[EpisodeTask]], EpisodeRows],
+) -> dict[str, EpisodeRows]:
+    """Return the metrics of each driver's episodes by label; `drivers` are names of drivers by label.
+
+    `run_episodes` runs tasks and returns the result of `family_metrics` for each of them, in their order.
+    """
+    made = [make_driver(name, scenario.control_step) for name in drivers.values()]  # one each: networks have memory
+    rows, count = run_episodes([task for driver in made for task in make_tasks(scenario, driver, seeds)]), len(seeds)
+    return {label: rows[number * count : (number + 1) * count] for number, label in enumerate(drivers)}
+
+
+def family_metrics(index: int, episode: Episode) -> dict[str, Any]:
+    """Return the metrics of an episode, for `WorkerPool.run_and_map`: a whole motorway episode takes 80 MB."""
+    measured = measure(episode)
+    return {key: measured[key] for key in FAMILY_METRICS}
+
+
+def run_in_batches(workers: WorkerPool, tasks: list[EpisodeTask]) -> EpisodeRows:
+    """Return the metrics of episodes of one road and several drivers, in batches where they are supported."""
+    if unsupported_reason(tasks[0].scenario):
+        return workers.run_and_map(tasks, family_metrics)
+    by_driver = groupby(tasks, key=lambda task: id(task.driver))
+    return [family_metrics(*each) for _, own in by_driver for each in enumerate(run_batches(list(own)))]
 
 
 def _driver_hash(label: str, driver: Driver) -> str | None:
