@@ -23,8 +23,7 @@ from unjam.parameters import build_dataclass, parse_toml, split_parameters
 from unjam.text import one_line
 
 GRAPH_SUFFIX, DESCRIPTION_SUFFIX = ".onnx", ".toml"
-DESCRIPTION_KEY = "unjam"
-"""key of the description among the metadata of a graph"""
+DESCRIPTION_KEY = "unjam"  # key of the description among the metadata of a graph
 MAX_DESCRIPTION_BYTES = 2**20
 
 

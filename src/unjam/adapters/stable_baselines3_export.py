@@ -15,10 +15,8 @@ ALGORITHMS = {
     "ppo": ("stable_baselines3", "PPO"),
     "sac": ("stable_baselines3", "SAC"),
     "td3": ("stable_baselines3", "TD3"),
-}
-"""packages and names of the algorithms, by the agent of a training"""
-MIN_EXPLORATION = 1e-3
-"""smallest standard deviation of exploration, as a share of the authority"""
+}  # packages and names of the algorithms, by the agent of a training
+MIN_EXPLORATION = 1e-3  # smallest standard deviation of exploration, as a share of the authority
 
 
 def stable_baselines3_model(driver: ResidualDriver, agent: str) -> Any:

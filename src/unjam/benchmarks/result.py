@@ -26,12 +26,9 @@ if TYPE_CHECKING:  # imported late, so that commands start quickly
 
 FILE_FORMAT, DIGITS, MAX_LABEL_CHARACTERS = 1, 7, 500
 """version of files; significant digits of stored metrics; maximum length of the name of a driver"""
-MAX_FILE_BYTES = 4 * 2**20
-"""maximum size of a file; one with all roads has 200 kB"""
-MAX_RELATIVE_DIFFERENCE = 1e-4
-"""allowed relative difference to reference values of the human baseline"""
-TRAINING_STEPS_UNIT = "environment steps: control steps in the simulator"
-"""unit of `training_steps`, as files say"""
+MAX_FILE_BYTES = 4 * 2**20  # maximum size of a file; one with all roads has 200 kB
+MAX_RELATIVE_DIFFERENCE = 1e-4  # allowed relative difference to reference values of the human baseline
+TRAINING_STEPS_UNIT = "environment steps: control steps in the simulator"  # unit of `training_steps`, as files say
 PARTS = {"all roads": ("training", "combination", "axis"), "training": ("training",), "unseen": ("combination", "axis")}
 """parts of the family by the name of their mean"""
 EPISODES_PER_ROAD, MAX_VALUE = 10, 1e9

@@ -47,10 +47,8 @@ from unjam.worlds.episode import check_can_drive, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
-EXACT_BACKEND = "exact"
-"""backend of benchmarks: the batch where its episodes are those of SUMO, else SUMO"""
-MAX_TRAINING_STEPS = 2**53
-"""environment steps that a result can record"""
+EXACT_BACKEND = "exact"  # backend of benchmarks: the batch where its episodes are those of SUMO, else SUMO
+MAX_TRAINING_STEPS = 2**53  # environment steps that a result can record
 Seeds = Sequence[tuple[int, ...]]
 
 

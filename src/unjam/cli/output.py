@@ -28,16 +28,11 @@ from unjam.measures.statistics import Estimate, is_expert_unchanged
 from unjam.measures.verdict import short_table_metrics, verdicts
 from unjam.text import format_duration, printable, split_label
 
-PROGRESS_LINE_SECONDS = 5.0
-"""time between two plain lines of progress without a terminal"""
-MIN_TIMED_SECONDS = 1.0
-"""time of a count from which the rest is estimated"""
-NARROW_COLUMN_WIDTHS = 18, 7
-"""widths of the columns of metrics and units in a narrow terminal [characters]"""
-WIDE_OPTIONS_WIDTH = 130
-"""width from which a cell of the main table of an assessment is one line [characters]"""
-MAX_HEADING_LENGTH = 45
-"""length of the name of a driver from which a table shows its beginning only [characters]"""
+PROGRESS_LINE_SECONDS = 5.0  # time between two plain lines of progress without a terminal
+MIN_TIMED_SECONDS = 1.0  # time of a count from which the rest is estimated
+NARROW_COLUMN_WIDTHS = 18, 7  # widths of the columns of metrics and units in a narrow terminal [characters]
+WIDE_OPTIONS_WIDTH = 130  # width from which a cell of the main table of an assessment is one line [characters]
+MAX_HEADING_LENGTH = 45  # length of the name of a driver from which a table shows its beginning only [characters]
 TEXT_COLUMN_WIDTHS = {" ": 22, "\n": 15}
 """width of headings and verdicts [characters], by what separates a mean from its interval: that of most numbers"""
 
@@ -189,8 +184,7 @@ class ProgressReporter:
         self._bar = Progress(*columns, console=err_console, transient=True, disable=self._is_plain)
         self._task, self._total = self._bar.add_task(label, total=total), total or 0
         self._done: dict[Any, int] = {}
-        self._start_time: float | None = None
-        """time of the first report"""
+        self._start_time: float | None = None  # time of the first report
         self._last_line = time.monotonic()
 
     def __enter__(self) -> Self:

@@ -14,12 +14,10 @@ from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyMemory
 from unjam.errors import InputError, invalid_value, naming, unknown_name
 from unjam.onnx_models import check_model, open_session, parse_model, remove_texts, run_session, time_limit
 
-OPSETS, IR_VERSIONS = range(9, 26), range(4, 14)
-"""allowed versions of the operators and of the format"""
+OPSETS, IR_VERSIONS = range(9, 26), range(4, 14)  # allowed versions of the operators and of the format
 TYPES: dict[int, type[np.floating[Any]]] = {1: np.float32, 11: np.float64}
 """allowed types of inputs and outputs, by their numbers in ONNX"""
-MAX_MEMORY_NUMBERS = 100_000
-"""maximum count of numbers in the recurrent state of one CAV"""
+MAX_MEMORY_NUMBERS = 100_000  # maximum count of numbers in the recurrent state of one CAV
 
 
 class Tensor(NamedTuple):

@@ -15,8 +15,7 @@ ENVIRONMENT_ARGUMENTS = {
         f"unjam/{name}-v1": {"scenario": f"{FAMILY_PREFIX}{name}"} | ({"cavs": 1} if "cavs" in road.options else {})
         for name, road in FAMILY.items()
     },
-}
-"""arguments of `RoadEnv`, by the Gymnasium id of the environment; closed roads of benchmarks have one CAV there"""
+}  # arguments of `RoadEnv`, by the Gymnasium id of the environment; closed roads of benchmarks have one CAV there
 
 
 def register_environments() -> None:

@@ -128,13 +128,10 @@ class RoadStepper:
         bound = np.full(observation_size(self._driver.features, driver), MAX_OBSERVATION, np.float32)
         self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
         low, high = (np.full(1, limit, np.float32) for limit in self.scenario.acceleration_limits)
-        self.action_space = spaces.Box(low, high, dtype=np.float32)
-        """action space of one CAV: an acceleration [m/s2]"""
+        self.action_space = spaces.Box(low, high, dtype=np.float32)  # action space of one CAV: an acceleration [m/s2]
         self._seed: int | None = None
-        self._episode_count = 0
-        """episodes since that seed"""
-        self.lock = CopyableLock()
-        """held during calls of the environment"""
+        self._episode_count = 0  # episodes since that seed
+        self.lock = CopyableLock()  # held during calls of the environment
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes for a copy; raise `InputError` after a reset: a simulation cannot be copied."""

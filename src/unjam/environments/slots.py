@@ -64,8 +64,7 @@ class SlottedRoadEnv(RoadAgents):
         count = check_integer("slots", slots, 1)
         super().__init__(environment._road, (f"slot_{number}" for number in range(count)))
         self._environment = environment
-        self._cavs: dict[str, str] = {}
-        """agent of the environment by occupied slot"""
+        self._cavs: dict[str, str] = {}  # agent of the environment by occupied slot
         self._without_slot: set[str] = set()
 
     @synchronized

@@ -36,10 +36,8 @@ from unjam.worlds.batch.support import required_batch_kind, statistically_unsupp
 from unjam.worlds.episode import as_seed
 from unjam.worlds.reward import Outcome, RewardLike, validate_reward_terms
 
-EXPERT_CHECK_STEPS = 3
-"""random steps in which an expert must drive each row by itself, without a state of its own"""
-MAX_ENVIRONMENTS = 1_000_000
-"""maximum number of environments, of which each takes 2 kB or more"""
+EXPERT_CHECK_STEPS = 3  # random steps in which an expert must drive each row by itself, without a state of its own
+MAX_ENVIRONMENTS = 1_000_000  # maximum number of environments, of which each takes 2 kB or more
 OTHER_MODE = "allowed: vectorization_mode='async', which simulates in SUMO"
 
 
@@ -182,13 +180,11 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._seeds: list[int | None] = [None] * num_envs
-        self._episode_counts = [0] * num_envs
-        """episodes of each environment since that seed, prepared ones included"""
+        self._episode_counts = [0] * num_envs  # episodes of each environment since that seed, prepared ones included
         self._episodes: Episodes | None = None
         self._prepared: dict[int, tuple[Episodes, int]] = {}
         """the next episode of an environment, as a row of started episodes"""
-        self._ended_rows: list[int] = []
-        """environments whose episode ended in the last step"""
+        self._ended_rows: list[int] = []  # environments whose episode ended in the last step
 
     def _unsupported_reason(self, scenario: Scenario) -> str:
         """Return why this class has no environment of a scenario that batches simulate; empty if it has one."""

@@ -16,8 +16,7 @@ from unjam.worlds.sumo.simulation import DetectorPassage
 
 DETECTOR_COLUMNS = ("position", "begin", "end", "flow_veh_per_h", "speed")
 """columns of a file of measurements, in addition to `edge` or `lane`"""
-GEH_LIMIT = 5.0
-"""GEH below which a simulated flow agrees with the measured flow"""
+GEH_LIMIT = 5.0  # GEH below which a simulated flow agrees with the measured flow
 SAME_PASSAGE_SECONDS = 10.0
 """time within which a second passage of a vehicle over loops of the same edge is only a lane change [s]"""
 

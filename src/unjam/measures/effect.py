@@ -23,8 +23,7 @@ from unjam.measures.statistics import (
     paired_difference,
 )
 
-MAX_FLOW_LOSS = 0.01
-"""loss of flow that the CI must exclude, as a share of the flow of the baseline"""
+MAX_FLOW_LOSS = 0.01  # loss of flow that the CI must exclude, as a share of the flow of the baseline
 SMALLEST_EFFECT = 0.005
 """difference of travel time below which there is neither gain nor harm, as a share of the baseline's travel time"""
 

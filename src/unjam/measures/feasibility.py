@@ -6,22 +6,16 @@ from typing import Any
 
 from unjam.text import format_count
 
-MIN_TIME_GAP_FRACTION = 0.9
-"""minimum time gap in every step, as a fraction of the required time gap"""
-DEFAULT_REQUIRED_TIME_GAP = 1.0
-"""required time gap on roads that do not define one [s]"""
+MIN_TIME_GAP_FRACTION = 0.9  # minimum time gap in every step, as a fraction of the required time gap
+DEFAULT_REQUIRED_TIME_GAP = 1.0  # required time gap on roads that do not define one [s]
 MIN_TIME_GAP_WITH_LANES = 0.8
 """minimum time gap in every step on roads with lanes [s]; the recovery after cut-ins is excluded"""
 MAX_SHORT_TIME_GAP_SHARE = 1e-3
 """maximum share of the time with a time gap below the required one, on roads with lanes; the recovery is excluded"""
-MAX_CUT_IN_BRAKING = 9.0
-"""maximum braking after a cut-in [m/s2]: about the limit on dry asphalt"""
-MIN_FEASIBLE_TTC = 1.0
-"""minimum time to collision [s]"""
-MAX_FEASIBLE_BRAKING = 6.0
-"""maximum braking [m/s2]"""
-TOLERANCE = 1e-6
-"""tolerance of these limits for rounding errors"""
+MAX_CUT_IN_BRAKING = 9.0  # maximum braking after a cut-in [m/s2]: about the limit on dry asphalt
+MIN_FEASIBLE_TTC = 1.0  # minimum time to collision [s]
+MAX_FEASIBLE_BRAKING = 6.0  # maximum braking [m/s2]
+TOLERANCE = 1e-6  # tolerance of these limits for rounding errors
 
 FEASIBLE = "feasible"
 HARD_BRAKING_METRIC = "human_braking_beyond_4_5"

@@ -23,13 +23,11 @@ from unjam.measures.statistics import (
 Value = TypeVar("Value")
 RowsByDriver = dict[str, list[dict[str, Any]]]
 """rows of metrics by driver: one row for each episode, failed ones included"""
-HUMAN_LABEL = "human"
-"""label of the human baseline"""
+HUMAN_LABEL = "human"  # label of the human baseline
 CAV_METRICS = {name for name, metric in METRICS.items() if metric.label.startswith("CAV")} | {
     *("min_ttc", "min_time_gap", "max_jerk", "filter_override_share", "override_share", "yield_share"),
     *("shield_override_share", "shield_max_braking"),
-}
-"""metrics of CAVs; in the human baseline, those of the human drivers in their places"""
+}  # metrics of CAVs; in the human baseline, those of the human drivers in their places
 
 
 @dataclass(frozen=True)

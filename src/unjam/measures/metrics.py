@@ -27,14 +27,10 @@ from unjam.worlds.reward import episode_reward_terms, eq16_reward
 
 STEADY_STATE_STEPS = 1000
 """number of control steps at the end of an episode that are its steady state; in a shorter episode the second half"""
-STANDING_SPEED = 0.1
-"""speed below which a vehicle counts as standing [m/s]: SUMO's threshold of a halting vehicle"""
-MAX_CALM_SPEED_STD = 0.3
-"""standard deviation of speed across vehicles below which there is no wave [m/s]"""
-MIN_CALM_SECONDS = 60.0
-"""time without a wave after which the wave counts as dissolved [s]"""
-GASOLINE_DENSITY = 742.0
-"""density of gasoline in SUMO's PollutantsInterface [mg/ml]"""
+STANDING_SPEED = 0.1  # speed below which a vehicle counts as standing [m/s]: SUMO's threshold of a halting vehicle
+MAX_CALM_SPEED_STD = 0.3  # standard deviation of speed across vehicles below which there is no wave [m/s]
+MIN_CALM_SECONDS = 60.0  # time without a wave after which the wave counts as dissolved [s]
+GASOLINE_DENSITY = 742.0  # density of gasoline in SUMO's PollutantsInterface [mg/ml]
 SHARE_BOUNDS, UNBOUNDED = (0.0, 1.0), (-inf, inf)
 """bounds of metrics that are shares, and of metrics that can be negative"""
 PEAK_END_SECONDS = 600.0

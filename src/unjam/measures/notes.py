@@ -12,17 +12,14 @@ from unjam.text import format_count
 
 MAX_EARLY_END_SHARE = 0.05
 """maximum share of the baseline's episodes that end early; with more of them comparisons would mislead"""
-MAX_WARNING_KINDS = 10
-"""kinds of SUMO's warnings that are shown, the most frequent first"""
-MAX_BACKLOG_SHARE = 0.05
-"""share of the vehicles in the insertion backlog at the end, above which there is a note"""
+MAX_WARNING_KINDS = 10  # kinds of SUMO's warnings that are shown, the most frequent first
+MAX_BACKLOG_SHARE = 0.05  # share of the vehicles in the insertion backlog at the end, above which there is a note
 MAX_UNFINISHED_SHARE, MAX_DELAY_SHARE = 0.05, 1 / 3
 """share of the vehicles that have not arrived at the end, above which there is a note, and share of delay in their
 travel time, above which traffic is still congested"""
 LOST_DEMAND_PATTERN = re.compile(
     "sorted by departure time|no (valid )?route|discard|removing vehicle|not reachable|inserted", re.IGNORECASE
-)
-"""pattern of SUMO's warnings about missing demand, which are listed first"""
+)  # pattern of SUMO's warnings about missing demand, which are listed first
 
 
 def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:

@@ -30,8 +30,7 @@ MAX_CAV_SLOWDOWN = 0.1
 """share by which CAVs may be slower than with their ACC alone: a controller must not sacrifice them"""
 NEGLIGIBLE_DELAY_SHARE = 0.05
 """delay of the human baseline up to which there is nothing to gain, as a share of the free-flow travel time"""
-MIN_VERDICT_SEEDS = 10
-"""minimum number of seeds for a recommendation; with fewer the CI is not reliable"""
+MIN_VERDICT_SEEDS = 10  # minimum number of seeds for a recommendation; with fewer the CI is not reliable
 RECOMMENDED, NOT_RECOMMENDED, UNDECIDED = "recommended", "not recommended", "not yet known"
 """verdicts on a controller, and on a road"""
 ACC_BASELINE = "ACC vehicles alone"

@@ -21,8 +21,7 @@ MIN_INTERVAL_VALUES = 3
 METRICS_DEFINED_AT_EARLY_END = {
     *("collisions", "min_ttc", "min_time_gap", "cav_min_ttc", "max_drac", "max_jerk", "shield_max_braking"),
     *("cav_max_braking", "cut_in_max_braking", "human_max_braking"),
-}
-"""metrics of conflicts, which are also defined for episodes that ended early"""
+}  # metrics of conflicts, which are also defined for episodes that ended early
 RETURN_METRICS = {"return", "return_eq16"}
 """metrics that are also defined for episodes with a collision, because the reward contains it"""
 MIN_VERDICT_TRAININGS = 10

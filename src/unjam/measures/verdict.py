@@ -15,14 +15,11 @@ from unjam.text import format_count
 if TYPE_CHECKING:  # imported late, so that commands start quickly
     import pandas as pd
 
-Rows = Sequence[dict[str, Any]]
-"""a row of metrics for each episode"""
+Rows = Sequence[dict[str, Any]]  # a row of metrics for each episode
 HIGHER_IS_BETTER = {"mean_speed", "mean_speed_steady", "outflow_veh_per_h", "min_ttc"}
 """metrics that are compared with the baseline, of which lower values are worse; of the others they are better"""
-MAX_RELATIVE_CHANGE = 10.0
-"""change from which it is not shown as a share of the baseline, which is nearly zero then"""
-FEW_SEEDS = 10
-"""number of seeds from which a verdict rarely changes with more of them"""
+MAX_RELATIVE_CHANGE = 10.0  # change from which it is not shown as a share of the baseline, which is nearly zero then
+FEW_SEEDS = 10  # number of seeds from which a verdict rarely changes with more of them
 NEITHER_IS_BETTER = {"cav_mean_gap"}
 """metrics of which neither direction is better: a larger gap can dissolve a wave, and lets vehicles cut in"""
 

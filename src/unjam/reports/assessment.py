@@ -32,14 +32,12 @@ EFFECT_METRICS = (
     ("flow", "outflow_veh_per_h", "flow", "veh/h", 0),
     ("fuel", "fuel_ml_per_km", "fuel by emission model", "ml/km", 1),
     ("hard_braking", "human_braking_beyond_4_5", "human drivers' braking beyond 4.5 m/s²", "per million", 0),
-)
-"""field of an effect, its metric, and label, unit and digits in tables"""
+)  # field of an effect, its metric, and label, unit and digits in tables
 HUMAN_BASELINE_LABEL, ACC_LABEL = "human baseline", "ACC alone"
 OPTION_HEADINGS = (
     *("CAVs", "driver", "travel time − human [s]", "travel time − ACC [s]"),
     *("flow − human [veh/h]", "flow − ACC [veh/h]", "feasibility", "verdict"),
-)
-"""columns of the main table: differences to the human baseline and to ACC vehicles alone"""
+)  # columns of the main table: differences to the human baseline and to ACC vehicles alone
 ACC_DIFFERENCES = "difference_to_acc", "flow_difference_to_acc"
 MISSING = Estimate(nan, nan, nan, 0)
 

@@ -30,18 +30,12 @@ from unjam.text import printable
 from unjam.worlds.record import assign_columns
 
 MAX_PANELS = 6
-MAX_REPLAY_FRAMES = 600
-"""maximum number of frames of a replay, which interpolates between them"""
-MAX_REPLAY_VALUES = 600_000
-"""vehicles times frames of all drivers of a replay: about three megabytes"""
-MAX_MERGE_DISTANCE = 50.0
-"""a merge is drawn at the vehicle that was nearest to it, if that was no farther away [m]"""
-REPLAY_NAN = 65535
-"""code of NaN in the arrays of a replay"""
-WORST_SHARE = 0.9
-"""share of the largest variance of speeds at which a replay opens"""
-REPLAY_STEP = 0.5
-"""time between two frames of the replay [s]"""
+MAX_REPLAY_FRAMES = 600  # maximum number of frames of a replay, which interpolates between them
+MAX_REPLAY_VALUES = 600_000  # vehicles times frames of all drivers of a replay: about three megabytes
+MAX_MERGE_DISTANCE = 50.0  # a merge is drawn at the vehicle that was nearest to it, if that was no farther away [m]
+REPLAY_NAN = 65535  # code of NaN in the arrays of a replay
+WORST_SHARE = 0.9  # share of the largest variance of speeds at which a replay opens
+REPLAY_STEP = 0.5  # time between two frames of the replay [s]
 
 
 def write_report_page(folders: Sequence[Path], target: Path) -> Path:

@@ -21,8 +21,7 @@ PREDICTED_QUANTITIES = {
     "follower_speed": ("follower speed", "m/s"),
     "follower_gap": ("follower gap", "m"),
     "reward": ("reward", ""),
-}
-"""label and unit of each predicted quantity"""
+}  # label and unit of each predicted quantity
 ERROR_KINDS = ("change", "base", "model")
 """quantities with a root mean square: the predicted changes, the errors of the base model and of the learned model"""
 BASE_LABELS = {
@@ -34,16 +33,13 @@ BASE_LABELS = {
     "acc": ("ACC alone", "physics with an adaptive cruise control follower"),
     "ovm": ("OVM alone", "physics with a follower of the optimal velocity model"),
     "none": ("no change", "the assumption that nothing changes"),
-}
-"""label and description of each base model"""
+}  # label and description of each base model
 WAVE_HEADINGS = ("mean speed [m/s]", "std across vehicles [m/s]", "slowest vehicle [m/s]")
-ERROR_PRECISION = 1e-5
-"""errors below this are rounding errors of single precision [m/s, m, reward]"""
+ERROR_PRECISION = 1e-5  # errors below this are rounding errors of single precision [m/s, m, reward]
 
 MODEL_COLOR, BASE_COLOR, CHANGE_COLOR, RECORDED_COLOR = LINE_COLORS[2], LINE_COLORS[1], LINE_COLORS[0], TEXT_COLOR
 ESTIMATORS = ("unexplained_variance", "transitions", "total_variation", "training_loss")
-REPLAYED_QUANTITIES = ("leader_speed", "leader_gap", "follower_gap")
-"""quantities with errors drawn over the time ahead"""
+REPLAYED_QUANTITIES = ("leader_speed", "leader_gap", "follower_gap")  # quantities with errors drawn over the time ahead
 ERROR_BINS = (("leader_speed", "leader_gap"), ("leader_speed", "speed"), ("reward", "leader_gap"))
 """pairs of a quantity and of the state over which its errors are drawn"""
 STEPS_LABEL = "environment steps [thousands]"

@@ -21,27 +21,20 @@ from unjam.worlds.record import Episode, Floats
 
 Float32s = NDArray[np.float32]
 
-EVALUATION_FILE = "evaluation.json"
-"""metrics of each driver"""
-PLOT_EPISODES_FILE = "plot_episodes.safetensors"
-"""arrays of the episodes that figures show"""
-PLOT_EPISODES_HASH = "plot_episodes_sha256"
-"""entry of the evaluation with the hash of that file"""
-MODEL_FILE = "model.json"
-"""facts about the learned model of a run"""
+EVALUATION_FILE = "evaluation.json"  # metrics of each driver
+PLOT_EPISODES_FILE = "plot_episodes.safetensors"  # arrays of the episodes that figures show
+PLOT_EPISODES_HASH = "plot_episodes_sha256"  # entry of the evaluation with the hash of that file
+MODEL_FILE = "model.json"  # facts about the learned model of a run
 VEHICLE_ARRAYS = ("speeds", "positions", "gaps", "poses", "lane_indices")
 """arrays with a row per time and a column per vehicle"""
 PLOT_ARRAYS = (*VEHICLE_ARRAYS, "replayed_motion", "outline", "backlog", "lane_lines")
 """arrays of an episode that figures need"""
-FULL_RATE_ARRAYS = ("speeds", "backlog")
-"""arrays that an episode has for every control step, not only for snapshots"""
-NO_LANE = -1
-"""lanes are stored as small integers, which have no NaN"""
+FULL_RATE_ARRAYS = ("speeds", "backlog")  # arrays that an episode has for every control step, not only for snapshots
+NO_LANE = -1  # lanes are stored as small integers, which have no NaN
 EPISODE_ENTRIES = (
     *("control_step", "seed", "drawn_values", "loop_length", "crossings", "branches", "limit_speed", "merge_positions"),
     *("vehicle_ids", "cav_ids", "vehicle_columns", "lane_names"),
-)
-"""fields of an episode that figures need, without the arrays"""
+)  # fields of an episode that figures need, without the arrays
 
 
 @dataclass(frozen=True)

@@ -23,20 +23,16 @@ from unjam.measures.verdict import Rows, Verdict, is_better, road_metrics, verdi
 from unjam.reports.results import PlotEpisode, Results, kept_row
 from unjam.text import format_count, printable
 
-CLOSE_TIME_GAP = 1.0
-"""time gap below which the report has a note [s]; the paper's h_max"""
-FORMULA_STARTS = {*"=+-@\t\r\n"}
-"""first letters of a cell that a spreadsheet takes for a formula"""
-MAX_LIMIT_RATIO = 1.01
-"""ratio of mean speed to the limit above which the report has a note"""
+CLOSE_TIME_GAP = 1.0  # time gap below which the report has a note [s]; the paper's h_max
+FORMULA_STARTS = {*"=+-@\t\r\n"}  # first letters of a cell that a spreadsheet takes for a formula
+MAX_LIMIT_RATIO = 1.01  # ratio of mean speed to the limit above which the report has a note
 COMPARED_METRICS = (
     *("mean_speed", "mean_speed_steady", "outflow_veh_per_h", "travel_time", "delay", "insertion_backlog_veh"),
     *(POWER_FUEL_METRIC, "share_standing", "speed_std_fleet", "speed_std_fleet_steady"),
     *("time_to_dissolve", "min_ttc"),
     *("human_max_braking", "human_braking_beyond_3_5", "human_braking_beyond_4_5", "human_braking_beyond_9"),
     *("cav_mean_gap", LAG_METRIC, "amplification_long", "amplification_medium", "amplification_short", "collisions"),
-)
-"""metrics with the same meaning in the human baseline and with CAVs, in the order of the table"""
+)  # metrics with the same meaning in the human baseline and with CAVs, in the order of the table
 
 
 @dataclass(frozen=True)

@@ -19,21 +19,14 @@ from unjam.worlds.ordered_road import poses_along
 from unjam.worlds.record import Episode
 from unjam.worlds.road_world import RoadScene
 
-FRAME_SIZE = 640
-"""width and height of a frame [pixels]"""
-ROAD_MARGIN = 8.0
-"""margin around the road [m]"""
-OVERSAMPLING = 2
-"""factor by which pictures are drawn larger and then reduced, for smooth edges"""
-MIN_VEHICLE_PIXELS = 7.0
-"""length of a vehicle on a large road, where the true length would be invisible"""
+FRAME_SIZE = 640  # width and height of a frame [pixels]
+ROAD_MARGIN = 8.0  # margin around the road [m]
+OVERSAMPLING = 2  # factor by which pictures are drawn larger and then reduced, for smooth edges
+MIN_VEHICLE_PIXELS = 7.0  # length of a vehicle on a large road, where the true length would be invisible
 ROAD_COLOR = "#dfe3e8"
-MAX_TITLE_WIDTH = 36
-"""maximum length of a line of the title, which must fit into a ring [characters]"""
-MIN_EMPTY_CENTER = 0.15
-"""empty radius around the center that a caption there needs, relative to the size of the road"""
-LEGEND_WIDTH, LEGEND_HEIGHT = 110, 10
-"""size of the scale of speeds [pixels]"""
+MAX_TITLE_WIDTH = 36  # maximum length of a line of the title, which must fit into a ring [characters]
+MIN_EMPTY_CENTER = 0.15  # empty radius around the center that a caption there needs, relative to the size of the road
+LEGEND_WIDTH, LEGEND_HEIGHT = 110, 10  # size of the scale of speeds [pixels]
 FRAMES_PER_SECOND = 20
 VIDEO_FORMATS = (".gif", ".webp", ".mp4")
 
