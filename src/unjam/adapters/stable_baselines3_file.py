@@ -36,14 +36,10 @@ class _Actor:
     """Names of the weights of an actor network; numbered layers come first."""
 
     hidden: str
-    output: str
-    """empty if the last numbered layer is the output"""
-    others: tuple[str, ...]
-    """beginnings of the names of other weights, without which actions are the same"""
-    activation: str
-    """default activation"""
-    is_squashed: bool
-    """whether the output is the tanh of the last layer, scaled to the action space"""
+    output: str  # empty if the last numbered layer is the output
+    others: tuple[str, ...]  # beginnings of the names of other weights, without which actions are the same
+    activation: str  # default activation
+    is_squashed: bool  # whether the output is the tanh of the last layer, scaled to the action space
 
 
 ACTORS = (
@@ -62,12 +58,10 @@ class SavedPolicy:
 
     observation_space: Box
     action_space: Box
-    layers: list[tuple[Floats, Floats]]
-    """weight, shape (outputs, inputs), and bias of each"""
+    layers: list[tuple[Floats, Floats]]  # weight, shape (outputs, inputs), and bias of each
     activation: Callable[[Floats], Floats]
     is_squashed: bool
-    unjam: dict[str, Any]
-    """what `unjam export --sb3` writes: expert, features, action repeat; empty for other models"""
+    unjam: dict[str, Any]  # what `unjam export --sb3` writes: expert, features, action repeat; empty for other models
 
     def predict(self, observation: Floats, *, deterministic: bool = True) -> tuple[Floats, None]:
         """Return actions, shape (n, 1), and no state."""

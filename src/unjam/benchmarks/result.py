@@ -49,13 +49,10 @@ Columns = dict[str, Annotated[Column, Field(min_length=EPISODES_PER_ROAD, max_le
 class RoadRecord:
     """The episodes of the human baseline and of the driver on one road."""
 
-    backend: StrictStr
-    """which simulator drove the driver's episodes"""
+    backend: StrictStr  # which simulator drove the driver's episodes
     baseline: Columns
-    driver: Columns
-    """empty if it cannot drive on this road: it then counts as the human baseline"""
-    note: StrictStr = ""
-    """why it cannot drive there"""
+    driver: Columns  # empty if it cannot drive on this road: it then counts as the human baseline
+    note: StrictStr = ""  # why it cannot drive there
 
 
 @parameter_dataclass(frozen=True, config=STRICT)

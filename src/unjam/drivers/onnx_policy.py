@@ -24,8 +24,7 @@ class Tensor(NamedTuple):
     """An input or output of a graph."""
 
     type: type[np.floating[Any]]
-    shape: tuple[int, ...] | None
-    """0 for an axis without a fixed length; None: unknown"""
+    shape: tuple[int, ...] | None  # 0 for an axis without a fixed length; None: unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,14 +32,11 @@ class OnnxPolicy:
     """A checked graph as the function of a policy."""
 
     graph: bytes
-    columns: dict[str, tuple[int, ...]]
-    """columns of the observation, by input"""
+    columns: dict[str, tuple[int, ...]]  # columns of the observation, by input
     output: str
     memory: tuple[PolicyMemory, ...]
-    tensors: dict[str, Tensor]
-    """its inputs"""
-    is_batched: bool
-    """whether the graph takes any number of rows; otherwise it runs once for each CAV"""
+    tensors: dict[str, Tensor]  # its inputs
+    is_batched: bool  # whether the graph takes any number of rows; otherwise it runs once for each CAV
 
     def initial_memory(self, n: int) -> Memory:
         """Return the initial recurrent state of `n` CAVs, in the types of the graph."""
@@ -80,8 +76,7 @@ class OnnxDriver(PolicyDriver):
     """A policy from an ONNX graph, alone or added to an expert; raises errors as `unjam.adapters.onnx_driver`."""
 
     policy: Any = field(init=False)  # an `OnnxPolicy`
-    graph: NDArray[np.uint8] = field(kw_only=True, repr=False)
-    """bytes of the graph"""
+    graph: NDArray[np.uint8] = field(kw_only=True, repr=False)  # bytes of the graph
 
     def __post_init__(self) -> None:
         with naming(f"driver {self.label}: "):

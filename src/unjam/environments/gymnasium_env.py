@@ -77,15 +77,12 @@ class RoadStepResult(NamedTuple):
     """The result of one control step, with the CAVs that are on the road now."""
 
     cav_ids: list[str]
-    observations: Observations
-    """shape (CAVs, numbers)"""
-    departed: dict[str, Observations]
-    """last observations of the CAVs that left the road in this step"""
+    observations: Observations  # shape (CAVs, numbers)
+    departed: dict[str, Observations]  # last observations of the CAVs that left the road in this step
     reward: float
     reward_terms: dict[str, float]
     terminated: bool
-    truncated: bool
-    """whether the horizon is reached, or no CAV will be on the road again"""
+    truncated: bool  # whether the horizon is reached, or no CAV will be on the road again
 
 
 class RoadStepper:

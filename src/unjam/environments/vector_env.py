@@ -45,10 +45,8 @@ class _ArrayKind(NamedTuple):
     """Library and precision of the arrays of an environment, and its noise."""
 
     to_array: ArrayFactory
-    draw: DrawNormal | None
-    """draws the noise of all roads; None: each road has that of SUMO's episode"""
-    to_single: Callable[[Array], Array]
-    """returns an array in single precision"""
+    draw: DrawNormal | None  # draws the noise of all roads; None: each road has that of SUMO's episode
+    to_single: Callable[[Array], Array]  # returns an array in single precision
     no_gradient: Callable[[], AbstractContextManager[object]]
 
 

@@ -25,18 +25,12 @@ SAME_PASSAGE_SECONDS = 10.0
 class Measurement:
     """Measurement of a detector in an interval."""
 
-    place: str
-    """id of an edge, all lanes of which are counted, or of a lane"""
-    position: float
-    """position on the edge or lane [m]"""
-    begin: float
-    """begin of the interval, in simulation time [s]"""
-    end: float
-    """end of the interval, in simulation time [s]"""
-    flow: float
-    """flow [veh/h]"""
-    speed: float
-    """mean speed of the vehicles that passed [m/s]; NaN if unknown"""
+    place: str  # id of an edge, all lanes of which are counted, or of a lane
+    position: float  # position on the edge or lane [m]
+    begin: float  # begin of the interval, in simulation time [s]
+    end: float  # end of the interval, in simulation time [s]
+    flow: float  # flow [veh/h]
+    speed: float  # mean speed of the vehicles that passed [m/s]; NaN if unknown
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ class TableCell:
     """A number in a table, as text."""
 
     mean: str
-    interval: str = ""
-    """CI, or the range without a CI; with the number of episodes if some are left out"""
+    interval: str = ""  # CI, or the range without a CI; with the number of episodes if some are left out
 
     def __str__(self) -> str:
         return f"{self.mean} {self.interval}".strip()

@@ -327,14 +327,11 @@ def travel_time_metric(group: str) -> EpisodeFunction:
 class Metric:
     """A metric, and how tables show it."""
 
-    function: EpisodeFunction
-    """computes the metric; its docstring is the description in tables"""
+    function: EpisodeFunction  # computes the metric; its docstring is the description in tables
     label: str
     unit: str
-    digits: int = 2
-    """number of decimal places"""
-    bounds: tuple[float, float] = (0.0, inf)
-    """smallest and largest possible value"""
+    digits: int = 2  # number of decimal places
+    bounds: tuple[float, float] = (0.0, inf)  # smallest and largest possible value
 
 
 def _braking_metrics(group: Literal["CAV", "human"]) -> dict[str, Metric]:

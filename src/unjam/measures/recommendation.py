@@ -226,8 +226,7 @@ class RoadVerdict(NamedTuple):
     """The answer of an assessment."""
 
     verdict: str
-    sentence: str
-    """the answer in one sentence"""
+    sentence: str  # the answer in one sentence
 
 
 def road_verdict(results: Sequence[ControllerResult], baseline: Sequence[dict[str, Any]] = ()) -> RoadVerdict:

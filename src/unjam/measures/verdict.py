@@ -28,12 +28,9 @@ NEITHER_IS_BETTER = {"cav_mean_gap"}
 class RoadMetrics:
     """What matters on a kind of road."""
 
-    compared: tuple[str, ...]
-    """metrics that are compared with the baseline; the first one decides"""
-    others: tuple[str, ...]
-    """metrics that a short table shows besides"""
-    headline: tuple[str, ...]
-    """metrics of a driver that is compared with none; the first two are the most important"""
+    compared: tuple[str, ...]  # metrics that are compared with the baseline; the first one decides
+    others: tuple[str, ...]  # metrics that a short table shows besides
+    headline: tuple[str, ...]  # metrics of a driver that is compared with none; the first two are the most important
 
 
 CLOSED_ROAD = RoadMetrics(
@@ -82,8 +79,7 @@ class DifferenceText:
     """A paired difference to the baseline, as text."""
 
     label: str
-    text: str
-    """mean and CI with the unit, and the mean as a share of the baseline"""
+    text: str  # mean and CI with the unit, and the mean as a share of the baseline
     is_better: bool | None
 
 
