@@ -1,13 +1,13 @@
 """Effect of CAVs on a road: paired differences to the human baseline on the same seeds."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import isfinite, nan
 from typing import Any
 
 import numpy as np
 
-from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, overall_feasibility
+from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, EpisodeRows, RowsByDriver, overall_feasibility
 from unjam.measures.statistics import (
     CONFIDENCE,
     Estimate,
@@ -120,9 +120,7 @@ def is_measured(rows: Iterable[dict[str, Any]], metric: str) -> bool:
     return any(isfinite(row.get(metric, nan)) for row in rows)
 
 
-def effect_of(
-    rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str, Any]], confidence: float = CONFIDENCE
-) -> Effect:
+def effect_of(rows: EpisodeRows, baseline: EpisodeRows, confidence: float = CONFIDENCE) -> Effect:
     """Return the effect of a driver, from its rows of `measure` and those of the human baseline.
 
     Only seeds that both have are used.
@@ -149,7 +147,7 @@ def effect_of(
     )
 
 
-def _delay_reduction(rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str, Any]], confidence: float) -> Estimate:
+def _delay_reduction(rows: EpisodeRows, baseline: EpisodeRows, confidence: float) -> Estimate:
     pairs = [
         (metric_value(human, TIME_METRIC) - metric_value(row, TIME_METRIC), metric_value(human, "delay"))
         for row, human in pair_rows(rows, baseline)
@@ -160,7 +158,7 @@ def _delay_reduction(rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str
     return estimate(linearized_ratio(saved, delays).tolist(), confidence)
 
 
-def effects_by_driver(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, Effect]:
+def effects_by_driver(rows_by_driver: RowsByDriver) -> dict[str, Effect]:
     """Return the effect of each driver compared with the human baseline; empty without a baseline."""
     baseline = rows_by_driver.get("human", [])
     others = ((label, rows) for label, rows in rows_by_driver.items() if label != "human")

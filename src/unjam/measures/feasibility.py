@@ -17,6 +17,8 @@ MIN_FEASIBLE_TTC = 1.0  # minimum time to collision [s]
 MAX_FEASIBLE_BRAKING = 6.0  # maximum braking [m/s2]
 TOLERANCE = 1e-6  # tolerance of these limits for rounding errors
 
+EpisodeRows = Sequence[dict[str, Any]]  # a row of metrics for each episode, failed ones included
+RowsByDriver = dict[str, list[dict[str, Any]]]
 FEASIBLE = "feasible"
 HARD_BRAKING_METRIC = "human_braking_beyond_4_5"
 """metric of human drivers whose value must not exceed that of the human baseline"""
@@ -65,20 +67,20 @@ def _rate_text(rate: float) -> str:
     return f"{rate:,.0f}" if rate >= 100.0 else f"{rate:.3g}"
 
 
-def feasibility_by_driver(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, str]:
+def feasibility_by_driver(rows_by_driver: RowsByDriver) -> dict[str, str]:
     """Return the verdict on each driver of a road; that of the human baseline is empty."""
     return {
         label: overall_feasibility(rows, baseline_rows(label, rows_by_driver)) for label, rows in rows_by_driver.items()
     }
 
 
-def baseline_rows(label: str, rows_by_driver: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+def baseline_rows(label: str, rows_by_driver: RowsByDriver) -> list[dict[str, Any]]:
     """Return the rows of the human baseline for a driver; in a comparison of results, those of the same result."""
     result, _, _ = label.rpartition(": ")
     return rows_by_driver.get(f"{result}: human", rows_by_driver.get("human", []))
 
 
-def overall_feasibility(rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str, Any]] = ()) -> str:
+def overall_feasibility(rows: EpisodeRows, baseline: EpisodeRows = ()) -> str:
     """Return one verdict on all episodes of a driver, with the number of episodes that violate a limit.
 
     The reason is the first limit that any episode violates, with the value of the worst episode. `baseline` has the

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from unjam.measures.effect import FLOW_METRIC, MAX_FLOW_LOSS
-from unjam.measures.feasibility import FEASIBLE, overall_feasibility
+from unjam.measures.feasibility import FEASIBLE, EpisodeRows, overall_feasibility
 from unjam.measures.statistics import Estimate, estimate, linearized_ratio, paired_difference
 from unjam.worlds.record import Floats
 
@@ -17,8 +17,6 @@ MIN_GAIN, MAX_GAIN = -1.0, 1.5  # range to which gains are clipped
 MIN_REFERENCE_GAIN = 0.03
 """smallest improvement by the reference, as a share of the baseline's performance; below it there is nothing to gain"""
 MEAN_GAIN = "mean gain"  # name of the objective of tuning on several roads
-
-EpisodeRows = Sequence[dict[str, Any]]
 
 
 def performance(row: dict[str, Any]) -> float:

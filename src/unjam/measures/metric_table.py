@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from unjam.drivers.registry import DRIVERS
-from unjam.measures.feasibility import feasibility_by_driver
+from unjam.measures.feasibility import RowsByDriver, feasibility_by_driver
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import (
     Estimate,
@@ -21,8 +21,6 @@ from unjam.measures.statistics import (
 )
 
 Value = TypeVar("Value")
-RowsByDriver = dict[str, list[dict[str, Any]]]
-"""rows of metrics by driver: one row for each episode, failed ones included"""
 HUMAN_LABEL = "human"  # label of the human baseline
 CAV_METRICS = {name for name, metric in METRICS.items() if metric.label.startswith("CAV")} | {
     *("min_ttc", "min_time_gap", "max_jerk", "filter_override_share", "override_share", "yield_share"),

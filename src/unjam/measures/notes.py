@@ -2,11 +2,9 @@
 
 import re
 from collections import Counter
-from collections.abc import Sequence
-from typing import Any
 
 from unjam.errors import InputError
-from unjam.measures.metric_table import RowsByDriver
+from unjam.measures.feasibility import EpisodeRows, RowsByDriver
 from unjam.measures.statistics import count_teleports, has_ended_early
 from unjam.text import format_count
 
@@ -25,19 +23,12 @@ LOST_DEMAND_PATTERN = re.compile(
 def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return all notes on the episodes of several drivers, the most serious first."""
     lost, others = warning_notes(rows_by_driver)
-    kinds = (
-        early_end_notes,
-        _backlog_notes,
-        _unfinished_trip_notes,
-        _entrance_notes,
-        teleport_notes,
-        _repeated_drive_notes,
-    )
-    notes = (note(rows_by_driver) for note in kinds)
+    traffic = early_end_notes, _backlog_notes, _unfinished_trip_notes, _entrance_notes
+    notes = (note(rows_by_driver) for note in (*traffic, teleport_notes, _repeated_drive_notes))
     return [*lost, *(each for group in notes for each in group), *others]
 
 
-def count_early_ends(rows: Sequence[dict[str, Any]]) -> dict[str, int]:
+def count_early_ends(rows: EpisodeRows) -> dict[str, int]:
     """Return the number of episodes that ended early, by reason."""
     return dict(Counter(row.get("reason") or row["status"] for row in rows if has_ended_early(row)))
 
@@ -51,13 +42,13 @@ def early_end_notes(rows_by_driver: RowsByDriver) -> list[str]:
     ]
 
 
-def _early_end_text(rows: Sequence[dict[str, Any]]) -> str:
+def _early_end_text(rows: EpisodeRows) -> str:
     counts = count_early_ends(rows)
     reasons = ", ".join(f"{reason} ({count})" if len(counts) > 1 else reason for reason, count in counts.items())
     return f"{sum(counts.values())} of {format_count(len(rows), 'episode')} ended early: {reasons}"
 
 
-def check_baseline(rows: Sequence[dict[str, Any]], planned_episodes: int = 0) -> None:
+def check_baseline(rows: EpisodeRows, planned_episodes: int = 0) -> None:
     """Raise `InputError` if so many episodes of the human baseline ended early that comparisons would mislead.
 
     `planned_episodes` is their planned number, if it is larger than that of the `rows` so far.

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isfinite
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from unjam.measures.effect import (
     MAX_FLOW_LOSS,
@@ -20,7 +20,7 @@ from unjam.measures.effect import (
     harm_checks,
     is_too_small,
 )
-from unjam.measures.feasibility import FEASIBLE
+from unjam.measures.feasibility import FEASIBLE, EpisodeRows
 from unjam.measures.statistics import Estimate, format_difference, format_percent, metric_estimate
 from unjam.text import format_count
 
@@ -229,7 +229,7 @@ class RoadVerdict(NamedTuple):
     sentence: str  # the answer in one sentence
 
 
-def road_verdict(results: Sequence[ControllerResult], baseline: Sequence[dict[str, Any]] = ()) -> RoadVerdict:
+def road_verdict(results: Sequence[ControllerResult], baseline: EpisodeRows = ()) -> RoadVerdict:
     """Return the answer of an assessment: the recommended controller, or why there is none.
 
     `baseline` has the rows of the human baseline, which show whether traffic is nearly free-flowing.

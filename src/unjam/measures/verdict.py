@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from unjam.measures.effect import FLOW_METRIC, FUEL_METRIC, LAG_METRIC, POWER_FUEL_METRIC, TIME_METRIC, is_measured
-from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
-from unjam.measures.metric_table import HUMAN_LABEL, RowsByDriver, estimate_cell, metric_table
+from unjam.measures.feasibility import FEASIBLE, RowsByDriver, feasibility_by_driver
+from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell, metric_table
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, count_teleports, pair_rows, paired_difference, relative_difference
 from unjam.text import format_count
@@ -15,7 +15,6 @@ from unjam.text import format_count
 if TYPE_CHECKING:  # imported late, so that commands start quickly
     import pandas as pd
 
-Rows = Sequence[dict[str, Any]]  # a row of metrics for each episode
 HIGHER_IS_BETTER = {"mean_speed", "mean_speed_steady", "outflow_veh_per_h", "min_ttc"}
 """metrics that are compared with the baseline, of which lower values are worse; of the others they are better"""
 MAX_RELATIVE_CHANGE = 10.0  # change from which it is not shown as a share of the baseline, which is nearly zero then

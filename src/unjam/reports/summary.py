@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from unjam.measures.effect import LAG_METRIC, POWER_FUEL_METRIC
+from unjam.measures.feasibility import EpisodeRows
 from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, driver_rank, estimate_cell
 from unjam.measures.metrics import METRICS
 from unjam.measures.notes import early_end_notes
@@ -19,7 +20,7 @@ from unjam.measures.statistics import (
     pair_rows,
     paired_difference,
 )
-from unjam.measures.verdict import Rows, Verdict, is_better, road_metrics, verdicts
+from unjam.measures.verdict import Verdict, is_better, road_metrics, verdicts
 from unjam.reports.results import PlotEpisode, Results, kept_row
 from unjam.text import format_count, printable
 
@@ -168,7 +169,7 @@ def main_finding(result: Results) -> str:
     return " ".join(sentences) or f"On {seeds} the mean return of the trained controller is {mean:.0f}."
 
 
-def _traffic_finding(rows: Rows, expert_rows: Rows, expert: str, name: str) -> str:
+def _traffic_finding(rows: EpisodeRows, expert_rows: EpisodeRows, expert: str, name: str) -> str:
     """Return whether the metric that decides on this road is better than that of the expert, as a sentence."""
     metric, change = METRICS[name], paired_difference(rows, expert_rows, name)
     finding = {None: "no difference is shown", True: "better", False: "worse"}[is_better(name, change)]
