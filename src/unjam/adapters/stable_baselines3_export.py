@@ -19,12 +19,12 @@ ALGORITHMS = {
 MIN_EXPLORATION = 1e-3  # smallest standard deviation of exploration, as a share of the authority
 
 
-def stable_baselines3_model(driver: ResidualDriver, agent: str) -> Any:
-    """Return a model of an algorithm of `ALGORITHMS` whose deterministic action is the residual of a driver [m/s2].
+def stable_baselines3_bytes(driver: ResidualDriver, agent: str) -> bytes:
+    """Return the content of the `.zip` file of a model whose deterministic action is the residual of a driver [m/s2].
 
-    Its observations are those of the Gymnasium environments with the driver's expert and features. Its actor has the
-    weights of the driver; critics and optimizers are new. Raise `InputError` for an unknown algorithm,
-    `MissingPartError` without Stable-Baselines3.
+    The algorithm is that of `ALGORITHMS` for `agent`. Observations are those of the Gymnasium environments with the
+    driver's expert and features. The actor has the weights of the driver; critics and optimizers are new. Raise
+    `InputError` for an unknown algorithm, `MissingPartError` without Stable-Baselines3.
     """
     if agent not in ALGORITHMS:
         raise unknown_name("agent", agent, ALGORITHMS)
@@ -67,11 +67,6 @@ def stable_baselines3_model(driver: ResidualDriver, agent: str) -> Any:
         "action": "residual acceleration [m/s2], added to that of the expert",
         "action_repeat": driver.action_repeat,
     }
-    return model
-
-
-def stable_baselines3_bytes(driver: ResidualDriver, agent: str) -> bytes:
-    """Return the content of the `.zip` file of a model; arguments and errors as `stable_baselines3_model`."""
     content = io.BytesIO()
-    stable_baselines3_model(driver, agent).save(content)
+    model.save(content)
     return content.getvalue()

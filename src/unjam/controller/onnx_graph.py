@@ -11,8 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from unjam.adapters.onnx_file import DESCRIPTION_KEY
-from unjam.controller.graph import ONNX_OPSET, graph_names
-from unjam.controller.manifest import driver_interface
+from unjam.controller.manifest import ONNX_OPSET, driver_interface, graph_names
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState, state_of_ones
