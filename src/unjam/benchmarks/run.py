@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from itertools import groupby
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -185,32 +185,24 @@ def make_tasks(scenario: Scenario, driver: Driver, seeds: Seeds, backend: Backen
 
 
 def drive_by_label(
-    scenario: Scenario,
-    drivers: Mapping[str, str],
-    seeds: Seeds,
-    run_episodes: Callable[[list[EpisodeTask]], EpisodeRows],
+    scenario: Scenario, drivers: Mapping[str, str], seeds: Seeds, workers: WorkerPool, in_batches: bool
 ) -> dict[str, EpisodeRows]:
     """Return the metrics of each driver's episodes by label; `drivers` are names of drivers by label.
 
-    `run_episodes` runs tasks and returns the result of `family_metrics` for each of them, in their order.
+    With `in_batches`, episodes run in batches if these support the scenario.
     """
-    made = [make_driver(name, scenario.control_step) for name in drivers.values()]  # one each: networks have memory
-    rows, count = run_episodes([task for driver in made for task in make_tasks(scenario, driver, seeds)]), len(seeds)
-    return {label: rows[number * count : (number + 1) * count] for number, label in enumerate(drivers)}
+    made = {label: make_driver(name, scenario.control_step) for label, name in drivers.items()}
+    tasks = {label: make_tasks(scenario, driver, seeds) for label, driver in made.items()}
+    if in_batches and not unsupported_reason(scenario):
+        return {label: list(map(_family_metrics, run_batches(own))) for label, own in tasks.items()}
+    # A whole motorway episode takes 80 MB.
+    rows = iter(workers.run_and_map([*chain(*tasks.values())], lambda index, episode: _family_metrics(episode)))
+    return {label: [next(rows) for _ in own] for label, own in tasks.items()}
 
 
-def family_metrics(index: int, episode: Episode) -> dict[str, Any]:
-    """Return the metrics of an episode, for `WorkerPool.run_and_map`: a whole motorway episode takes 80 MB."""
+def _family_metrics(episode: Episode) -> dict[str, Any]:
     measured = measure(episode)
     return {key: measured[key] for key in FAMILY_METRICS}
-
-
-def run_in_batches(workers: WorkerPool, tasks: list[EpisodeTask]) -> EpisodeRows:
-    """Return the metrics of episodes of one road and several drivers, in batches where they are supported."""
-    if unsupported_reason(tasks[0].scenario):
-        return workers.run_and_map(tasks, family_metrics)
-    by_driver = groupby(tasks, key=lambda task: id(task.driver))
-    return [family_metrics(*each) for _, own in by_driver for each in enumerate(run_batches(list(own)))]
 
 
 def _driver_hash(label: str, driver: Driver) -> str | None:
