@@ -22,7 +22,5 @@ def register_environments() -> None:
     """Register the environments with Gymnasium; their module is imported when one is made."""
     for name, arguments in ENVIRONMENT_ARGUMENTS.items():
         if name not in registry:
-            single, vector = (
-                f"unjam.environments.{each}" for each in ("gymnasium_env:RoadEnv", "slotted_vector_env:make_vector_env")
-            )
-            register(name, single, vector_entry_point=vector, kwargs=arguments)
+            vector = "unjam.environments.slotted_vector_env:make_vector_env"
+            register(name, "unjam.environments.gymnasium_env:RoadEnv", vector_entry_point=vector, kwargs=arguments)

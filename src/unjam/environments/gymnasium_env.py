@@ -33,15 +33,7 @@ from unjam.text import one_line
 from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend, open_world
 from unjam.worlds.drive import DriveLoop
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
-from unjam.worlds.reward import (
-    Outcome,
-    Reward,
-    RewardLike,
-    is_packaged_reward,
-    make_reward,
-    step_reward_terms,
-    time_gap,
-)
+from unjam.worlds.reward import Outcome, RewardLike, is_packaged_reward, make_reward, step_reward_terms, time_gap
 from unjam.worlds.road_world import RoadWorld
 
 Observations = NDArray[np.float32]
@@ -107,7 +99,7 @@ class RoadStepper:
         self.scenario = self.episode_scenario = made
         """that of the constructor; `episode_scenario` is that of the last reset, with its options"""
         reward = reward or self.scenario.reward
-        self._reward, self.has_user_reward = make_reward(reward), not is_packaged_reward(reward)
+        self.reward, self.has_user_reward = make_reward(reward), not is_packaged_reward(reward)
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
         inputs = as_features(features)
         if not expert and (useless := [name for name in ("expert_acceleration", "expert_memory") if name in inputs]):
@@ -204,7 +196,7 @@ class RoadStepper:
             accelerations = np.array(accelerations)  # a backend may write into its own arrays later
         ends = bool(world.has_crashed), float(world.backlog)
         outcome = Outcome(np.array(world.speeds), accelerations, time_gaps, *ends, speed)
-        terms = step_reward_terms(self._reward, outcome, world.control_steps - 1, self.has_user_reward)
+        terms = step_reward_terms(self.reward, outcome, world.control_steps - 1, self.has_user_reward)
         terminated, reward = world.has_crashed, sum(terms.values())
         self._steps, self._return = self._steps + 1, self._return + reward
         if self._metric_means is not None:
@@ -231,11 +223,6 @@ class RoadStepper:
     def copy_driver(self) -> ExternalDriver:
         """Return a driver with the same expert and features, for other CAVs."""
         return copy(self._driver)
-
-    @property
-    def reward(self) -> Reward:
-        """The reward of control steps."""
-        return self._reward
 
     @property
     def world(self) -> RoadWorld:

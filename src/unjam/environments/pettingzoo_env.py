@@ -55,10 +55,8 @@ class ParallelRoadEnv(RoadAgents):
         observations = self._road.reset(seed, np.random.default_rng(), options)
         if options and (others := {*self._road.episode_scenario.possible_cav_ids()}.difference(self.possible_agents)):
             self._road.end_episode()
-            allowed = "as many CAVs as in the constructor, or fewer"
-            raise InputError(
-                f"reset: options: {format_count(len(others), 'more CAV')} cannot be there; allowed: {allowed}"
-            )
+            more, allowed = format_count(len(others), "more CAV"), "as many CAVs as in the constructor, or fewer"
+            raise InputError(f"reset: options: {more} cannot be there; allowed: {allowed}")
         self._agent_by_vehicle.clear()
         self._departed_agents.clear()
         self.agents = self._assign_agents(self._road.world.cav_ids)
@@ -82,9 +80,8 @@ class ParallelRoadEnv(RoadAgents):
         )
         departed.update(leaving)
         # A vehicle that enters in the last control step does not become an agent.
-        observations = {
-            agent: each for agent, each in (leaving | present).items() if agent in previous or not has_ended
-        }
+        shown = leaving | present
+        observations = {agent: shown[agent] for agent in shown if agent in previous or not has_ended}
         self.agents = [] if has_ended else list(present)
         info = self._road.step_info(result, has_ended)
         return (
@@ -103,11 +100,6 @@ class ParallelRoadEnv(RoadAgents):
                 free = [agent for agent in self.possible_agents if agent not in taken]
                 self._agent_by_vehicle[name] = name if name in free else free[0]
         return [self._agent_by_vehicle[name] for name in vehicles]
-
-    @synchronized
-    def close(self) -> None:
-        """Close SUMO; further calls have no effect."""
-        self._road.close()
 
 
 @overload

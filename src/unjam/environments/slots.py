@@ -45,6 +45,11 @@ class RoadAgents(ParallelEnv[str, Any, Any]):
     def render(self) -> None:
         """Draw nothing."""
 
+    @synchronized
+    def close(self) -> None:
+        """Close SUMO; further calls have no effect."""
+        self._road.close()
+
 
 class SlottedRoadEnv(RoadAgents):
     """A `ParallelRoadEnv` with the agents slot_0, slot_1, ..., all of which exist for the whole episode.
@@ -128,7 +133,3 @@ class SlottedRoadEnv(RoadAgents):
             }
             for slot in self.possible_agents
         }
-
-    def close(self) -> None:
-        """Close SUMO; further calls have no effect."""
-        self._environment.close()

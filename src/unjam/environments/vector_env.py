@@ -244,16 +244,13 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             super().reset(seed=as_seed(seed)[0])
             return list(range(int(seed), int(seed) + self.num_envs))
         try:
-            seeds = [
-                None if each is None else as_seed(index(each))[0]
-                for each in ([None] * self.num_envs if seed is None else seed)
-            ]
+            given = [None] * self.num_envs if seed is None else seed
+            seeds = [None if each is None else as_seed(index(each))[0] for each in given]
         except TypeError:
             raise invalid_value("seed", seed, "an integer, or one for each environment") from None
         if len(seeds) != self.num_envs:
-            raise InputError(
-                f"seed: {format_count(len(seeds), 'seed')} not allowed; allowed: {self.num_envs}, or a single one"
-            )
+            count = format_count(len(seeds), "seed")
+            raise InputError(f"seed: {count} not allowed; allowed: {self.num_envs}, or a single one")
         return seeds
 
     def make_batch(self, rows: Sequence[int]) -> Any:
