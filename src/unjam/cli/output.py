@@ -22,7 +22,7 @@ from unjam.controller import DEFAULT_DRIVER
 from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, MissingPartError
 from unjam.files import to_json
-from unjam.measures.metric_table import RowsByDriver, TableCell, choose_baseline, metric_table
+from unjam.measures.metric_table import RowsByDriver, choose_baseline, metric_table
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, is_expert_unchanged
 from unjam.measures.verdict import short_table_metrics, verdicts
@@ -110,15 +110,16 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
         columns[label].append(number)  # without a baseline there are no differences
 
     def build_table(columns: Sequence[int], separator: str) -> Table:
-        table = new_table(
-            ("metric", "unit"), [break_label(headings[number], TEXT_COLUMN_WIDTHS[separator]) for number in columns]
-        )
+        width = TEXT_COLUMN_WIDTHS[separator]
+        table = new_table(("metric", "unit"), [break_label(headings[number], width) for number in columns])
         for column in table.columns[2:]:
             column.no_wrap = True
         if separator != " ":
             table.columns[0].width, table.columns[1].width = NARROW_COLUMN_WIDTHS
         for row in rows:
-            table.add_row(row.label, row.unit, *(_cell_text(row.cells[number], separator) for number in columns))
+            cells = ((fill(row.cells[number].mean, width), row.cells[number].interval) for number in columns)
+            texts = (Text.assemble(mean, separator, (ci, "dim")) if ci else Text(mean) for mean, ci in cells)
+            table.add_row(row.label, row.unit, *texts)
         return table
 
     def fits(columns: Sequence[int], separator: str) -> bool:
@@ -165,12 +166,6 @@ def print_notes(notes: Sequence[str]) -> None:
     """Print what a reader of the metrics should know, a line for each note."""
     for note in notes:
         err_console.print(f"note: {note}", soft_wrap=True)
-
-
-def _cell_text(cell: "TableCell", separator: str) -> Text:
-    """Return a cell: its interval dim, verdicts wrapped."""
-    mean = fill(cell.mean, TEXT_COLUMN_WIDTHS[separator])
-    return Text.assemble(mean, separator, (cell.interval, "dim")) if cell.interval else Text(mean)
 
 
 class ProgressReporter:

@@ -87,9 +87,8 @@ def _parse_measurement(file: str, line: int, kind: str, row: dict[str, str | Non
     context = f"{file}: line {line}"
     surplus: Any = row.get(None) or ()  # pyright: ignore[reportArgumentType]  (the key of cells without a column)
     if any(surplus) or None in row.values():
-        raise InputError(
-            f"{context}: has {'more' if any(surplus) else 'fewer'} cells than the header; allowed: as many"
-        )
+        number = "more" if any(surplus) else "fewer"
+        raise InputError(f"{context}: has {number} cells than the header; allowed: as many")
     place = (row[kind] or "").strip()
     if not place:
         raise invalid_value(f"{context}: {kind}", place, f"the id of one {kind}")

@@ -85,7 +85,7 @@ def metric_table(
     has_cavs = any(map(driver_rank, rows_by_driver))
     compared = {label: rows for label, rows in rows_by_driver.items() if baseline and label != baseline}
     headings = [*rows_by_driver, *(f"{label} − {baseline}" for label in compared)]
-    pairs = {label: len(pair_rows(rows, rows_by_driver[baseline])) for label, rows in compared.items()}
+    reference = rows_by_driver.get(baseline, [])
     table = list[TableRow]()
     if has_cavs:
         verdicts = [TableCell(verdict or "–") for verdict in feasibility_by_driver(rows_by_driver).values()]
@@ -93,11 +93,9 @@ def metric_table(
         table.append(TableRow("feasible", "", description, [*verdicts, *(TableCell("") for _ in compared)]))
     if compared:
         description = f"Share of seeds with a larger return than {baseline}; a tie counts half. Wilson's interval."
-        improvements = [
-            probability_of_improvement(paired_differences([rows], rows_by_driver[baseline], "return"))
-            for rows in compared.values()
-        ]
-        cells = [*(TableCell("") for _ in rows_by_driver), *(estimate_cell(each, 2) for each in improvements)]
+        differences = (paired_differences([rows], reference, "return") for rows in compared.values())
+        improvements = (estimate_cell(probability_of_improvement(each), 2) for each in differences)
+        cells = [*(TableCell("") for _ in rows_by_driver), *improvements]
         table.append(TableRow("probability of improvement", "in return", description, cells))
     for name in names:
         metric = METRICS[name]
@@ -107,10 +105,9 @@ def metric_table(
         if not any(each.count for each, _ in estimates):
             continue  # it is not defined on this road
         cells = [estimate_cell(each, metric.digits, episodes) for each, episodes in estimates]
-        cells += [
-            estimate_cell(paired_difference(rows, rows_by_driver[baseline], name), metric.digits, pairs[label], "+")
-            for label, rows in compared.items()
-        ]
+        for rows in compared.values():
+            difference, pairs = paired_difference(rows, reference, name), len(pair_rows(rows, reference))
+            cells.append(estimate_cell(difference, metric.digits, pairs, "+"))
         table.append(TableRow(metric.label, metric.unit, " ".join((metric.function.__doc__ or "").split()), cells))
     return headings, table
 

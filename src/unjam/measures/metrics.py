@@ -7,19 +7,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from unjam.measures.averages import mean_of_present, mean_over_cavs, per_kilometer, per_step
+from unjam.measures import platoon_metrics as platoon
+from unjam.measures.averages import mean_of_present, mean_over_cavs, per_step, row_chunks
 from unjam.measures.feasibility import feasibility
-from unjam.measures.platoon_metrics import (
-    amplification,
-    cav_fuel_by_power,
-    cav_gap_95,
-    cav_max_gap,
-    cav_mean_gap,
-    fuel_by_power,
-    human_fuel_by_power,
-    period_amplification,
-    time_behind_leader,
-)
 from unjam.scenarios.scenario import sumo_seed
 from unjam.worlds.audit import BRAKING_THRESHOLDS, OVERRIDE_TOLERANCE, BrakingStatistics
 from unjam.worlds.record import VEHICLE_GROUPS, Episode, Floats
@@ -188,7 +178,8 @@ def fuel_ml_per_km(episode: Episode) -> float:
     """
     if episode.fuel.size == 0:
         return nan
-    return per_kilometer(episode, float(np.nansum(episode.fuel)) / GASOLINE_DENSITY, episode.speeds)
+    distance = sum(float(np.nansum(chunk)) for chunk in row_chunks(episode.speeds[1:]))  # [m/s], over all steps
+    return float(np.nansum(episode.fuel)) / GASOLINE_DENSITY / (distance / 1000.0) if distance else nan
 
 
 def outflow_veh_per_h(episode: Episode) -> float:
@@ -399,17 +390,17 @@ METRICS: dict[str, Metric] = {
     "shield_override_share": Metric(shield_override_share, "commands overridden by the simulator", "", 4, SHARE_BOUNDS),
     "shield_max_braking": Metric(shield_max_braking, "maximum braking added by SUMO", "m/s2"),
     "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel by emission model", "ml/km", 1),
-    "fuel_by_power": Metric(fuel_by_power, "fuel by power", "ml/km", 1),
-    "cav_fuel_by_power": Metric(cav_fuel_by_power, "CAV's fuel by power", "ml/km", 1),
-    "human_fuel_by_power": Metric(human_fuel_by_power, "human drivers' fuel by power", "ml/km", 1),
-    "cav_mean_gap": Metric(cav_mean_gap, "CAV's mean gap", "m", 1),
-    "cav_gap_95": Metric(cav_gap_95, "CAV's gap, 95 %", "m", 1),
-    "cav_max_gap": Metric(cav_max_gap, "CAV's largest gap", "m", 1),
-    "time_behind_leader": Metric(time_behind_leader, "time behind the recorded vehicle", "s", 1),
-    "amplification": Metric(amplification, "amplification of speed std", "", 2),
-    "amplification_long": Metric(period_amplification(inf, 60.0), "amplification, above 60 s", "", 2),
-    "amplification_medium": Metric(period_amplification(60.0, 20.0), "amplification, 20 to 60 s", "", 2),
-    "amplification_short": Metric(period_amplification(20.0, 4.0), "amplification, 4 to 20 s", "", 2),
+    "fuel_by_power": Metric(platoon.fuel_by_power, "fuel by power", "ml/km", 1),
+    "cav_fuel_by_power": Metric(platoon.cav_fuel_by_power, "CAV's fuel by power", "ml/km", 1),
+    "human_fuel_by_power": Metric(platoon.human_fuel_by_power, "human drivers' fuel by power", "ml/km", 1),
+    "cav_mean_gap": Metric(platoon.cav_mean_gap, "CAV's mean gap", "m", 1),
+    "cav_gap_95": Metric(platoon.cav_gap_95, "CAV's gap, 95 %", "m", 1),
+    "cav_max_gap": Metric(platoon.cav_max_gap, "CAV's largest gap", "m", 1),
+    "time_behind_leader": Metric(platoon.time_behind_leader, "time behind the recorded vehicle", "s", 1),
+    "amplification": Metric(platoon.amplification, "amplification of speed std", "", 2),
+    "amplification_long": Metric(platoon.period_amplification(inf, 60.0), "amplification, above 60 s", "", 2),
+    "amplification_medium": Metric(platoon.period_amplification(60.0, 20.0), "amplification, 20 to 60 s", "", 2),
+    "amplification_short": Metric(platoon.period_amplification(20.0, 4.0), "amplification, 4 to 20 s", "", 2),
     "outflow_veh_per_h": Metric(outflow_veh_per_h, "flow", "veh/h", 0),
     "travel_time": Metric(mean_travel_time, "travel time, departure delay included", "s", 1),
     **{

@@ -35,11 +35,8 @@ def count_early_ends(rows: EpisodeRows) -> dict[str, int]:
 
 def early_end_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note for each driver with episodes that ended early, with the reasons."""
-    return [
-        f"{label}: {_early_end_text(rows)}; means are over complete episodes only"
-        for label, rows in rows_by_driver.items()
-        if count_early_ends(rows)
-    ]
+    early = ((label, rows) for label, rows in rows_by_driver.items() if count_early_ends(rows))
+    return [f"{label}: {_early_end_text(rows)}; means are over complete episodes only" for label, rows in early]
 
 
 def _early_end_text(rows: EpisodeRows) -> str:
@@ -54,21 +51,16 @@ def check_baseline(rows: EpisodeRows, planned_episodes: int = 0) -> None:
     `planned_episodes` is their planned number, if it is larger than that of the `rows` so far.
     """
     if sum(count_early_ends(rows).values()) > MAX_EARLY_END_SHARE * max(len(rows), planned_episodes):
-        raise InputError(
-            f"human: {_early_end_text(rows)}; allowed: {100 * MAX_EARLY_END_SHARE:g} %, because CAVs are compared with "
-            "the baseline"
-        )
+        reason = "because CAVs are compared with the baseline"
+        raise InputError(f"human: {_early_end_text(rows)}; allowed: {100 * MAX_EARLY_END_SHARE:g} %, {reason}")
 
 
 def teleport_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note for each driver with teleports, which do not exist in real traffic."""
     counts = {label: count_teleports(rows) for label, rows in rows_by_driver.items()}
-    return [
-        f"{label}: SUMO teleported or removed {format_count(count, 'vehicle')}, which had waited longer than "
-        "time-to-teleport or collided"
-        for label, count in counts.items()
-        if count
-    ]
+    found = {label: format_count(count, "vehicle") for label, count in counts.items() if count}
+    reason = "which had waited longer than time-to-teleport or collided"
+    return [f"{label}: SUMO teleported or removed {vehicles}, {reason}" for label, vehicles in found.items()]
 
 
 def _repeated_drive_notes(rows_by_driver: RowsByDriver) -> list[str]:

@@ -74,9 +74,8 @@ def time_behind_leader(episode: Episode) -> float:
     """
     if not episode.has_recorded_leader:
         return nan
-    passed = float(
-        np.interp(episode.positions[-1, 0], episode.replayed_motion[:, 0, 0], np.arange(len(episode.speeds)))
-    )
+    leader = episode.replayed_motion[:, 0, 0]
+    passed = float(np.interp(episode.positions[-1, 0], leader, np.arange(len(episode.speeds))))
     return (episode.control_steps - passed) * episode.control_step
 
 

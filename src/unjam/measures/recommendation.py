@@ -239,20 +239,16 @@ def road_verdict(results: Sequence[ControllerResult], baseline: EpisodeRows = ()
         time, to_acc = best.effect.travel_time.mean, best.difference_to_acc.mean
         share = 100 * abs(best.effect.relative_travel_time)
         gain = f"{-time:.1f} s ({share:.1f} %) shorter than in human-only traffic"
-        return RoadVerdict(
-            RECOMMENDED,
-            f"Recommended: {best.label}, because travel time is {gain} and {-to_acc:.1f} s shorter than with "
-            f"{ACC_BASELINE}.",
-        )
+        reason = f"travel time is {gain} and {-to_acc:.1f} s shorter than with {ACC_BASELINE}"
+        return RoadVerdict(RECOMMENDED, f"Recommended: {best.label}, because {reason}.")
     travel_time, delay = (metric_estimate(baseline, name).mean for name in (TIME_METRIC, "delay"))
     if (delay_share := delay / (travel_time - delay)) <= NEGLIGIBLE_DELAY_SHARE:
         within = max(1, ceil(100 * delay_share))
         reason = f"there is nothing to gain, because human-only traffic is within {within} % of free flow"
     elif undecided := [each for each in results if each.verdict == UNDECIDED]:
         best, fastest = _quickest(undecided) or undecided[0], ", the fastest so far" if len(undecided) > 1 else ""
-        return RoadVerdict(
-            UNDECIDED, f"Not yet known whether to recommend {best.label}{fastest}: {best.open_question}."
-        )
+        sentence = f"Not yet known whether to recommend {best.label}{fastest}: {best.open_question}."
+        return RoadVerdict(UNDECIDED, sentence)
     elif best := _quickest(results):
         reason = f"no controller passes the rule; the fastest is {best.label}, but {best.reasons[0]}"
     else:

@@ -1,6 +1,5 @@
 """Verdicts on drivers: feasible or not, better or worse than a baseline, and the numbers that matter on a road."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import TYPE_CHECKING
@@ -37,9 +36,8 @@ CLOSED_ROAD = RoadMetrics(
     ("time_to_dissolve",),
     ("mean_speed", "speed_limit_ratio_steady", "speed_std_fleet_steady", POWER_FUEL_METRIC),
 )
-OPEN_ROAD = RoadMetrics(
-    (TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC), ("mean_speed",), (TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC)
-)
+_OPEN_ROAD_METRICS = TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC
+OPEN_ROAD = RoadMetrics(_OPEN_ROAD_METRICS, ("mean_speed",), _OPEN_ROAD_METRICS)
 RECORDED_ROAD = RoadMetrics(
     (POWER_FUEL_METRIC, FLOW_METRIC, "cav_mean_gap"),
     (LAG_METRIC, "amplification_medium"),
@@ -111,17 +109,12 @@ class Verdict:
 def verdicts(rows_by_driver: RowsByDriver, baseline: str = "") -> list[Verdict]:
     """Return the verdict on each driver but the baseline, empty: human drivers; none without this baseline."""
     reference = baseline or HUMAN_LABEL
-    names = road_metrics(rows_by_driver).compared
     found = feasibility_by_driver(rows_by_driver) if rows_by_driver.get(reference) else {}
-    return [
-        _verdict(label, rows_by_driver, reference, feasible, names)
-        for label, feasible in found.items()
-        if label != reference
-    ]
+    return [_verdict(label, rows_by_driver, reference, found[label]) for label in found if label != reference]
 
 
-def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible: str, names: Sequence[str]) -> Verdict:
-    rows, others = rows_by_driver[label], rows_by_driver[reference]
+def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible: str) -> Verdict:
+    rows, others, names = rows_by_driver[label], rows_by_driver[reference], road_metrics(rows_by_driver).compared
     name_of_others = "human drivers" if reference == HUMAN_LABEL else reference
     checked = (*names, FUEL_METRIC) if names[0] == POWER_FUEL_METRIC else names
     differences = {name: paired_difference(rows, others, name) for name in checked}

@@ -68,13 +68,8 @@ def render_template(template: str, **values: Any) -> str:
 
     Values in figures, JSON and addresses are encoded, and must be printable before.
     """
-    environment = Environment(
-        loader=PackageLoader("unjam.reports", "page"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    options: dict[str, Any] = {"undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=PackageLoader("unjam.reports", "page"), autoescape=True, **options)
     common = {"version": __version__, "style": _page_file("report.css"), "downloads": _page_file("downloads.js")}
     return printable(environment.get_template(template).render(**common, **values))
 
@@ -140,9 +135,8 @@ def _report_figures(
     if panels:
         found["time_series"] = figures.time_series_figure(panels)
     if runs := {name: result.progress for name, result in sources if result.progress}:
-        found["learning_curve"] = figures.learning_curve_figure(
-            runs, _expert_returns(sources), *_test_returns(sources, columns)
-        )
+        test_returns, expert = _test_returns(sources, columns)
+        found["learning_curve"] = figures.learning_curve_figure(runs, _expert_returns(sources), test_returns, expert)
     if len(sources) == 1 and sources[0][1].progress:
         progress, model = sources[0][1].progress, sources[0][1].model
         found["training_time"] = figures.training_time_figure(progress)

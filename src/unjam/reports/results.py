@@ -17,7 +17,7 @@ from unjam.files import INVALID_DATA_ERRORS, read_json_lines, sha256_of
 from unjam.folders import reject_unsafe_files
 from unjam.measures.metric_table import driver_rank
 from unjam.measures.metrics import METRICS
-from unjam.worlds.record import Episode, Floats
+from unjam.worlds.record import Episode
 
 Float32s = NDArray[np.float32]
 
@@ -75,16 +75,11 @@ def to_plot_episode(driver: str, episode: Episode) -> PlotEpisode:
     """Return the data of an episode for figures; its `control_step` is the time between two snapshots."""
     values = {name: getattr(episode, name) for name in (*EPISODE_ENTRIES, *PLOT_ARRAYS)}
     values |= {name: values[name][:: episode.snapshot_stride] for name in FULL_RATE_ARRAYS}
-    if episode.has_recorded_leader:
-        values |= _moving_scene(episode)
+    if episode.has_recorded_leader:  # in a plane that moves with the recorded vehicle, which is at its origin
+        behind = episode.positions - episode.replayed_motion[:, :1, 0]
+        line = np.array([[behind.min(), 0.0], [0.0, 0.0]])
+        values |= {"poses": np.stack([behind, 0.0 * behind, 0.0 * behind], -1), "lane_lines": line}
     return PlotEpisode(**{**values, "control_step": episode.control_step * episode.snapshot_stride}, driver=driver)
-
-
-def _moving_scene(episode: Episode) -> dict[str, Floats]:
-    """Return poses and the line of the road in a plane that moves with the recorded vehicle, which is at its origin."""
-    behind = episode.positions - episode.replayed_motion[:, :1, 0]
-    poses = np.stack([behind, 0.0 * behind, 0.0 * behind], -1)
-    return {"poses": poses, "lane_lines": np.array([[behind.min(), 0.0], [0.0, 0.0]])}
 
 
 def pack_episode(episode: PlotEpisode) -> dict[str, Float32s]:
@@ -202,15 +197,13 @@ def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:
     """Return the rows of a run's progress without damaged rows, such as one that a crash truncated."""
-    return [row for row in read_json_lines(folder / "progress.jsonl") if _is_progress(row)]
 
+    def is_progress(row: dict[str, Any]) -> bool:
+        counts = row.get("iteration"), row.get("environment_steps", 0)
+        returns = row.get("return_validation"), row.get("return_expert")
+        return {*map(type, counts)} <= {int} and {*map(type, returns)} <= {int, float, type(None)}
 
-def _is_progress(row: dict[str, Any]) -> bool:
-    counts = row.get("iteration"), row.get("environment_steps", 0)
-    returns = row.get("return_validation"), row.get("return_expert")
-    return all(isinstance(each, int) for each in counts) and all(
-        isinstance(each, int | float | None) for each in returns
-    )
+    return list(filter(is_progress, read_json_lines(folder / "progress.jsonl")))
 
 
 def validation_gains(progress: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
@@ -218,17 +211,16 @@ def validation_gains(progress: Sequence[dict[str, Any]]) -> tuple[float, float] 
 
     If the best is not positive, the run kept the untrained network, which has the return of the expert.
     """
-    returns = [row["return_validation"] for row in progress if row["return_validation"] is not None]
     expert = progress[0]["return_expert"] or 0.0 if progress else 0.0
-    return (max(returns) - expert, returns[-1] - expert) if returns else None
+    gains = [row["return_validation"] - expert for row in progress if row["return_validation"] is not None]
+    return (max(gains), gains[-1]) if gains else None
 
 
 def kept_row(progress: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """Return the row of progress after which the best network in validation was saved; None: none was better."""
-    rows = [row for row in progress if row["return_validation"] is not None]
-    best = max(rows, key=lambda row: row["return_validation"], default=None)
-    is_better = best is not None and best["return_validation"] > (progress[0]["return_expert"] or 0.0)
-    return best if is_better else None
+    expert = progress[0]["return_expert"] or 0.0 if progress else 0.0
+    rows = [row for row in progress if row["return_validation"] is not None and row["return_validation"] > expert]
+    return max(rows, key=lambda row: row["return_validation"], default=None)
 
 
 def seconds_by_part(progress: Sequence[dict[str, Any]]) -> dict[str, float]:

@@ -112,12 +112,8 @@ def _branch_row(episodes: Sequence[PlotEpisode], branch: str, is_main: bool) -> 
 
     def draw(axes: Axes, episode: PlotEpisode, scale: Normalize) -> None:
         stride = max(1, len(episode.times) // figures.MAX_PLOT_TIMES)
-        arrays = (
-            episode.times,
-            _branch_positions(episode, branch, is_main),
-            _with_replayed(episode, episode.speeds, 1),
-        )
-        times, positions, speeds = (array[::stride] for array in arrays)
+        positions = _branch_positions(episode, branch, is_main)[::stride]
+        times, speeds = episode.times[::stride], _with_replayed(episode, episode.speeds, 1)[::stride]
         axes.grid(False)
         axes.set_ylim(*extent)
         for start, end in episode.crossings:
@@ -225,9 +221,8 @@ def lane_map_figure(episodes: Sequence[PlotEpisode], shown: Sequence[PlotEpisode
     extents = [_lane_range(episodes, lane) for lane in lanes]
     max_span = max(end - start for start, end in extents)
     longest = max(episode.times[-1] for episode in episodes)
-    rows = [
-        _lane_row(episodes[0], lane, (longest, *extent), max_span) for lane, extent in zip(lanes, extents, strict=True)
-    ]
+    ranges = zip(lanes, extents, strict=True)
+    rows = [_lane_row(episodes[0], lane, (longest, *extent), max_span) for lane, extent in ranges]
     return episode_grid(episodes, rows, 0.4 + 1.75 * sum(row.height for row in rows), shown)
 
 

@@ -152,10 +152,8 @@ def main_finding(result: Results) -> str:
     if expert in experts:
         gain = paired_difference(rows, experts[expert], "return")
         seeds = format_count(gain.count, "test seed")
-        sentences.append(
-            f"Return difference to its expert, {expert} (return {returns[expert]:,.0f}), on {seeds}: "
-            f"{format_difference(gain)}. {gain_verdict(gain)}"
-        )
+        finding = f"Return difference to its expert, {expert} (return {returns[expert]:,.0f}), on {seeds}"
+        sentences.append(f"{finding}: {format_difference(gain)}. {gain_verdict(gain)}")
         if row := kept_row(result.progress):
             steps = f"{row['environment_steps']:,} environment steps"
             sentences.append(f"The network is that after {steps}, the best in validation.")
@@ -188,12 +186,14 @@ def _drive_finding(result: Results) -> str:
 
 
 def _mean_text(rows: Sequence[dict[str, Any]], name: str) -> str:
-    """Return a mean with its unit; what follows a comma in the name of the metric is after it, in parentheses."""
-    (label, _, detail), found = METRICS[name].label.partition(", "), metric_estimate(rows, name)
-    value = (
-        f"{label} {found.mean:.{METRICS[name].digits}f} {METRICS[name].unit}".strip() if found.count else f"{label} –"
-    )
-    return f"{value} ({detail})" if detail else value
+    """Return a mean with its label; what follows a comma in the name of the metric is after it, in parentheses."""
+    label, _, detail = METRICS[name].label.partition(", ")
+    return f"{label} {_mean_with_unit(rows, name)}{detail and f' ({detail})'}"
+
+
+def _mean_with_unit(rows: EpisodeRows, name: str) -> str:
+    metric, found = METRICS[name], metric_estimate(rows, name)
+    return f"{found.mean:.{metric.digits}f} {metric.unit}".strip() if found.count else "–"
 
 
 def report_notes(result: Results) -> list[str]:
@@ -219,11 +219,9 @@ def _driver_notes(result: Results, label: str) -> list[str]:
         )
     share = metric_estimate(rows, "shield_override_share").mean
     if share > 0.01:
-        hardest = max(row["shield_max_braking"] for row in rows)
-        notes.append(
-            f"{label} relies on SUMO's safety check: it overrides {100 * share:.1f}\u00a0% of commands, and adds up to "
-            f"{hardest:.1f} m/s² of braking."
-        )
+        overrides = f"it overrides {100 * share:.1f}\u00a0% of commands"
+        braking = f"adds up to {max(row['shield_max_braking'] for row in rows):.1f} m/s² of braking"
+        notes.append(f"{label} relies on SUMO's safety check: {overrides}, and {braking}.")
     return notes
 
 
@@ -232,12 +230,8 @@ def key_figures(result: Results) -> list[dict[str, str]]:
     if len(result.rows) > 1:
         return []
     [(label, rows)] = result.rows.items()
-    cards = []
-    for name in road_metrics(result.rows).headline:
-        metric, found = METRICS[name], metric_estimate(rows, name)
-        value = f"{found.mean:.{metric.digits}f} {metric.unit}".strip() if found.count else "–"
-        cards.append({"label": metric.label, "value": value, "detail": label})
-    return cards
+    names = road_metrics(result.rows).headline
+    return [{"label": METRICS[name].label, "value": _mean_with_unit(rows, name), "detail": label} for name in names]
 
 
 def baseline_differences(columns: Sequence[ReportColumn]) -> dict[str, Any]:
