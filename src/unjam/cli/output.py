@@ -61,12 +61,12 @@ def print_json(document: Any) -> None:
     sys.stdout.write(to_json(document, indent=1) + "\n")
 
 
-def new_table(text_columns: Sequence[str] = (), number_columns: Sequence[str] = (), style: str = "bold") -> Table:
-    """Return an empty table: columns of text (units dim), then of numbers; headings in `style`.
+def new_table(text_columns: Sequence[str] = (), number_columns: Sequence[str] = ()) -> Table:
+    """Return an empty table: columns of text (units dim), then of numbers; headings in bold.
 
     Nothing is cut; names in the first column, which a reader copies, are not broken, unless they are of quantities.
     """
-    table = Table(box=None, pad_edge=False, header_style=style, show_header=any(text_columns))
+    table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(text_columns))
     for number, heading in enumerate(text_columns):
         is_name, color = number == 0 and "unit" not in text_columns, "dim" if heading == "unit" else None
         table.add_column(heading, style=color, overflow="fold", no_wrap=is_name)
@@ -126,15 +126,11 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
         unlimited = console.options.update_width(10_000)
         return Measurement.get(console, unlimited, build_table(columns, separator)).maximum <= console.width
 
-    everything = [number for each in columns.values() for number in each]
-    separator = " " if fits(everything, " ") else "\n"
+    separator = " " if fits(range(len(headings)), " ") else "\n"
     blocks = [list[int]()]
     for each in columns.values():
         block = sorted([*blocks[-1], *each])
-        if blocks[-1] and not fits(block, separator):
-            blocks.append(each)
-        else:
-            blocks[-1] = block
+        blocks[-1:] = [block] if not blocks[-1] or fits(block, separator) else [blocks[-1], each]
     for block in blocks:
         console.print(build_table(block, separator))
     for number, label in enumerate(long_labels, 1):

@@ -18,7 +18,6 @@ from unjam.tree import leaves
 
 MANIFEST_FORMAT = 5  # version of the schema, the only one that is read
 ACTION_NAME = "acceleration"  # name of the recorded answers in a sample and of the output of a graph
-ONNX_OPSET = 20  # version of the ONNX operators in graphs
 JsonObject = dict[str, Any]
 _StrictPositive = Annotated[StrictFloat, Field(gt=0)]
 

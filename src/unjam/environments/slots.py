@@ -124,12 +124,8 @@ class SlottedRoadEnv(RoadAgents):
         return {slot: observations[shown[slot]] if slot in shown else empty.copy() for slot in self.possible_agents}
 
     def _infos(self, infos: dict[str, Any], shown: dict[str, str], left: dict[str, str]) -> dict[str, Any]:
-        return {
-            slot: {
-                **infos.get(shown.get(slot, ""), {}),
-                "is_occupied": slot in self._cavs,
-                "has_left": slot in left,
-                "vehicle": shown.get(slot, ""),
-            }
-            for slot in self.possible_agents
-        }
+        found: dict[str, Any] = {}
+        for slot in self.possible_agents:
+            state = {"is_occupied": slot in self._cavs, "has_left": slot in left, "vehicle": shown.get(slot, "")}
+            found[slot] = infos.get(state["vehicle"], {}) | state
+        return found

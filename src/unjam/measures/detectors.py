@@ -37,14 +37,10 @@ class Measurement:
 class Agreement:
     """Agreement of simulated traffic with measurements."""
 
-    geh: float
-    """mean GEH over all intervals of all detectors"""
-    geh_below_5: float
-    """share of the intervals with a GEH below 5"""
-    flow_rmse: float
-    """root mean square error of the flow [veh/h]"""
-    speed_rmse: float
-    """root mean square error of the speed [m/s]; NaN if no speed was measured"""
+    geh: float  # mean GEH over all intervals of all detectors
+    geh_below_5: float  # share of the intervals with a GEH below 5
+    flow_rmse: float  # root mean square error of the flow [veh/h]
+    speed_rmse: float  # root mean square error of the speed [m/s]; NaN if no speed was measured
     score: float
     """objective of calibration, smaller is better: mean GEH over 5, plus speed error over mean measured speed"""
 

@@ -103,6 +103,13 @@ class Effect:
         """Whether travel time is shown to be longer, and the difference is not shown to be too small to matter."""
         return self.travel_time.low > 0 and not self.is_too_small
 
+    @property
+    def harm_checks(self) -> tuple[tuple[bool, str], ...]:
+        """For travel time and for flow: whether it is shown to be worse, and the text that says so."""
+        longer = f"travel time is longer than that of the human baseline: {format_seconds(self.travel_time)}"
+        lower = f"flow is lower than that of the human baseline: {format_difference(self.flow)} veh/h"
+        return (self.is_longer, longer), (self.flow.high < 0, lower)
+
 
 def format_seconds(difference: Estimate) -> str:
     """Return a difference of times [s] with its CI as text."""
@@ -167,11 +174,4 @@ def effects_by_driver(rows_by_driver: RowsByDriver) -> dict[str, Effect]:
 
 def describe_harm(effect: Effect) -> str:
     """Return whether travel time or flow is shown to be worse, as text; empty if neither is."""
-    return "; ".join(reason for is_worse, reason in harm_checks(effect) if is_worse)
-
-
-def harm_checks(effect: Effect) -> tuple[tuple[bool, str], ...]:
-    """Return for travel time and for flow: whether it is shown to be worse, and the text that says so."""
-    longer = f"travel time is longer than that of the human baseline: {format_seconds(effect.travel_time)}"
-    lower = f"flow is lower than that of the human baseline: {format_difference(effect.flow)} veh/h"
-    return (effect.is_longer, longer), (effect.flow.high < 0, lower)
+    return "; ".join(reason for is_worse, reason in effect.harm_checks if is_worse)

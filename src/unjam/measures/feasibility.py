@@ -42,6 +42,7 @@ def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tup
     min_time_gap = MIN_TIME_GAP_WITH_LANES if has_lanes else MIN_TIME_GAP_FRACTION * required
     short, cut_in = (row[name] if has_lanes else 0.0 for name in ("share_short_time_gap", "cut_in_max_braking"))
     baseline = "unknown, -d human measures it" if baseline_braking is None else _rate_text(baseline_braking)
+    rate = f"{_rate_text(human_braking)} times in a million vehicle-steps (without CAVs: {baseline})"
     collided, contacts, braking = row["status"] == "collision", float(row.get("contacts", 0)), row["cav_max_braking"]
     checks = (  # value, largest allowed value, reason
         (collided * (1.0 + row["collisions"]), 0.0, f"{format_count(row['collisions'], 'vehicle')} in contact"),
@@ -52,12 +53,7 @@ def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tup
         (-row["cav_min_ttc"], TOLERANCE - MIN_FEASIBLE_TTC, f"{row['cav_min_ttc']:.2f} s to a collision"),
         (braking, TOLERANCE + MAX_FEASIBLE_BRAKING, f"brakes with {braking:.1f} m/s2"),
         (row["override_share"], 0.0, f"the simulator overrides {100 * row['override_share']:.2g} % of its commands"),
-        (
-            human_braking,
-            baseline_braking or 0.0,
-            f"human drivers brake beyond 4.5 m/s2 {_rate_text(human_braking)} times in a million vehicle-steps "
-            f"(without CAVs: {baseline})",
-        ),
+        (human_braking, baseline_braking or 0.0, f"human drivers brake beyond 4.5 m/s2 {rate}"),
     )
     return [(number, value, reason) for number, (value, limit, reason) in enumerate(checks) if value > limit]
 

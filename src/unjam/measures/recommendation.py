@@ -11,15 +11,7 @@ from math import ceil, inf, isfinite
 from operator import attrgetter
 from typing import NamedTuple
 
-from unjam.measures.effect import (
-    MAX_FLOW_LOSS,
-    TIME_METRIC,
-    TOO_SMALL,
-    Effect,
-    format_seconds,
-    harm_checks,
-    is_too_small,
-)
+from unjam.measures.effect import MAX_FLOW_LOSS, TIME_METRIC, TOO_SMALL, Effect, format_seconds, is_too_small
 from unjam.measures.feasibility import FEASIBLE, EpisodeRows
 from unjam.measures.statistics import Estimate, format_difference, format_percent, metric_estimate
 from unjam.text import format_count
@@ -38,43 +30,34 @@ ACC_BASELINE = "ACC vehicles alone"
 
 def rejection_reasons(effect: Effect) -> list[str]:
     """Return all reasons against a recommendation."""
-    time, max_loss = format_seconds(effect.travel_time), MAX_FLOW_LOSS * effect.baseline_flow
+    time, change, flow = effect.travel_time, format_seconds(effect.travel_time), format_difference(effect.flow)
+    is_known = time.low > 0 or time.high < 0 or effect.is_too_small
+    keeps_flow = effect.flow.high < 0 or effect.flow.low >= -MAX_FLOW_LOSS * effect.baseline_flow
+    teleported = f"SUMO teleports or removes {100 * effect.baseline_teleport_share:.1f} % of the vehicles"
+    teleports, contacts = (format_count(each, "more vehicle") for each in (effect.teleports, round(effect.collisions)))
+    braking = f"{format_difference(effect.hard_braking)} times in a million vehicle-steps (the sign of the mean counts)"
     # Too few seeds give NaN, with which every comparison is false: then a check fails.
     checks = (
         (
-            effect.travel_time.count >= MIN_VERDICT_SEEDS or effect.is_infeasible,
-            f"{format_count(effect.travel_time.count, 'test seed')}, where {MIN_VERDICT_SEEDS} are needed",
+            time.count >= MIN_VERDICT_SEEDS or effect.is_infeasible,
+            f"{format_count(time.count, 'test seed')}, where {MIN_VERDICT_SEEDS} are needed",
         ),
         (not effect.failed_episodes, f"{format_count(effect.failed_episodes, 'episode')} failed"),
         (not effect.early_ends, f"{format_count(effect.early_ends, 'episode')} ended early"),
         (
             effect.baseline_teleport_share <= MAX_TELEPORT_SHARE,
-            f"nothing can be concluded: in the human baseline SUMO teleports or removes "
-            f"{100 * effect.baseline_teleport_share:.1f} % of the vehicles (limit {100 * MAX_TELEPORT_SHARE:g} %)",
+            f"nothing can be concluded: in the human baseline {teleported} (limit {100 * MAX_TELEPORT_SHARE:g} %)",
         ),
-        (
-            effect.teleports <= 0,
-            f"{format_count(effect.teleports, 'more vehicle')} teleported or removed than without CAVs",
-        ),
-        *((not is_worse, reason) for is_worse, reason in harm_checks(effect)),
-        (not effect.is_too_small, f"travel time differs from that of the human baseline by {TOO_SMALL}: {time}"),
-        (
-            effect.travel_time.low > 0 or effect.travel_time.high < 0 or effect.is_too_small,
-            f"travel time is not shown to be shorter than that of the human baseline: {time}",
-        ),
-        (
-            effect.flow.high < 0 or effect.flow.low >= -max_loss,
-            f"flow may be lower by more than {100 * MAX_FLOW_LOSS:g} %: {format_difference(effect.flow)} veh/h",
-        ),
+        (effect.teleports <= 0, f"{teleports} teleported or removed than without CAVs"),
+        *((not is_worse, reason) for is_worse, reason in effect.harm_checks),
+        (not effect.is_too_small, f"travel time differs from that of the human baseline by {TOO_SMALL}: {change}"),
+        (is_known, f"travel time is not shown to be shorter than that of the human baseline: {change}"),
+        (keeps_flow, f"flow may be lower by more than {100 * MAX_FLOW_LOSS:g} %: {flow} veh/h"),
         (effect.feasibility == FEASIBLE, f"infeasible: {effect.feasibility or 'no CAV drove'}"),
-        (
-            effect.collisions <= 0,
-            f"{format_count(round(effect.collisions), 'more vehicle')} in contact than without CAVs",
-        ),
+        (effect.collisions <= 0, f"{contacts} in contact than without CAVs"),
         (
             effect.hard_braking.mean <= 0,
-            "human drivers brake beyond 4.5 m/s² more often than in the human baseline: "
-            f"{format_difference(effect.hard_braking)} times in a million vehicle-steps (the sign of the mean counts)",
+            f"human drivers brake beyond 4.5 m/s² more often than in the human baseline: {braking}",
         ),
     )
     return [reason for is_fine, reason in checks if not is_fine]

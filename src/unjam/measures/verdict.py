@@ -122,15 +122,12 @@ def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible:
     if not pairs:
         return Verdict(label, "", f"no episode can be compared with {name_of_others}", None)
     changes = {name: is_better(name, difference) for name, difference in differences.items()}
-    texts = (
-        DifferenceText(
-            METRICS[name].label.removesuffix(", departure delay included"),
-            _difference_text(name, difference, relative_difference(rows, others, name).mean),
-            changes[name],
-        )
-        for name, difference in differences.items()
-        if difference.count and name in names
-    )
+    texts = list[DifferenceText]()
+    for name in names:
+        if differences[name].count:
+            label = METRICS[name].label.removesuffix(", departure delay included")
+            text = _difference_text(name, differences[name], relative_difference(rows, others, name).mean)
+            texts.append(DifferenceText(label, text, changes[name]))
     prices = [text for name, text in PRICES.items() if changes.get(name) is False]
     own, paired = zip(*pair_rows(rows, others), strict=True)
     if (teleports := count_teleports(own) - count_teleports(paired)) > 0:

@@ -183,17 +183,10 @@ def _evaluated_options(assessment: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _tuning_row(option: dict[str, Any]) -> dict[str, Any]:
     effect = option["effect"]
-    return {
-        "label": _option_label(option),
-        "cells": [
-            format_difference(effect["travel_time"], 1),
-            format_difference(effect["flow"]),
-            format_difference(effect["fuel"], 1),
-            f"{effect['collisions']:.0f}",
-            str(effect["travel_time"].count),
-        ],
-        "texts": [effect["feasibility"] or "–", option["rejection_reason"] or "selected"],
-    }
+    cells = [format_difference(effect[name], digits) for name, digits in (("travel_time", 1), ("flow", 0), ("fuel", 1))]
+    cells += [f"{effect['collisions']:.0f}", str(effect["travel_time"].count)]
+    texts = [effect["feasibility"] or "–", option["rejection_reason"] or "selected"]
+    return {"label": _option_label(option), "cells": cells, "texts": texts}
 
 
 @rc_context(figures.PLOT_STYLE)

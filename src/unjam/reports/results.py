@@ -118,18 +118,13 @@ class Results:
     """The content of a run folder, or of a folder of `unjam drive`."""
 
     folder: Path
-    metadata: dict[str, Any]
-    """scenario, reward, expert, label of the trained controller, manifest"""
-    rows: dict[str, list[dict[str, Any]]]
-    """rows of metrics by driver, one for each episode"""
-    plot_episodes: dict[str, PlotEpisode]
-    """episodes for figures, by driver"""
+    metadata: dict[str, Any]  # scenario, reward, expert, label of the trained controller, manifest
+    rows: dict[str, list[dict[str, Any]]]  # rows of metrics by driver, one for each episode
+    plot_episodes: dict[str, PlotEpisode]  # episodes for figures, by driver
     progress: list[dict[str, Any]] = field(default_factory=list)
     """a row per iteration of training; empty without training"""
-    config: str = ""
-    """configuration of the run, as TOML"""
-    model: dict[str, Any] | None = None
-    """facts about the learned model; None without one"""
+    config: str = ""  # configuration of the run, as TOML
+    model: dict[str, Any] | None = None  # facts about the learned model; None without one
 
     @property
     def trained_label(self) -> str | None:

@@ -4,6 +4,7 @@ import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -62,16 +63,9 @@ def draw_road(scene: RoadScene, max_speed: float, caption: str) -> Image.Image:
         )
     distances = np.linalg.norm(np.concatenate([_densify_line(line, size / 100) for line in lines]) - center, axis=1)
     is_centered = distances.min() > MIN_EMPTY_CENTER * size
-    corner = 0.03 * pixels
-    pen.multiline_text(
-        (pixels / 2, pixels / 2) if is_centered else (corner, corner),
-        caption,
-        fill=TEXT_COLOR,
-        font=ImageFont.load_default(22 * OVERSAMPLING),
-        anchor="mm" if is_centered else "la",
-        align="center" if is_centered else "left",
-        spacing=12,
-    )
+    place, anchor, align = (0.5, "mm", "center") if is_centered else (0.03, "la", "left")
+    style: dict[str, Any] = {"fill": TEXT_COLOR, "font": ImageFont.load_default(22 * OVERSAMPLING), "spacing": 12}
+    pen.multiline_text((place * pixels, place * pixels), caption, anchor=anchor, align=align, **style)
     _draw_legend(pen, max_speed, pixels)
     return image.reduce(OVERSAMPLING)
 
