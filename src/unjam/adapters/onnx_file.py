@@ -51,7 +51,8 @@ def onnx_driver(
         name = table.pop("expert", Constant.name)
         if not isinstance(name, str) or split_parameters(name)[0] not in DRIVERS:
             raise unknown_name("expert", name, DRIVERS)
-        inner = driver_from_name(name, time_step) if expert is None else as_driver(expert, time_step)
+        named = driver_from_name(name, time_step)
+        inner = named if expert is None else as_driver(expert, time_step)
         if description is None:
             description = build_dataclass(PolicyDescription, table, "")
         return OnnxDriver(path.name, description, inner, time_step, graph=np.frombuffer(content, np.uint8))

@@ -85,7 +85,7 @@ def metric_table(
     has_cavs = any(map(driver_rank, rows_by_driver))
     compared = {label: rows for label, rows in rows_by_driver.items() if baseline and label != baseline}
     headings = [*rows_by_driver, *(f"{label} − {baseline}" for label in compared)]
-    reference = rows_by_driver.get(baseline, [])
+    reference = rows_by_driver[baseline] if compared else []
     table = list[TableRow]()
     if has_cavs:
         verdicts = [TableCell(verdict or "–") for verdict in feasibility_by_driver(rows_by_driver).values()]

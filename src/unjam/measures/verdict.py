@@ -125,9 +125,9 @@ def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible:
     texts = list[DifferenceText]()
     for name in names:
         if differences[name].count:
-            label = METRICS[name].label.removesuffix(", departure delay included")
+            title = METRICS[name].label.removesuffix(", departure delay included")
             text = _difference_text(name, differences[name], relative_difference(rows, others, name).mean)
-            texts.append(DifferenceText(label, text, changes[name]))
+            texts.append(DifferenceText(title, text, changes[name]))
     prices = [text for name, text in PRICES.items() if changes.get(name) is False]
     own, paired = zip(*pair_rows(rows, others), strict=True)
     if (teleports := count_teleports(own) - count_teleports(paired)) > 0:
