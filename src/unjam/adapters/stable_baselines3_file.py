@@ -19,16 +19,19 @@ from unjam.physics.arrays import Floats
 from unjam.text import one_line
 
 DATA_PART, POLICY_PART, PICKLE_SUFFIX = "data", "policy.pth", ".pkl"
-MAX_ARCHIVE_BYTES = 64 * 2**20  # maximum size of an archive, decompressed
+MAX_ARCHIVE_BYTES = 64 * 2**20
+"""maximum size of an archive, decompressed"""
 MAX_PICKLE_BYTES = 2**20
 """maximum size of a pickle, decompressed; that of the usual weights has some kilobytes, and each byte takes 2 us"""
-SAFE_TORCH = (2, 6)  # version of torch from which on reading weights cannot run code (CVE-2025-32434)
+SAFE_TORCH = (2, 6)
+"""version of torch from which on reading weights cannot run code (CVE-2025-32434)"""
 ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {"Tanh": np.tanh, "ReLU": lambda units: np.maximum(units, 0.0)}
 POLICY_PACKAGES = ("stable_baselines3.", "sb3_contrib.")
 HARMLESS_POLICY_OPTIONS = {
     *("net_arch", "log_std_init", "ortho_init", "optimizer_class", "optimizer_kwargs", "share_features_extractor"),
     *("n_critics", "n_quantiles", "clip_mean", "full_std", "use_expln", "normalize_images", ":type:", ":serialized:"),
-}  # options of policies that do not change their deterministic actions, or that the shapes of the weights show
+}
+"""options of policies that do not change their deterministic actions, or that the shapes of the weights show"""
 
 
 @dataclass(frozen=True)
@@ -36,10 +39,14 @@ class _Actor:
     """Names of the weights of an actor network; numbered layers come first."""
 
     hidden: str
-    output: str  # empty if the last numbered layer is the output
-    others: tuple[str, ...]  # beginnings of the names of other weights, without which actions are the same
-    activation: str  # default activation
-    is_squashed: bool  # whether the output is the tanh of the last layer, scaled to the action space
+    output: str
+    """empty if the last numbered layer is the output"""
+    others: tuple[str, ...]
+    """beginnings of the names of other weights, without which actions are the same"""
+    activation: str
+    """default activation"""
+    is_squashed: bool
+    """whether the output is the tanh of the last layer, scaled to the action space"""
 
 
 ACTORS = (
@@ -49,7 +56,8 @@ ACTORS = (
     ),
     _Actor("actor.latent_pi.", "actor.mu.", ("actor.log_std.", "critic.", "critic_target."), "ReLU", is_squashed=True),
     _Actor("actor.mu.", "", ("actor_target.", "critic.", "critic_target."), "ReLU", is_squashed=True),
-)  # actors of PPO, A2C and TRPO; of SAC and TQC; of TD3 and DDPG
+)
+"""actors of PPO, A2C and TRPO; of SAC and TQC; of TD3 and DDPG"""
 
 
 @dataclass(frozen=True)
@@ -58,10 +66,12 @@ class SavedPolicy:
 
     observation_space: Box
     action_space: Box
-    layers: list[tuple[Floats, Floats]]  # weight, shape (outputs, inputs), and bias of each
+    layers: list[tuple[Floats, Floats]]
+    """weight, shape (outputs, inputs), and bias of each"""
     activation: Callable[[Floats], Floats]
     is_squashed: bool
-    unjam: dict[str, Any]  # what `unjam export --sb3` writes: expert, features, action repeat; empty for other models
+    unjam: dict[str, Any]
+    """what `unjam export --sb3` writes: expert, features, action repeat; empty for other models"""
 
     def predict(self, observation: Floats, *, deterministic: bool = True) -> tuple[Floats, None]:
         """Return actions, shape (n, 1), and no state."""

@@ -31,8 +31,7 @@ MAX_RELATIVE_DIFFERENCE = 1e-4  # allowed relative difference to reference value
 TRAINING_STEPS_UNIT = "environment steps: control steps in the simulator"  # unit of `training_steps`, as files say
 PARTS = {"all roads": ("training", "combination", "axis"), "training": ("training",), "unseen": ("combination", "axis")}
 """parts of the family by the name of their mean"""
-EPISODES_PER_ROAD, MAX_VALUE = 10, 1e9
-"""number of episodes of each driver on each road, and the largest allowed number in a file"""
+EPISODES_PER_ROAD, MAX_VALUE = 10, 1e9  # episodes of each driver on each road; largest allowed number in a file
 FAMILY_TEST_SEEDS = held_out_seeds(EPISODES_PER_ROAD)
 FAMILY_METRICS = (
     *("seed", "status", "travel_time", "delay", "mean_speed", "mean_speed_second_half", "speed_limit_ratio"),

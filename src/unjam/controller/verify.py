@@ -43,8 +43,7 @@ class PartCheck:
     status: CheckStatus
     """`checked`: it was checked, and is right; `absent`: the controller has no such part; `stated`: only its maker can
     know it; `not checked`: it could not be checked on this machine"""
-    detail: str
-    """how it was checked, or why it was not"""
+    detail: str  # how it was checked, or why it was not
 
 
 def verify_controller_file(path: Path | str, signer: Path | str | None = None) -> list[PartCheck]:

@@ -37,6 +37,7 @@ from unjam.worlds.reward import Outcome, RewardLike, is_packaged_reward, make_re
 from unjam.worlds.road_world import RoadWorld
 
 Observations = NDArray[np.float32]
+Options = dict[str, Any] | None  # parameters of the scenario for one episode
 
 
 def as_action(action: Any, name: str) -> float:
@@ -144,9 +145,7 @@ class RoadStepper:
         self._check_scenario(scenario, backend)
         return scenario
 
-    def reset(
-        self, seed: int | None, generator: np.random.Generator, options: dict[str, Any] | None = None
-    ) -> Observations:
+    def reset(self, seed: int | None, generator: np.random.Generator, options: Options = None) -> Observations:
         """Start an episode, run its warm-up, and return the first observations.
 
         It is that of `seed`, or the next after the last seed, at first one from `generator`. `options` change
@@ -336,9 +335,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         self.action_space = self._road.action_space
 
     @synchronized
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Options = None) -> tuple[Observations, dict[str, Any]]:
         """Start an episode: that of `seed`; without one, the next after that of the last seed.
 
         `options` are changes to the parameters of the scenario, as `changes` of the constructor, for this episode only:
@@ -380,9 +377,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         from unjam.reports.video import draw_road
 
         world = self._road.world
-        limit = world.road.limit_speed
-        is_known = np.isfinite(limit)  # not on user networks
-        max_speed = 2.0 * limit if is_known else self._road.episode_scenario.top_speed
+        limit = world.road.limit_speed  # unknown on user networks
+        max_speed = 2.0 * limit if np.isfinite(limit) else self._road.episode_scenario.top_speed
         return np.asarray(draw_road(world.scene(), max_speed, f"mean {np.mean(world.speeds):.1f} m/s"))
 
     @synchronized

@@ -7,7 +7,7 @@ import numpy as np
 
 from unjam.drivers.observation import FeatureLike
 from unjam.drivers.user_driver import DriverLike
-from unjam.environments.gymnasium_env import RoadStepper, as_action
+from unjam.environments.gymnasium_env import Options, RoadStepper, as_action
 from unjam.environments.slots import RoadAgents, SlottedRoadEnv
 from unjam.environments.threads import synchronized
 from unjam.errors import InputError
@@ -15,8 +15,7 @@ from unjam.text import format_count
 from unjam.worlds.backend import BackendLike
 from unjam.worlds.reward import RewardLike
 
-API_TEST_OPTIONS = {"options": 1}
-"""options without a meaning, with which `parallel_api_test` of PettingZoo calls `reset`"""
+API_TEST_OPTIONS = {"options": 1}  # options without a meaning with which PettingZoo's `parallel_api_test` calls `reset`
 
 
 class ParallelRoadEnv(RoadAgents):
@@ -43,13 +42,10 @@ class ParallelRoadEnv(RoadAgents):
         road = RoadStepper(scenario, changes, reward, expert, features, backend)
         super().__init__(road, road.scenario.possible_cav_ids())
         self._agent_by_vehicle: dict[str, str] = {}
-        self._departed_agents: set[str] = set()
-        """agents whose vehicle has left the road; if it returns, only the expert drives it"""
+        self._departed_agents: set[str] = set()  # whose vehicle has left; if it returns, only the expert drives it
 
     @synchronized
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(self, seed: int | None = None, options: Options = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode as `RoadEnv.reset`; raise `InputError` if the road can then have other CAVs."""
         options = None if options == API_TEST_OPTIONS else options
         observations = self._road.reset(seed, np.random.default_rng(), options)

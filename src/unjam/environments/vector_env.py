@@ -126,8 +126,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         "render_modes": [],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
-    _step_sums = staticmethod(step_metrics)
-    """returns what is summed over the control steps of an episode, by name, shape (W,)"""
+    _step_sums = staticmethod(step_metrics)  # returns what is summed over control steps, by name, shape (W,)
 
     def __init__(
         self,
@@ -180,8 +179,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         self._seeds: list[int | None] = [None] * num_envs
         self._episode_counts = [0] * num_envs  # episodes of each environment since that seed, prepared ones included
         self._episodes: Episodes | None = None
-        self._prepared: dict[int, tuple[Episodes, int]] = {}
-        """the next episode of an environment, as a row of started episodes"""
+        self._prepared: dict[int, tuple[Episodes, int]] = {}  # next episode by environment: a row of started episodes
         self._ended_rows: list[int] = []  # environments whose episode ended in the last step
 
     def _unsupported_reason(self, scenario: Scenario) -> str:

@@ -17,8 +17,7 @@ from unjam.worlds.sumo.simulation import DetectorPassage
 DETECTOR_COLUMNS = ("position", "begin", "end", "flow_veh_per_h", "speed")
 """columns of a file of measurements, in addition to `edge` or `lane`"""
 GEH_LIMIT = 5.0  # GEH below which a simulated flow agrees with the measured flow
-SAME_PASSAGE_SECONDS = 10.0
-"""time within which a second passage of a vehicle over loops of the same edge is only a lane change [s]"""
+SAME_PASSAGE_SECONDS = 10.0  # time within which a second passage of loops of the same edge is only a lane change [s]
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,7 @@ class Agreement:
     geh_below_5: float  # share of the intervals with a GEH below 5
     flow_rmse: float  # root mean square error of the flow [veh/h]
     speed_rmse: float  # root mean square error of the speed [m/s]; NaN if no speed was measured
-    score: float
-    """objective of calibration, smaller is better: mean GEH over 5, plus speed error over mean measured speed"""
+    score: float  # objective of calibration, to minimize: mean GEH over 5, plus speed error over mean measured speed
 
 
 def read_detectors(path: Path) -> tuple[str, list[Measurement]]:

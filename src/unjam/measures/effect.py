@@ -28,8 +28,7 @@ SMALLEST_EFFECT = 0.005
 """difference of travel time below which there is neither gain nor harm, as a share of the baseline's travel time"""
 
 TIME_METRIC, FLOW_METRIC, FUEL_METRIC = "travel_time", "outflow_veh_per_h", "fuel_ml_per_km"
-POWER_FUEL_METRIC, LAG_METRIC = "fuel_by_power", "time_behind_leader"
-"""the second one is defined behind recorded vehicles alone"""
+POWER_FUEL_METRIC, LAG_METRIC = "fuel_by_power", "time_behind_leader"  # the second: behind recorded vehicles alone
 TOO_SMALL = f"less than {100 * SMALLEST_EFFECT:g} %, which is too small to matter"
 """text for a difference of travel time below `SMALLEST_EFFECT`"""
 
@@ -38,32 +37,21 @@ TOO_SMALL = f"less than {100 * SMALLEST_EFFECT:g} %, which is too small to matte
 class Effect:
     """Effect of CAVs. An `Estimate` is a paired difference to the human baseline, with its CI."""
 
-    travel_time: Estimate
-    """mean travel time of the vehicles of the demand, departure delay included [s]"""
-    flow: Estimate
-    """flow [veh/h]"""
+    travel_time: Estimate  # mean travel time of the vehicles of the demand, departure delay included [s]
+    flow: Estimate  # flow [veh/h]
     fuel: Estimate
     """fuel of all vehicles [ml/km]; behind a recorded vehicle by power, elsewhere by the scenario's emission class"""
-    hard_braking: Estimate
-    """vehicle-steps in which human drivers brake beyond 4.5 m/s2 [per million]"""
-    collisions: float
-    """difference of the number of vehicles in contact, in all episodes together"""
-    failed_episodes: int
-    """number of episodes that did not run"""
-    feasibility: str
-    """verdict on the CAVs themselves: `FEASIBLE`, or the first reason against it"""
-    baseline_travel_time: float
-    """mean travel time of the human baseline on these seeds [s]"""
-    baseline_flow: float
-    """mean flow of the human baseline on these seeds [veh/h]"""
+    hard_braking: Estimate  # vehicle-steps in which human drivers brake beyond 4.5 m/s2 [per million]
+    collisions: float  # difference of the number of vehicles in contact, in all episodes together
+    failed_episodes: int  # number of episodes that did not run
+    feasibility: str  # verdict on the CAVs themselves: `FEASIBLE`, or the first reason against it
+    baseline_travel_time: float  # mean travel time of the human baseline on these seeds [s]
+    baseline_flow: float  # mean flow of the human baseline on these seeds [veh/h]
     delay_reduction: Estimate
     """reduction of the delay, as a share of the delay of the human baseline; NaN if that is unknown or zero"""
-    speed: Estimate
-    """mean speed of all vehicles [m/s]"""
-    early_ends: int = 0
-    """number of episodes that ended early, with or without CAVs; only complete ones are compared"""
-    teleports: int = 0
-    """difference of the number of vehicles that SUMO teleported or removed, in all episodes together"""
+    speed: Estimate  # mean speed of all vehicles [m/s]
+    early_ends: int = 0  # number of episodes that ended early, with or without CAVs; only complete ones are compared
+    teleports: int = 0  # difference of the number of vehicles that SUMO teleported or removed, in all episodes together
     baseline_teleport_share: float = 0.0
     """number of teleports and removals in the human baseline, as a share of its vehicles"""
 

@@ -8,8 +8,7 @@ from unjam.text import format_count
 
 MIN_TIME_GAP_FRACTION = 0.9  # minimum time gap in every step, as a fraction of the required time gap
 DEFAULT_REQUIRED_TIME_GAP = 1.0  # required time gap on roads that do not define one [s]
-MIN_TIME_GAP_WITH_LANES = 0.8
-"""minimum time gap in every step on roads with lanes [s]; the recovery after cut-ins is excluded"""
+MIN_TIME_GAP_WITH_LANES = 0.8  # minimum time gap in all steps on roads with lanes [s], without recovery after cut-ins
 MAX_SHORT_TIME_GAP_SHARE = 1e-3
 """maximum share of the time with a time gap below the required one, on roads with lanes; the recovery is excluded"""
 MAX_CUT_IN_BRAKING = 9.0  # maximum braking after a cut-in [m/s2]: about the limit on dry asphalt
@@ -20,8 +19,7 @@ TOLERANCE = 1e-6  # tolerance of these limits for rounding errors
 EpisodeRows = Sequence[dict[str, Any]]  # a row of metrics for each episode, failed ones included
 RowsByDriver = dict[str, list[dict[str, Any]]]
 FEASIBLE = "feasible"
-HARD_BRAKING_METRIC = "human_braking_beyond_4_5"
-"""metric of human drivers whose value must not exceed that of the human baseline"""
+HARD_BRAKING_METRIC = "human_braking_beyond_4_5"  # must not exceed that of the human baseline
 
 
 def feasibility(row: dict[str, Any], baseline_braking: float | None = None) -> str:
@@ -65,9 +63,8 @@ def _rate_text(rate: float) -> str:
 
 def feasibility_by_driver(rows_by_driver: RowsByDriver) -> dict[str, str]:
     """Return the verdict on each driver of a road; that of the human baseline is empty."""
-    return {
-        label: overall_feasibility(rows, baseline_rows(label, rows_by_driver)) for label, rows in rows_by_driver.items()
-    }
+    baselines = {label: baseline_rows(label, rows_by_driver) for label in rows_by_driver}
+    return {label: overall_feasibility(rows, baselines[label]) for label, rows in rows_by_driver.items()}
 
 
 def baseline_rows(label: str, rows_by_driver: RowsByDriver) -> list[dict[str, Any]]:

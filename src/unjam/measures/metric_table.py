@@ -68,9 +68,8 @@ def choose_baseline(rows_by_driver: RowsByDriver, requested: str = "") -> str:
         return requested
     if len(rows_by_driver) < 2 or HUMAN_LABEL in rows_by_driver:
         return HUMAN_LABEL if len(rows_by_driver) > 1 else ""
-    returns = {
-        label: metric_estimate(rows, "return").mean for label, rows in rows_by_driver.items() if driver_rank(label) == 1
-    }
+    experts = {label: rows for label, rows in rows_by_driver.items() if driver_rank(label) == 1}
+    returns = {label: metric_estimate(rows, "return").mean for label, rows in experts.items()}
     return max(returns, key=lambda label: np.nan_to_num(returns[label], nan=-np.inf), default="")
 
 

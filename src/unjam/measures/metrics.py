@@ -21,8 +21,7 @@ STANDING_SPEED = 0.1  # speed below which a vehicle counts as standing [m/s]: SU
 MAX_CALM_SPEED_STD = 0.3  # standard deviation of speed across vehicles below which there is no wave [m/s]
 MIN_CALM_SECONDS = 60.0  # time without a wave after which the wave counts as dissolved [s]
 GASOLINE_DENSITY = 742.0  # density of gasoline in SUMO's PollutantsInterface [mg/ml]
-SHARE_BOUNDS, UNBOUNDED = (0.0, 1.0), (-inf, inf)
-"""bounds of metrics that are shares, and of metrics that can be negative"""
+SHARE_BOUNDS, UNBOUNDED = (0.0, 1.0), (-inf, inf)  # bounds of shares, and of metrics that can be negative
 PEAK_END_SECONDS = 600.0
 """duration at the end of the demand peak in which flow is counted [s]; there it is the capacity, not the demand"""
 

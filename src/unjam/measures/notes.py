@@ -8,8 +8,7 @@ from unjam.measures.feasibility import EpisodeRows, RowsByDriver
 from unjam.measures.statistics import count_teleports, has_ended_early
 from unjam.text import format_count
 
-MAX_EARLY_END_SHARE = 0.05
-"""maximum share of the baseline's episodes that end early; with more of them comparisons would mislead"""
+MAX_EARLY_END_SHARE = 0.05  # share of the baseline's episodes that may end early; with more, comparisons would mislead
 MAX_WARNING_KINDS = 10  # kinds of SUMO's warnings that are shown, the most frequent first
 MAX_BACKLOG_SHARE = 0.05  # share of the vehicles in the insertion backlog at the end, above which there is a note
 MAX_UNFINISHED_SHARE, MAX_DELAY_SHARE = 0.05, 1 / 3

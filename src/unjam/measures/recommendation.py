@@ -18,13 +18,11 @@ from unjam.text import format_count
 
 MAX_TELEPORT_SHARE = 0.01
 """share of the baseline's vehicles that SUMO may teleport or remove; with more of them travel times mean nothing"""
-MAX_CAV_SLOWDOWN = 0.1
-"""share by which CAVs may be slower than with their ACC alone: a controller must not sacrifice them"""
+MAX_CAV_SLOWDOWN = 0.1  # share by which CAVs may be slower than with ACC alone: a controller must not sacrifice them
 NEGLIGIBLE_DELAY_SHARE = 0.05
 """delay of the human baseline up to which there is nothing to gain, as a share of the free-flow travel time"""
 MIN_VERDICT_SEEDS = 10  # minimum number of seeds for a recommendation; with fewer the CI is not reliable
-RECOMMENDED, NOT_RECOMMENDED, UNDECIDED = "recommended", "not recommended", "not yet known"
-"""verdicts on a controller, and on a road"""
+RECOMMENDED, NOT_RECOMMENDED, UNDECIDED = "recommended", "not recommended", "not yet known"  # on a controller or road
 ACC_BASELINE = "ACC vehicles alone"
 
 
@@ -84,8 +82,7 @@ class AccResult:
     property_effect: Estimate | None = None
     """difference of travel time to ACC vehicles with all properties of the vehicles that they replace [s]; None: these
     ACC vehicles have the same properties"""
-    missing_seeds: float = 0.0
-    """number of further test seeds with which the interval is narrow enough"""
+    missing_seeds: float = 0.0  # number of further test seeds with which the interval is narrow enough
 
     @property
     def has_enough_seeds(self) -> bool:
@@ -126,12 +123,9 @@ class ControllerResult:
     penetration_rate: float
     driver: str
     effect: Effect
-    difference_to_acc: Estimate
-    """difference of travel time to ACC vehicles at the same penetration rate [s]"""
-    flow_difference_to_acc: Estimate
-    """difference of flow to the same ACC vehicles [veh/h]"""
-    missing_seeds: float = 0.0
-    """number of further test seeds that a verdict needs"""
+    difference_to_acc: Estimate  # difference of travel time to ACC vehicles at the same penetration rate [s]
+    flow_difference_to_acc: Estimate  # difference of flow to the same ACC vehicles [veh/h]
+    missing_seeds: float = 0.0  # number of further test seeds that a verdict needs
     cav_speed_change: Estimate | None = None
     """relative change of the CAVs' own mean speed, compared with the same ACC vehicles; None: unknown"""
 

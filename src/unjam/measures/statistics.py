@@ -16,8 +16,7 @@ from unjam.measures.feasibility import EpisodeRows
 from unjam.measures.metrics import METRICS, UNBOUNDED
 
 CONFIDENCE = 0.95
-MIN_INTERVAL_VALUES = 3
-"""minimum number of values for a CI; that of two values is thirteen times as wide as their distance"""
+MIN_INTERVAL_VALUES = 3  # minimum number of values for a CI; that of two is thirteen times as wide as their distance
 
 METRICS_DEFINED_AT_EARLY_END = {
     *("collisions", "min_ttc", "min_time_gap", "cav_min_ttc", "max_drac", "max_jerk", "shield_max_braking"),

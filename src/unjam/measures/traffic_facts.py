@@ -14,13 +14,11 @@ from unjam.physics.arrays import Floats
 from unjam.scenarios.motorway import Motorway
 from unjam.worlds.record import Episode
 
-MERGING_LENGTH = 300.0
-"""length of a merging section that counts as the bottleneck: of a longer one the downstream end [m]"""
+MERGING_LENGTH = 300.0  # maximum length of a bottleneck: of a longer merging section the downstream end [m]
 INTERVAL = 60.0  # time over which detectors count [s]
 BREAKDOWN_MINUTES = 5
 """number of intervals for which traffic must stay slow, and over which the flow before and after it is averaged"""
-BREAKDOWN_SPEED_RATIO = 0.65
-"""share of the speed limit below which traffic is congested: 65 km/h at a limit of 100 km/h"""
+BREAKDOWN_SPEED_RATIO = 0.65  # share of the limit below which traffic is congested: 65 km/h at a limit of 100 km/h
 UPSTREAM_DETECTOR, DOWNSTREAM_DISTANCE = -200.0, 300.0
 """position of the detector that sees the breakdown [m], and distance of the one that measures the discharge downstream
 of the merging section [m]"""
@@ -44,26 +42,19 @@ MIN_SAMPLES = 100  # number of values from which a median or quantile is meaning
 class TrafficFacts:
     """Facts of one episode; NaN where the episode does not show them."""
 
-    breakdown_time: float = nan
-    """when traffic upstream of the merging section becomes slow for several minutes [s]"""
-    flow_before: float = nan
-    """flow downstream in the minutes before the breakdown [veh/h per lane]"""
+    breakdown_time: float = nan  # when traffic upstream of the merging section becomes slow for several minutes [s]
+    flow_before: float = nan  # flow downstream in the minutes before the breakdown [veh/h per lane]
     highest_flow: float = nan
     """highest flow downstream over as many minutes, before a breakdown or at any time [veh/h per lane]"""
     discharge: float = nan
     """flow downstream while traffic upstream is congested, without its first minutes [veh/h per lane]"""
-    congested_speed: float = nan
-    """mean speed at the detector upstream in the same time [m/s]"""
-    wave_speed: float = nan
-    """speed of stop-and-go waves; negative upstream [m/s]"""
+    congested_speed: float = nan  # mean speed at the detector upstream in the same time [m/s]
+    wave_speed: float = nan  # speed of stop-and-go waves; negative upstream [m/s]
     merge_ratio: float = nan
     """flow of the ramp over that of the right lane next to it, while traffic upstream is congested"""
-    free_time_gap: float = nan
-    """median net time gap of followers in the free traffic before a breakdown [s]"""
-    congested_time_gap: float = nan
-    """median net time gap of followers in congestion [s]"""
-    lane_changes_per_km: float = nan
-    """lane changes per vehicle and km before a breakdown, far from the ramp"""
+    free_time_gap: float = nan  # median net time gap of followers in the free traffic before a breakdown [s]
+    congested_time_gap: float = nan  # median net time gap of followers in congestion [s]
+    lane_changes_per_km: float = nan  # lane changes per vehicle and km before a breakdown, far from the ramp
     hardest_braking: float = nan
     """99.9 % quantile of decelerations from 500 m upstream to the end of the merging section [m/s2]"""
 

@@ -85,12 +85,9 @@ class Verdict:
     """What is shown of a driver compared with the baseline on the same seeds."""
 
     driver: str
-    feasibility: str
-    """`FEASIBLE`, the first reason against it, or empty"""
-    comparison: str
-    """whether the metric that decides is better or worse, and at which price"""
-    is_better: bool | None
-    """whether the metric that decides is shown to be better; None: undecided"""
+    feasibility: str  # `FEASIBLE`, the first reason against it, or empty
+    comparison: str  # whether the metric that decides is better or worse, and at which price
+    is_better: bool | None  # whether the metric that decides is shown to be better; None: undecided
     differences: tuple[DifferenceText, ...] = ()
 
     @property

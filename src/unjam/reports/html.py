@@ -30,6 +30,7 @@ from unjam.text import printable
 from unjam.worlds.record import assign_columns
 
 MAX_PANELS = 6
+Sources = Sequence[tuple[str, Results]]  # folders of results, with their names
 MAX_REPLAY_FRAMES = 600  # maximum number of frames of a replay, which interpolates between them
 MAX_REPLAY_VALUES = 600_000  # vehicles times frames of all drivers of a replay: about three megabytes
 MAX_MERGE_DISTANCE = 50.0  # a merge is drawn at the vehicle that was nearest to it, if that was no farther away [m]
@@ -129,7 +130,7 @@ def render_report(results: Sequence[Results]) -> str:
 
 
 def _report_figures(
-    sources: Sequence[tuple[str, Results]], columns: Sequence[ReportColumn], panels: Sequence[PlotEpisode]
+    sources: Sources, columns: Sequence[ReportColumn], panels: Sequence[PlotEpisode]
 ) -> dict[str, Figure]:
     found: dict[str, Figure] = {}
     if panels:
@@ -148,9 +149,7 @@ def _report_figures(
     return found
 
 
-def _test_returns(
-    sources: Sequence[tuple[str, Results]], columns: Sequence[ReportColumn]
-) -> tuple[dict[str, Estimate], str]:
+def _test_returns(sources: Sources, columns: Sequence[ReportColumn]) -> tuple[dict[str, Estimate], str]:
     """Return the returns on test seeds by driver, and the expert of a single training, of which they are differences.
 
     Human drivers are left out then: their returns are often so small that the other differences would not be visible.
@@ -163,7 +162,7 @@ def _test_returns(
     return {name: paired_difference(rows[name], rows[expert], "return") for name in rows if name in others}, expert
 
 
-def _expert_returns(sources: Sequence[tuple[str, Results]]) -> dict[str, float]:
+def _expert_returns(sources: Sources) -> dict[str, float]:
     """Return the return of the expert of each run on the validation seeds, with which its curve starts."""
     returns: dict[str, float] = {}
     has_several_roads = len({result.metadata.get("scenario") for _, result in sources}) > 1

@@ -25,10 +25,8 @@ EVALUATION_FILE = "evaluation.json"  # metrics of each driver
 PLOT_EPISODES_FILE = "plot_episodes.safetensors"  # arrays of the episodes that figures show
 PLOT_EPISODES_HASH = "plot_episodes_sha256"  # entry of the evaluation with the hash of that file
 MODEL_FILE = "model.json"  # facts about the learned model of a run
-VEHICLE_ARRAYS = ("speeds", "positions", "gaps", "poses", "lane_indices")
-"""arrays with a row per time and a column per vehicle"""
-PLOT_ARRAYS = (*VEHICLE_ARRAYS, "replayed_motion", "outline", "backlog", "lane_lines")
-"""arrays of an episode that figures need"""
+VEHICLE_ARRAYS = ("speeds", "positions", "gaps", "poses", "lane_indices")  # arrays of shape (times, vehicles, ...)
+PLOT_ARRAYS = (*VEHICLE_ARRAYS, "replayed_motion", "outline", "backlog", "lane_lines")  # arrays that figures need
 FULL_RATE_ARRAYS = ("speeds", "backlog")  # arrays that an episode has for every control step, not only for snapshots
 NO_LANE = -1  # lanes are stored as small integers, which have no NaN
 EPISODE_ENTRIES = (
@@ -100,13 +98,11 @@ def pack_episode(episode: PlotEpisode) -> dict[str, Float32s]:
 
 def unpack_episode(arrays: dict[str, Any]) -> dict[str, Any]:
     """Return the arrays that `pack_episode` was given."""
-    is_present = arrays.get("is_present")
-    if is_present is None:
-        return arrays
-    unpacked = {name: array for name, array in arrays.items() if name != "is_present"}
-    for name in VEHICLE_ARRAYS:
-        packed = arrays.get(name)
-        if packed is not None and len(packed) == is_present.sum():
+    unpacked = dict(arrays)
+    if (is_present := unpacked.pop("is_present", None)) is None:
+        return unpacked
+    for name in unpacked.keys() & set(VEHICLE_ARRAYS):
+        if len(packed := arrays[name]) == is_present.sum():
             unpacked[name] = np.full((*is_present.shape, *packed.shape[1:]), np.nan, np.float32)
             values = np.where(packed == NO_LANE, np.nan, packed) if name == "lane_indices" else packed
             unpacked[name][is_present] = values

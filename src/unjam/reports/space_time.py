@@ -19,8 +19,7 @@ FILL_DISTANCE, FILL_SECONDS = 10.0, 1.4
 """distance from a vehicle up to which a figure shows its speed: meters, plus seconds of driving"""
 MAX_TIME_BINS, MAX_POSITION_BINS = 240, 100  # maximum numbers of cells of a lane map, in time and along the road
 MIN_SAMPLES_PER_CELL = 4  # mean number of samples in a cell that leaves hardly any cell empty
-PANEL_WIDTH = 4.75
-"""width of a figure of one driver [inch]: a page has up to three next to each other, and on a phone one per row"""
+PANEL_WIDTH = 4.75  # width of a driver's figure [inch]: up to three are next to each other, on a phone one per row
 SCALE_QUANTILE = 0.98  # quantile of all speeds that has the brightest color; faster vehicles have it too
 MAX_LANE_MAPS = 4  # maximum number of lane maps; of more lanes, those with the most traffic are drawn
 HUMAN_LINE_STYLE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.35}

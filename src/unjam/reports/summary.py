@@ -45,8 +45,7 @@ class ReportColumn:
     episode: PlotEpisode | None
     baseline_rows: list[dict[str, Any]] | None = None
     """rows of the baseline in the same folder; None for the baseline itself"""
-    verdict: Verdict | None = None
-    """the verdict compared with the baseline"""
+    verdict: Verdict | None = None  # the verdict compared with the baseline
 
 
 def report_columns(results: Sequence[Results]) -> list[ReportColumn]:
