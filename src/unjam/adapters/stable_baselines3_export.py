@@ -10,12 +10,9 @@ from unjam.drivers.observation import MAX_OBSERVATION
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import import_optional, unknown_name
 
-ALGORITHMS = {
-    "trpo": ("sb3_contrib", "TRPO"),
-    "ppo": ("stable_baselines3", "PPO"),
-    "sac": ("stable_baselines3", "SAC"),
-    "td3": ("stable_baselines3", "TD3"),
-}  # packages and names of the algorithms, by the agent of a training
+ALGORITHMS = {"trpo": ("sb3_contrib", "TRPO"), "ppo": ("stable_baselines3", "PPO")}
+ALGORITHMS |= {"sac": ("stable_baselines3", "SAC"), "td3": ("stable_baselines3", "TD3")}
+"""packages and names of the algorithms, by the agent of a training"""
 MIN_EXPLORATION = 1e-3  # smallest standard deviation of exploration, as a share of the authority
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from math import inf, isfinite, nan
 from typing import Any, Literal
 
@@ -348,6 +349,8 @@ def _braking_metrics(group: Literal["CAV", "human"]) -> dict[str, Metric]:
     }
 
 
+_share = partial(Metric, unit="", digits=4, bounds=SHARE_BOUNDS)
+
 METRICS: dict[str, Metric] = {
     "mean_speed": Metric(mean_speed, "mean speed", "m/s"),
     "mean_speed_step_average": Metric(mean_speed_step_average, "mean speed, average over steps", "m/s"),
@@ -368,9 +371,7 @@ METRICS: dict[str, Metric] = {
     "min_ttc": Metric(min_ttc, "minimum time to collision", "s"),
     "min_time_gap": Metric(min_time_gap, "minimum time gap", "s"),
     "cav_min_ttc": Metric(cav_min_ttc, "CAV's minimum time to collision", "s"),
-    "share_short_time_gap": Metric(
-        share_short_time_gap, "CAV's share of time with a time gap below 1 s", "", 4, SHARE_BOUNDS
-    ),
+    "share_short_time_gap": _share(share_short_time_gap, "CAV's share of time with a time gap below 1 s"),
     "max_drac": Metric(max_drac, "CAV's maximum DRAC", "m/s2"),
     "max_jerk": Metric(max_jerk, "CAV's maximum jerk", "m/s3", 1),
     "cav_max_braking": Metric(cav_max_braking, "CAV's maximum braking", "m/s2"),
@@ -378,15 +379,11 @@ METRICS: dict[str, Metric] = {
     **_braking_metrics("CAV"),
     "human_max_braking": Metric(human_max_braking, "human drivers' maximum braking", "m/s2"),
     **_braking_metrics("human"),
-    "filter_override_share": Metric(
-        filter_override_share, "control steps in which the safety filter braked", "", 4, SHARE_BOUNDS
-    ),
-    "override_share": Metric(
-        override_share, "commands overridden by the simulator in car following", "", 4, SHARE_BOUNDS
-    ),
-    "yield_share": Metric(yield_share, "commands overridden by the simulator at a crossing", "", 4, SHARE_BOUNDS),
+    "filter_override_share": _share(filter_override_share, "control steps in which the safety filter braked"),
+    "override_share": _share(override_share, "commands overridden by the simulator in car following"),
+    "yield_share": _share(yield_share, "commands overridden by the simulator at a crossing"),
     "collisions": Metric(collisions, "vehicles in collisions", "", 0),
-    "shield_override_share": Metric(shield_override_share, "commands overridden by the simulator", "", 4, SHARE_BOUNDS),
+    "shield_override_share": _share(shield_override_share, "commands overridden by the simulator"),
     "shield_max_braking": Metric(shield_max_braking, "maximum braking added by SUMO", "m/s2"),
     "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel by emission model", "ml/km", 1),
     "fuel_by_power": Metric(platoon.fuel_by_power, "fuel by power", "ml/km", 1),
