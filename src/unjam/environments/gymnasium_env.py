@@ -1,11 +1,13 @@
 """A scenario with external actions, and with one CAV as a Gymnasium environment."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from copy import copy
+from functools import wraps
 from math import isfinite
-from typing import Any, ClassVar, NamedTuple
+from threading import RLock
+from typing import Any, ClassVar, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
 import gymnasium
 import numpy as np
@@ -19,7 +21,6 @@ from unjam.drivers.command import as_numbers
 from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features, memory_size, observation_size
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
-from unjam.environments.threads import CopyableLock, synchronized
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
 from unjam.measures.step_metrics import StepMetricMeans
 from unjam.parameters import check_integer, merge_changes, nest_keys
@@ -38,6 +39,30 @@ from unjam.worlds.road_world import RoadWorld
 
 Observations = NDArray[np.float32]
 Options = dict[str, Any] | None  # parameters of the scenario for one episode
+P = ParamSpec("P")
+S = TypeVar("S")
+T = TypeVar("T")
+
+
+class CopyableLock:
+    """A reentrant lock; copies of its owner get their own."""
+
+    def __init__(self) -> None:
+        self.held = RLock()
+
+    def __reduce__(self) -> tuple[type[Self], tuple[()]]:
+        return type(self), ()
+
+
+def synchronized(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
+    """Return a method of an environment in which a second thread waits until the first has returned."""
+
+    @wraps(method)
+    def call(self: S, /, *arguments: P.args, **keywords: P.kwargs) -> T:
+        with self._road.lock.held:  # pyright: ignore[reportAttributeAccessIssue]
+            return method(self, *arguments, **keywords)
+
+    return call
 
 
 def as_action(action: Any, name: str) -> float:

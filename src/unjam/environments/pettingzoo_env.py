@@ -7,9 +7,8 @@ import numpy as np
 
 from unjam.drivers.observation import FeatureLike
 from unjam.drivers.user_driver import DriverLike
-from unjam.environments.gymnasium_env import Options, RoadStepper, as_action
+from unjam.environments.gymnasium_env import Options, RoadStepper, as_action, synchronized
 from unjam.environments.slots import RoadAgents, SlottedRoadEnv
-from unjam.environments.threads import synchronized
 from unjam.errors import InputError
 from unjam.text import format_count
 from unjam.worlds.backend import BackendLike

@@ -8,8 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from unjam.environments.gymnasium_env import Options, RoadStepper, as_action
-from unjam.environments.threads import synchronized
+from unjam.environments.gymnasium_env import Options, RoadStepper, as_action, synchronized
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import check_integer
 

@@ -192,24 +192,16 @@ def _wave_caption(facts: dict[str, Any]) -> str:
 def wave_figure(facts: dict[str, Any]) -> Figure:
     """Draw a recorded episode and rollouts from its start; waves are dark bands."""
     lane_names, episodes = tuple(facts.get("lane_names", ())), list[PlotEpisode]()
+    common: dict[str, Any] = {"control_step": facts["control_step"], "lane_names": lane_names}
+    common["loop_length"] = nan if facts["loop_length"] is None else facts["loop_length"]
+    common["outline"] = np.zeros((0 if lane_names else 1, 3))
     for label, road in facts["waves"].items():
         arrays = (road.get(name, np.zeros((0, 0))) for name in ("speeds", "positions", "lanes"))
         speeds, positions, lanes = (np.array(array, np.float64) for array in arrays)
         columns = tuple(str(column) for column in range(speeds.shape[1]))
-        episodes.append(
-            PlotEpisode(
-                driver=_base_label(facts) if label == "base" else label,
-                control_step=facts["control_step"],
-                loop_length=nan if facts["loop_length"] is None else facts["loop_length"],
-                lane_names=lane_names,
-                outline=np.zeros((0 if lane_names else 1, 3)),
-                vehicle_ids=columns,
-                cav_ids=tuple(columns[cav] for cav in road["cav_columns"]),
-                speeds=speeds,
-                positions=positions,
-                lane_indices=lanes,
-            )
-        )
+        own = {"driver": _base_label(facts) if label == "base" else label, "vehicle_ids": columns, "speeds": speeds}
+        own |= {"cav_ids": tuple(columns[cav] for cav in road["cav_columns"])}
+        episodes.append(PlotEpisode(**common, **own, positions=positions, lane_indices=lanes))
     return space_time_figure(episodes)
 
 
