@@ -58,12 +58,9 @@ def stable_baselines3_bytes(driver: ResidualDriver, agent: str) -> bytes:
                 parameter.copy_(torch.as_tensor(array.T))
         if agent == "td3":
             model.actor_target.load_state_dict(actor.state_dict())
-    model.unjam = {
-        "expert": driver.expert.describe(),
-        "features": list(driver.inputs),
-        "action": "residual acceleration [m/s2], added to that of the expert",
-        "action_repeat": driver.action_repeat,
-    }
+    action = "residual acceleration [m/s2], added to that of the expert"
+    model.unjam = {"expert": driver.expert.describe(), "features": list(driver.inputs)}
+    model.unjam |= {"action": action, "action_repeat": driver.action_repeat}
     content = io.BytesIO()
     model.save(content)
     return content.getvalue()

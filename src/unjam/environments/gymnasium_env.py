@@ -310,10 +310,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
-        "render_modes": ["human", "rgb_array"],
-        "render_fps": 10,
-    }
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # pyright: ignore
 
     def __init__(
         self,

@@ -52,8 +52,7 @@ class Effect:
     speed: Estimate  # mean speed of all vehicles [m/s]
     early_ends: int = 0  # number of episodes that ended early, with or without CAVs; only complete ones are compared
     teleports: int = 0  # difference of the number of vehicles that SUMO teleported or removed, in all episodes together
-    baseline_teleport_share: float = 0.0
-    """number of teleports and removals in the human baseline, as a share of its vehicles"""
+    baseline_teleport_share: float = 0.0  # teleports and removals in the human baseline, as a share of its vehicles
 
     @property
     def summary(self) -> str:

@@ -104,11 +104,8 @@ class AccResult:
             change = f"is not shown to differ ({seeds}, where {MIN_VERDICT_SEEDS} are needed)"
         elif self.effect.is_too_small:
             change = f"differs by {TOO_SMALL},"
-        text = (
-            f"{ACC_BASELINE} at a penetration rate of {format_percent(self.penetration_rate)}: travel time "
-            f"{change} compared with the human baseline. "
-            f"Differences: {self.effect.summary}."
-        )
+        label = f"{ACC_BASELINE} at a penetration rate of {format_percent(self.penetration_rate)}"
+        text = f"{label}: travel time {change} compared with the human baseline. Differences: {self.effect.summary}."
         if self.effect.feasibility != FEASIBLE:
             text += f" They are infeasible themselves: {self.effect.feasibility or 'no CAV drove'}."
         if self.property_effect is None:

@@ -44,14 +44,11 @@ class TrafficFacts:
 
     breakdown_time: float = nan  # when traffic upstream of the merging section becomes slow for several minutes [s]
     flow_before: float = nan  # flow downstream in the minutes before the breakdown [veh/h per lane]
-    highest_flow: float = nan
-    """highest flow downstream over as many minutes, before a breakdown or at any time [veh/h per lane]"""
-    discharge: float = nan
-    """flow downstream while traffic upstream is congested, without its first minutes [veh/h per lane]"""
+    highest_flow: float = nan  # highest downstream flow in as many minutes, before a breakdown or ever [veh/h per lane]
+    discharge: float = nan  # downstream flow while upstream is congested, without the first minutes [veh/h per lane]
     congested_speed: float = nan  # mean speed at the detector upstream in the same time [m/s]
     wave_speed: float = nan  # speed of stop-and-go waves; negative upstream [m/s]
-    merge_ratio: float = nan
-    """flow of the ramp over that of the right lane next to it, while traffic upstream is congested"""
+    merge_ratio: float = nan  # flow of the ramp over that of the right lane, while traffic upstream is congested
     free_time_gap: float = nan  # median net time gap of followers in the free traffic before a breakdown [s]
     congested_time_gap: float = nan  # median net time gap of followers in congestion [s]
     lane_changes_per_km: float = nan  # lane changes per vehicle and km before a breakdown, far from the ramp

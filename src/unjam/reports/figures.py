@@ -197,8 +197,7 @@ def training_time_figure(progress: Sequence[dict[str, Any]]) -> Figure:
     totals = {f"{part} {seconds:.0f} s": seconds for part, seconds in seconds_by_part(progress).items()}
     figure = stacked_bars({"": totals}, "wall time [s]", height=1.5)
     axes = figure.axes[0]
-    axes.set_yticks([])
-    axes.margins(x=0)
+    axes.set(yticks=[], xmargin=0.0)
     axes.spines["left"].set_visible(False)
     return figure
 

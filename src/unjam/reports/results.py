@@ -117,8 +117,7 @@ class Results:
     metadata: dict[str, Any]  # scenario, reward, expert, label of the trained controller, manifest
     rows: dict[str, list[dict[str, Any]]]  # rows of metrics by driver, one for each episode
     plot_episodes: dict[str, PlotEpisode]  # episodes for figures, by driver
-    progress: list[dict[str, Any]] = field(default_factory=list)
-    """a row per iteration of training; empty without training"""
+    progress: list[dict[str, Any]] = field(default_factory=list)  # a row per iteration of training; empty without one
     config: str = ""  # configuration of the run, as TOML
     model: dict[str, Any] | None = None  # facts about the learned model; None without one
 

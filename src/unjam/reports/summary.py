@@ -43,8 +43,7 @@ class ReportColumn:
     name: str
     rows: list[dict[str, Any]]
     episode: PlotEpisode | None
-    baseline_rows: list[dict[str, Any]] | None = None
-    """rows of the baseline in the same folder; None for the baseline itself"""
+    baseline_rows: list[dict[str, Any]] | None = None  # rows of its folder's baseline; None for the baseline itself
     verdict: Verdict | None = None  # the verdict compared with the baseline
 
 

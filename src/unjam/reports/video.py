@@ -54,13 +54,10 @@ def draw_road(scene: RoadScene, max_speed: float, caption: str) -> Image.Image:
         pen.line(to_pixels(line), fill=ROAD_COLOR, width=max(OVERSAMPLING, round(4 * scale)), joint="curve")
     colors = color_table()
     for vehicle in np.flatnonzero(~np.isnan(scene.speeds)):
-        is_cav = bool(scene.is_cav[vehicle])
-        pen.polygon(
-            to_pixels(_vehicle_corners(scene.poses[vehicle], enlargement)),
-            fill=colors[min(len(colors) - 1, int(scene.speeds[vehicle] / max_speed * len(colors)))],
-            outline=CAV_PLOT_COLOR if is_cav else None,
-            width=3 * OVERSAMPLING if is_cav else 1,
-        )
+        color = colors[min(len(colors) - 1, int(scene.speeds[vehicle] / max_speed * len(colors)))]
+        outline, width = (CAV_PLOT_COLOR, 3 * OVERSAMPLING) if scene.is_cav[vehicle] else (None, 1)
+        corners = to_pixels(_vehicle_corners(scene.poses[vehicle], enlargement))
+        pen.polygon(corners, fill=color, outline=outline, width=width)
     distances = np.linalg.norm(np.concatenate([_densify_line(line, size / 100) for line in lines]) - center, axis=1)
     is_centered = distances.min() > MIN_EMPTY_CENTER * size
     place, anchor, align = (0.5, "mm", "center") if is_centered else (0.03, "la", "left")
