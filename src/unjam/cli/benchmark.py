@@ -25,7 +25,7 @@ def benchmark_command(
             show_default=DEFAULT_DRIVER,
         ),
     ] = None,
-    suite: Annotated[str, Option(help=f"Set of roads: {' or '.join(SUITES)}.")] = DEFAULT_SUITE,
+    suite: Annotated[str, Option(help=f"Set of roads: {', '.join(SUITES)}.")] = DEFAULT_SUITE,
     out: Annotated[
         Path | None,
         Option(
