@@ -38,7 +38,7 @@ from unjam.worlds.reward import Outcome, RewardLike, is_packaged_reward, make_re
 from unjam.worlds.road_world import RoadWorld
 
 Observations = NDArray[np.float32]
-Options = dict[str, Any] | None  # parameters of the scenario for one episode
+ResetOptions = dict[str, Any] | None  # parameters of the scenario for one episode
 P = ParamSpec("P")
 S = TypeVar("S")
 T = TypeVar("T")
@@ -170,7 +170,7 @@ class RoadStepper:
         self._check_scenario(scenario, backend)
         return scenario
 
-    def reset(self, seed: int | None, generator: np.random.Generator, options: Options = None) -> Observations:
+    def reset(self, seed: int | None, generator: np.random.Generator, options: ResetOptions = None) -> Observations:
         """Start an episode, run its warm-up, and return the first observations.
 
         It is that of `seed`, or the next after the last seed, at first one from `generator`. `options` change
@@ -357,7 +357,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         self.action_space = self._road.action_space
 
     @synchronized
-    def reset(self, *, seed: int | None = None, options: Options = None) -> tuple[Observations, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: ResetOptions = None) -> tuple[Observations, dict[str, Any]]:
         """Start an episode: that of `seed`; without one, the next after that of the last seed.
 
         `options` are changes to the parameters of the scenario, as `changes` of the constructor, for this episode only:

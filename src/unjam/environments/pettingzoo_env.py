@@ -7,7 +7,7 @@ import numpy as np
 
 from unjam.drivers.observation import FeatureLike
 from unjam.drivers.user_driver import DriverLike
-from unjam.environments.gymnasium_env import Options, RoadStepper, as_action, synchronized
+from unjam.environments.gymnasium_env import ResetOptions, RoadStepper, as_action, synchronized
 from unjam.environments.slots import RoadAgents, SlottedRoadEnv
 from unjam.errors import InputError
 from unjam.text import format_count
@@ -44,7 +44,7 @@ class ParallelRoadEnv(RoadAgents):
         self._departed_agents: set[str] = set()  # whose vehicle has left; if it returns, only the expert drives it
 
     @synchronized
-    def reset(self, seed: int | None = None, options: Options = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(self, seed: int | None = None, options: ResetOptions = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode as `RoadEnv.reset`; raise `InputError` if the road can then have other CAVs."""
         options = None if options == API_TEST_OPTIONS else options
         observations = self._road.reset(seed, np.random.default_rng(), options)

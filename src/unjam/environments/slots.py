@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from unjam.environments.gymnasium_env import Options, RoadStepper, as_action, synchronized
+from unjam.environments.gymnasium_env import ResetOptions, RoadStepper, as_action, synchronized
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import check_integer
 
@@ -72,7 +72,7 @@ class SlottedRoadEnv(RoadAgents):
         self._without_slot: set[str] = set()
 
     @synchronized
-    def reset(self, seed: int | None = None, options: Options = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(self, seed: int | None = None, options: ResetOptions = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode, as `ParallelRoadEnv.reset`."""
         observations, infos = self._environment.reset(seed, options)
         self.agents = list(self.possible_agents)
