@@ -237,7 +237,7 @@ UNSAFE_BUT = {
     "cli/__init__.py: open(os.devnull, mode)": "no file",
     "sandbox.py: os.open(path, os.O_PATH | os.O_CLOEXEC)": "a handle, by which nothing can be written",
     "cli/catalog.py: draw_road(scene, max_speed, caption).save(content, 'PNG')": BUFFER,
-    "adapters/stable_baselines3_export.py: stable_baselines3_model(driver, agent).save(content)": BUFFER,
+    "adapters/stable_baselines3_export.py: model.save(content)": BUFFER,
     "reports/figures.py: figure.savefig(content, format='svg', dpi=DPI, metadata={'Date': None})": BUFFER,
     "reports/figures.py: figure.savefig(content, format='png', dpi=DPI)": BUFFER,
     "reports/figures.py: opaque.quantize(256, Image.Quantize.MAXCOVERAGE).save(content, 'PNG')": BUFFER,

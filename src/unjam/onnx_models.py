@@ -38,8 +38,7 @@ ALLOWED_FIELDS = {
     "Tensor": {"elem_type", "shape"},
     "TensorShapeProto": {"dim"},
     "Dimension": {"dim_param", "dim_value"},
-}
-"""all fields that messages of a model may set: no function, subgraph, sparse or external tensor, metadata"""
+}  # all fields that messages of a model may set: no function, subgraph, sparse or external tensor, metadata
 ONNX_DOMAINS = "", "ai.onnx"  # both names of the domain of ONNX itself
 TEXT_FIELDS = {"doc_string", "metadata_props", "model_version", "producer_name", "producer_version", "denotation"}
 """fields with texts for readers, which change no number"""

@@ -12,14 +12,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from unjam.benchmarks.episodes import (
-    EPISODES_PER_ROAD,
-    FAMILY_TEST_SEEDS,
-    Seeds,
-    drive_by_label,
-    family_metrics,
-    run_in_batches,
-)
+from unjam.benchmarks.result import EPISODES_PER_ROAD, FAMILY_TEST_SEEDS
+from unjam.benchmarks.run import Seeds, drive_by_label
 from unjam.controller import PACKAGED_PREFIX
 from unjam.measures import gain
 from unjam.measures.feasibility import FEASIBLE, overall_feasibility
@@ -158,10 +152,9 @@ def measure_road(
     scenario = make_scenario(road.scenario, road.options)
     candidates = {driver: driver for driver in (HUMAN_LABEL, *experts)}
     with WorkerPool(workers) as pool:
-        run = partial(run_in_batches, pool) if in_batches else partial(pool.run_and_map, transform=family_metrics)
-        best = best_feasible_driver(drive_by_label(scenario, candidates, EXPERT_SELECTION_SEEDS, run))
+        best = best_feasible_driver(drive_by_label(scenario, candidates, EXPERT_SELECTION_SEEDS, pool, in_batches))
         evaluated = {HUMAN_LABEL: HUMAN_LABEL, best: best, **drivers}
-        rows = drive_by_label(scenario, evaluated, test_seeds, run)
+        rows = drive_by_label(scenario, evaluated, test_seeds, pool, in_batches)
     return {"road": name, "part": road.part, "best": best, "rows": rows}
 
 

@@ -160,6 +160,9 @@ def test_actions_are_added_to_an_expert_with_a_name(tmp_path: Path) -> None:
     alone = expert.act(STATE, expert.initial_memory(6))[0].clip(-1.0, 1.0)
     np.testing.assert_allclose(answers(driver), (1.5 * alone).clip(-1.0, 1.0), atol=1e-6)
     assert driver.describe() == "pi + policy.onnx"
+    assert (
+        onnx_driver(tmp_path / "policy.onnx", expert=unjam.make_driver("lacc", 0.1)).describe() == "lacc + policy.onnx"
+    )
     np.testing.assert_array_equal(answers(driver_from_recipe(*driver_recipe(driver))), answers(driver))
 
 

@@ -108,7 +108,7 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
 
 def test_the_command_prints_eighty_columns_and_draws(tmp_path: Path) -> None:
     def rename(content: dict[str, Any]) -> None:
-        content["driver"] = "$x^{ \x1b[31m</svg>" + "y" * 60
+        content["driver"] = "$x^{$ \x1b[31m</svg>" + "y" * 60
 
     picture, file = tmp_path / "board.svg", edited(tmp_path, rename)
     ran = CliRunner().invoke(app, ["benchmark", "--compare", str(file), str(PI), "--out", str(picture)])
@@ -119,6 +119,8 @@ def test_the_command_prints_eighty_columns_and_draws(tmp_path: Path) -> None:
     assert "\x1b" not in board
     assert b"<svg" in picture.read_bytes()[:400]
     assert picture.read_bytes().count(b"</svg>") == 1
+    labels = leaderboard_figure(read_leaderboard([file, PI])).axes[0].get_yticklabels()
+    assert any(label.get_text().startswith("$x^{$ ?") and not label.get_parse_math() for label in labels)
 
 
 @pytest.mark.parametrize(

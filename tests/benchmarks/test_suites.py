@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import unjam
-from unjam.benchmarks.episodes import FAMILY_TEST_SEEDS, drive_by_label, run_in_batches
+from unjam.benchmarks.result import FAMILY_TEST_SEEDS
+from unjam.benchmarks.run import drive_by_label
 from unjam.benchmarks.suites import SUITES, find_suite, references
 from unjam.errors import InputError
 from unjam.measures.gain import MIN_REFERENCE_GAIN, performance
@@ -104,9 +105,7 @@ def test_the_references_of_a_road_can_be_measured_again(name: str) -> None:
     reference = references()[name]
     with WorkerPool(2) as pool:
         drivers = {"human": "human", "best": reference["expert"]}
-        rows = drive_by_label(
-            make_scenario(f"family/{name}"), drivers, FAMILY_TEST_SEEDS, lambda tasks: run_in_batches(pool, tasks)
-        )
+        rows = drive_by_label(make_scenario(f"family/{name}"), drivers, FAMILY_TEST_SEEDS, pool, in_batches=True)
     found = {label: list(map(performance, own)) for label, own in rows.items()}
     assert found == {
         "human": pytest.approx(reference["baseline"], rel=1e-9),

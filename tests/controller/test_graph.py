@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.controller.test_sample import perceived
-from unjam.controller.graph import check_graph, run_graph
+from unjam.controller.verify import check_graph, run_graph
 from unjam.drivers import LACC, Constant
 from unjam.drivers.local_state import COMMON_FIELDS
 from unjam.errors import InputError, MissingPartError

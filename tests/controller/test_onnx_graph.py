@@ -14,8 +14,8 @@ from tests.drivers.test_experts import EXPERTS
 from tests.learners.test_trpo_ppo import mean_of
 from tests.learners.toy_task import make_policy, shake
 from unjam.controller.file import replay_states
-from unjam.controller.graph import check_graph, run_graph
 from unjam.controller.onnx_graph import describe_graph, onnx_graph
+from unjam.controller.verify import check_graph, run_graph
 from unjam.drivers import ACC, IDM, LACC, Driver, FollowerStopper, Human, Pacer, PISaturation, ResidualDriver
 from unjam.drivers.car_following import Constant
 from unjam.drivers.network import Network

@@ -11,8 +11,7 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 import unjam
 from tests.worlds.sumo.user_networks import straight
 from unjam.drivers import Constant
-from unjam.environments.gymnasium_env import RoadStepResult
-from unjam.environments.threads import CopyableLock
+from unjam.environments.gymnasium_env import CopyableLock, RoadStepResult
 from unjam.errors import InputError
 from unjam.measures.metrics import METRICS
 from unjam.scenarios import make_scenario

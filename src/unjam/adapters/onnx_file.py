@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from unjam.drivers.car_following import Constant
-from unjam.drivers.driver import Driver
 from unjam.drivers.onnx_policy import OnnxDriver
 from unjam.drivers.policy import PolicyDescription
 from unjam.drivers.registry import DRIVERS, driver_from_name
@@ -23,8 +22,7 @@ from unjam.parameters import build_dataclass, parse_toml, split_parameters
 from unjam.text import one_line
 
 GRAPH_SUFFIX, DESCRIPTION_SUFFIX = ".onnx", ".toml"
-DESCRIPTION_KEY = "unjam"
-"""key of the description among the metadata of a graph"""
+DESCRIPTION_KEY = "unjam"  # key of the description among the metadata of a graph
 MAX_DESCRIPTION_BYTES = 2**20
 
 
@@ -50,7 +48,10 @@ def onnx_driver(
     path = Path(file)
     content, table = _read_described(path) if description is None else (_read(path, MAX_MODEL_BYTES), {})
     with naming(f"driver {path.name}: "):
-        named = _expert(table.pop("expert", Constant.name), time_step)
+        name = table.pop("expert", Constant.name)
+        if not isinstance(name, str) or split_parameters(name)[0] not in DRIVERS:
+            raise unknown_name("expert", name, DRIVERS)
+        named = driver_from_name(name, time_step)
         inner = named if expert is None else as_driver(expert, time_step)
         if description is None:
             description = build_dataclass(PolicyDescription, table, "")
@@ -98,9 +99,3 @@ def _parse_description(content: bytes, name: str) -> dict[str, Any]:
         return parse_toml(content.decode())
     except (ValueError, RecursionError) as error:
         raise InputError(f"driver {name}: not TOML: {one_line(error)}") from None
-
-
-def _expert(name: Any, time_step: float) -> Driver:
-    if not isinstance(name, str) or split_parameters(name)[0] not in DRIVERS:
-        raise unknown_name("expert", name, DRIVERS)
-    return driver_from_name(name, time_step)

@@ -10,23 +10,18 @@ from unjam.drivers.observation import MAX_OBSERVATION
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import import_optional, unknown_name
 
-ALGORITHMS = {
-    "trpo": ("sb3_contrib", "TRPO"),
-    "ppo": ("stable_baselines3", "PPO"),
-    "sac": ("stable_baselines3", "SAC"),
-    "td3": ("stable_baselines3", "TD3"),
-}
+ALGORITHMS = {"trpo": ("sb3_contrib", "TRPO"), "ppo": ("stable_baselines3", "PPO")}
+ALGORITHMS |= {"sac": ("stable_baselines3", "SAC"), "td3": ("stable_baselines3", "TD3")}
 """packages and names of the algorithms, by the agent of a training"""
-MIN_EXPLORATION = 1e-3
-"""smallest standard deviation of exploration, as a share of the authority"""
+MIN_EXPLORATION = 1e-3  # smallest standard deviation of exploration, as a share of the authority
 
 
-def stable_baselines3_model(driver: ResidualDriver, agent: str) -> Any:
-    """Return a model of an algorithm of `ALGORITHMS` whose deterministic action is the residual of a driver [m/s2].
+def stable_baselines3_bytes(driver: ResidualDriver, agent: str) -> bytes:
+    """Return the content of the `.zip` file of a model whose deterministic action is the residual of a driver [m/s2].
 
-    Its observations are those of the Gymnasium environments with the driver's expert and features. Its actor has the
-    weights of the driver; critics and optimizers are new. Raise `InputError` for an unknown algorithm,
-    `MissingPartError` without Stable-Baselines3.
+    The algorithm is that of `ALGORITHMS` for `agent`. Observations are those of the Gymnasium environments with the
+    driver's expert and features. The actor has the weights of the driver; critics and optimizers are new. Raise
+    `InputError` for an unknown algorithm, `MissingPartError` without Stable-Baselines3.
     """
     if agent not in ALGORITHMS:
         raise unknown_name("agent", agent, ALGORITHMS)
@@ -63,17 +58,9 @@ def stable_baselines3_model(driver: ResidualDriver, agent: str) -> Any:
                 parameter.copy_(torch.as_tensor(array.T))
         if agent == "td3":
             model.actor_target.load_state_dict(actor.state_dict())
-    model.unjam = {
-        "expert": driver.expert.describe(),
-        "features": list(driver.inputs),
-        "action": "residual acceleration [m/s2], added to that of the expert",
-        "action_repeat": driver.action_repeat,
-    }
-    return model
-
-
-def stable_baselines3_bytes(driver: ResidualDriver, agent: str) -> bytes:
-    """Return the content of the `.zip` file of a model; arguments and errors as `stable_baselines3_model`."""
+    action = "residual acceleration [m/s2], added to that of the expert"
+    model.unjam = {"expert": driver.expert.describe(), "features": list(driver.inputs)}
+    model.unjam |= {"action": action, "action_repeat": driver.action_repeat}
     content = io.BytesIO()
-    stable_baselines3_model(driver, agent).save(content)
+    model.save(content)
     return content.getvalue()

@@ -61,7 +61,7 @@ def leaderboard_figure(results: Mapping[str, BenchmarkResult]) -> Figure:
         axes.plot([mean.mean], [row], "D", color=CAV_PLOT_COLOR, ms=6)
     for reference in (0.0, 1.0):
         axes.axvline(reference, color=MUTED_COLOR, lw=0.8, ls=":")
-    axes.set_yticks(range(len(results)), [label.replace("$", r"\$") for label in results])
+    axes.set_yticks(range(len(results)), list(results))
     axes.invert_yaxis()
     suite = next(iter(results.values())).suite
     axes.set_xlabel(f"gain in {suite}: 0 is the human baseline, 1 the best tuned expert of each road")

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr
 
-from unjam.benchmarks.episodes import FAMILY_METRICS, FAMILY_TEST_SEEDS
 from unjam.benchmarks.suites import Suite, find_suite, references
 from unjam.controller.manifest import first_difference, short_text
 from unjam.errors import InputError, invalid_value, naming, unknown_name
@@ -20,24 +19,28 @@ from unjam.measures.statistics import Estimate, estimate_crossed
 from unjam.parameters import STRICT, build_dataclass, parameter_dataclass
 from unjam.physics.arrays import Floats
 from unjam.road_family import FAMILY
+from unjam.seeds import held_out_seeds
 
 if TYPE_CHECKING:  # imported late, so that commands start quickly
     import pandas as pd
 
 FILE_FORMAT, DIGITS, MAX_LABEL_CHARACTERS = 1, 7, 500
 """version of files; significant digits of stored metrics; maximum length of the name of a driver"""
-MAX_FILE_BYTES = 4 * 2**20
-"""maximum size of a file; one with all roads has 200 kB"""
-MAX_RELATIVE_DIFFERENCE = 1e-4
-"""allowed relative difference to reference values of the human baseline"""
-TRAINING_STEPS_UNIT = "environment steps: control steps in the simulator"
-"""unit of `training_steps`, as files say"""
+MAX_FILE_BYTES = 4 * 2**20  # maximum size of a file; one with all roads has 200 kB
+MAX_RELATIVE_DIFFERENCE = 1e-4  # allowed relative difference to reference values of the human baseline
+TRAINING_STEPS_UNIT = "environment steps: control steps in the simulator"  # unit of `training_steps`, as files say
 PARTS = {"all roads": ("training", "combination", "axis"), "training": ("training",), "unseen": ("combination", "axis")}
 """parts of the family by the name of their mean"""
-COUNT, MAX_VALUE = len(FAMILY_TEST_SEEDS), 1e9
-"""number of test seeds, and the largest allowed number in a file"""
+EPISODES_PER_ROAD, MAX_VALUE = 10, 1e9  # episodes of each driver on each road; largest allowed number in a file
+FAMILY_TEST_SEEDS = held_out_seeds(EPISODES_PER_ROAD)
+FAMILY_METRICS = (
+    *("seed", "status", "travel_time", "delay", "mean_speed", "mean_speed_second_half", "speed_limit_ratio"),
+    *("outflow_veh_per_h", "fuel_ml_per_km", "required_time_gap", "has_lanes", "collisions", "min_time_gap"),
+    *("cav_min_ttc", "cav_max_braking", "cut_in_max_braking", "share_short_time_gap", "override_share"),
+    "human_braking_beyond_4_5",
+)
 Column = list[StrictFloat | StrictInt | StrictBool | StrictStr | None]
-Columns = dict[str, Annotated[Column, Field(min_length=COUNT, max_length=COUNT)]]
+Columns = dict[str, Annotated[Column, Field(min_length=EPISODES_PER_ROAD, max_length=EPISODES_PER_ROAD)]]
 """metrics by name, a value for each test seed"""
 
 
@@ -45,13 +48,10 @@ Columns = dict[str, Annotated[Column, Field(min_length=COUNT, max_length=COUNT)]
 class RoadRecord:
     """The episodes of the human baseline and of the driver on one road."""
 
-    backend: StrictStr
-    """which simulator drove the driver's episodes"""
+    backend: StrictStr  # which simulator drove the driver's episodes
     baseline: Columns
-    driver: Columns
-    """empty if it cannot drive on this road: it then counts as the human baseline"""
-    note: StrictStr = ""
-    """why it cannot drive there"""
+    driver: Columns  # empty if it cannot drive on this road: it then counts as the human baseline
+    note: StrictStr = ""  # why it cannot drive there
 
 
 @parameter_dataclass(frozen=True, config=STRICT)

@@ -1,16 +1,18 @@
 """Run a benchmark: the human baseline and a driver on the test seeds of each road of a suite."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from safetensors.numpy import save
 
-from unjam.benchmarks.episodes import FAMILY_TEST_SEEDS, family_metrics, make_tasks
 from unjam.benchmarks.result import (
+    FAMILY_METRICS,
+    FAMILY_TEST_SEEDS,
     MAX_LABEL_CHARACTERS,
     BenchmarkResult,
     RoadRecord,
@@ -38,17 +40,16 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.text import format_count, one_line
 from unjam.training.evaluate import raise_failure
-from unjam.worlds.backend import check_support, open_backend
+from unjam.worlds.backend import BackendLike, check_support, open_backend
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.batch.support import unsupported_reason
 from unjam.worlds.episode import check_can_drive, run_episode
 from unjam.worlds.record import Episode
-from unjam.worlds.worker_pool import WorkerPool
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
-EXACT_BACKEND = "exact"
-"""backend of benchmarks: the batch where its episodes are those of SUMO, else SUMO"""
-MAX_TRAINING_STEPS = 2**53
-"""environment steps that a result can record"""
+EXACT_BACKEND = "exact"  # backend of benchmarks: the batch where its episodes are those of SUMO, else SUMO
+MAX_TRAINING_STEPS = 2**53  # environment steps that a result can record
+Seeds = Sequence[tuple[int, ...]]
 
 
 def benchmark(
@@ -173,8 +174,35 @@ def _drive_road(scenario: Scenario, driver: Driver, backend: str, pool: WorkerPo
 
 
 def _measure_episode(index: int, episode: Episode) -> dict[str, Any]:
-    raise_failure([] if episode.has_run else [measure(episode)])
-    return family_metrics(index, episode)
+    raise_failure([row := measure(episode)])
+    return row
+
+
+def make_tasks(scenario: Scenario, driver: Driver, seeds: Seeds, backend: BackendLike = "sumo") -> list[EpisodeTask]:
+    """Return the episodes of a driver; together they cover the range of sizes of the road evenly."""
+    strata = (scenario.stratum(index, len(seeds)) for index in range(len(seeds)))
+    return [EpisodeTask(road, driver, seed, backend=backend) for road, seed in zip(strata, seeds, strict=True)]
+
+
+def drive_by_label(
+    scenario: Scenario, drivers: Mapping[str, str], seeds: Seeds, workers: WorkerPool, in_batches: bool
+) -> dict[str, EpisodeRows]:
+    """Return the metrics of each driver's episodes by label; `drivers` are names of drivers by label.
+
+    With `in_batches`, episodes run in batches if these support the scenario.
+    """
+    made = {label: make_driver(name, scenario.control_step) for label, name in drivers.items()}
+    tasks = {label: make_tasks(scenario, driver, seeds) for label, driver in made.items()}
+    if in_batches and not unsupported_reason(scenario):
+        return {label: list(map(_family_metrics, run_batches(own))) for label, own in tasks.items()}
+    # A whole motorway episode takes 80 MB.
+    rows = iter(workers.run_and_map([*chain(*tasks.values())], lambda index, episode: _family_metrics(episode)))
+    return {label: [next(rows) for _ in own] for label, own in tasks.items()}
+
+
+def _family_metrics(episode: Episode) -> dict[str, Any]:
+    measured = measure(episode)
+    return {key: measured[key] for key in FAMILY_METRICS}
 
 
 def _driver_hash(label: str, driver: Driver) -> str | None:

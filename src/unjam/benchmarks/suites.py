@@ -40,8 +40,7 @@ _SUITES = (
         ("on-ramp-5", "on-ramp-20", "on-ramp-10", "on-ramp-10-more-demand", "one-lane-10"),
     ),
 )
-SUITES = {suite.name: suite for suite in _SUITES}
-"""all suites by name"""
+SUITES = {suite.name: suite for suite in _SUITES}  # all suites by name
 
 
 def find_suite(name: str) -> Suite:

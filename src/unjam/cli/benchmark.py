@@ -6,6 +6,7 @@ from typing import Annotated
 
 from typer import Argument, Option
 
+from unjam.benchmarks.suites import DEFAULT_SUITE, SUITES
 from unjam.cli import options as opt
 from unjam.cli.output import console, err_console, new_table, print_json, print_next_command
 from unjam.controller import DEFAULT_DRIVER
@@ -24,7 +25,7 @@ def benchmark_command(
             show_default=DEFAULT_DRIVER,
         ),
     ] = None,
-    suite: Annotated[str, Option(help="Set of roads: all-roads-v1, closed-roads-v1 or motorways-v1.")] = "all-roads-v1",
+    suite: Annotated[str, Option(help=f"Set of roads: {', '.join(SUITES)}.")] = DEFAULT_SUITE,
     out: Annotated[
         Path | None,
         Option(
@@ -87,9 +88,8 @@ def benchmark_command(
     if out is not None:
         err_console.print(f"result: {out}", soft_wrap=True)
     if trial:
-        driven = (
-            f"{len(result.roads)} of {format_count(len(result.roads) + len(result.missing_roads), 'road')} of {suite}"
-        )
+        total = format_count(len(result.roads) + len(result.missing_roads), "road")
+        driven = f"{len(result.roads)} of {total} of {suite}"
         err_console.print(f"trial: {driven}; the same command without --roads drives all", soft_wrap=True)
     else:
         print_next_command("compare it", "benchmark", "--compare", out, "OTHER.json")

@@ -22,22 +22,17 @@ from unjam.controller import DEFAULT_DRIVER
 from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, MissingPartError
 from unjam.files import to_json
-from unjam.measures.metric_table import RowsByDriver, TableCell, choose_baseline, metric_table
+from unjam.measures.metric_table import RowsByDriver, choose_baseline, metric_table
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, is_expert_unchanged
 from unjam.measures.verdict import short_table_metrics, verdicts
 from unjam.text import format_duration, printable, split_label
 
-PROGRESS_LINE_SECONDS = 5.0
-"""time between two plain lines of progress without a terminal"""
-MIN_TIMED_SECONDS = 1.0
-"""time of a count from which the rest is estimated"""
-NARROW_COLUMN_WIDTHS = 18, 7
-"""widths of the columns of metrics and units in a narrow terminal [characters]"""
-WIDE_OPTIONS_WIDTH = 130
-"""width from which a cell of the main table of an assessment is one line [characters]"""
-MAX_HEADING_LENGTH = 45
-"""length of the name of a driver from which a table shows its beginning only [characters]"""
+PROGRESS_LINE_SECONDS = 5.0  # time between two plain lines of progress without a terminal
+MIN_TIMED_SECONDS = 1.0  # time of a count from which the rest is estimated
+NARROW_COLUMN_WIDTHS = 18, 7  # widths of the columns of metrics and units in a narrow terminal [characters]
+WIDE_OPTIONS_WIDTH = 130  # width from which a cell of the main table of an assessment is one line [characters]
+MAX_HEADING_LENGTH = 45  # length of the name of a driver from which a table shows its beginning only [characters]
 TEXT_COLUMN_WIDTHS = {" ": 22, "\n": 15}
 """width of headings and verdicts [characters], by what separates a mean from its interval: that of most numbers"""
 
@@ -66,12 +61,12 @@ def print_json(document: Any) -> None:
     sys.stdout.write(to_json(document, indent=1) + "\n")
 
 
-def new_table(text_columns: Sequence[str] = (), number_columns: Sequence[str] = (), style: str = "bold") -> Table:
-    """Return an empty table: columns of text (units dim), then of numbers; headings in `style`.
+def new_table(text_columns: Sequence[str] = (), number_columns: Sequence[str] = ()) -> Table:
+    """Return an empty table: columns of text (units dim), then of numbers; headings in bold.
 
     Nothing is cut; names in the first column, which a reader copies, are not broken, unless they are of quantities.
     """
-    table = Table(box=None, pad_edge=False, header_style=style, show_header=any(text_columns))
+    table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(text_columns))
     for number, heading in enumerate(text_columns):
         is_name, color = number == 0 and "unit" not in text_columns, "dim" if heading == "unit" else None
         table.add_column(heading, style=color, overflow="fold", no_wrap=is_name)
@@ -115,30 +110,27 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
         columns[label].append(number)  # without a baseline there are no differences
 
     def build_table(columns: Sequence[int], separator: str) -> Table:
-        table = new_table(
-            ("metric", "unit"), [break_label(headings[number], TEXT_COLUMN_WIDTHS[separator]) for number in columns]
-        )
+        width = TEXT_COLUMN_WIDTHS[separator]
+        table = new_table(("metric", "unit"), [break_label(headings[number], width) for number in columns])
         for column in table.columns[2:]:
             column.no_wrap = True
         if separator != " ":
             table.columns[0].width, table.columns[1].width = NARROW_COLUMN_WIDTHS
         for row in rows:
-            table.add_row(row.label, row.unit, *(_cell_text(row.cells[number], separator) for number in columns))
+            cells = ((fill(row.cells[number].mean, width), row.cells[number].interval) for number in columns)
+            texts = (Text.assemble(mean, separator, (ci, "dim")) if ci else Text(mean) for mean, ci in cells)
+            table.add_row(row.label, row.unit, *texts)
         return table
 
     def fits(columns: Sequence[int], separator: str) -> bool:
         unlimited = console.options.update_width(10_000)
         return Measurement.get(console, unlimited, build_table(columns, separator)).maximum <= console.width
 
-    everything = [number for each in columns.values() for number in each]
-    separator = " " if fits(everything, " ") else "\n"
+    separator = " " if fits(range(len(headings)), " ") else "\n"
     blocks = [list[int]()]
     for each in columns.values():
         block = sorted([*blocks[-1], *each])
-        if blocks[-1] and not fits(block, separator):
-            blocks.append(each)
-        else:
-            blocks[-1] = block
+        blocks[-1:] = [block] if not blocks[-1] or fits(block, separator) else [blocks[-1], each]
     for block in blocks:
         console.print(build_table(block, separator))
     for number, label in enumerate(long_labels, 1):
@@ -172,12 +164,6 @@ def print_notes(notes: Sequence[str]) -> None:
         err_console.print(f"note: {note}", soft_wrap=True)
 
 
-def _cell_text(cell: "TableCell", separator: str) -> Text:
-    """Return a cell: its interval dim, verdicts wrapped."""
-    mean = fill(cell.mean, TEXT_COLUMN_WIDTHS[separator])
-    return Text.assemble(mean, separator, (cell.interval, "dim")) if cell.interval else Text(mean)
-
-
 class ProgressReporter:
     """Progress of a count: a bar on a terminal, plain lines now and then elsewhere."""
 
@@ -189,8 +175,7 @@ class ProgressReporter:
         self._bar = Progress(*columns, console=err_console, transient=True, disable=self._is_plain)
         self._task, self._total = self._bar.add_task(label, total=total), total or 0
         self._done: dict[Any, int] = {}
-        self._start_time: float | None = None
-        """time of the first report"""
+        self._start_time: float | None = None  # time of the first report
         self._last_line = time.monotonic()
 
     def __enter__(self) -> Self:

@@ -93,8 +93,7 @@ def evaluate_command(
     results = read_results(target)
     if json:
         gain, means = gain_over_expert(config, evaluation.rows), evaluation.means()
-        facts = {"run": str(run), "folder": str(target), "scenario": config.scenario}
-        facts = {**facts, "gain": asdict(gain) if gain else None}
+        facts = {"run": str(run), "folder": str(target), "scenario": config.scenario, "gain": gain and asdict(gain)}
         drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in evaluation.rows.items()]
         print_json({**facts, "drivers": drivers, "notes": results.metadata["notes"]})
         return

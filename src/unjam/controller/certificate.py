@@ -152,12 +152,9 @@ def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: I
             raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")
     ranges = [(float(values.min()), float(values.max())) for values in states]
     speeds = operating_speeds(float(states.speed.mean()), humans)
-    return Certificate(
-        _worst_cases(simulate, states, driver),
-        _comfort(states.speed, driver.time_step),
-        measure_string_stability(driver, speeds, humans, loop),
-        OperatingDomain(*ranges),
-    )
+    worst_cases, comfort = _worst_cases(simulate, states, driver), _comfort(states.speed, driver.time_step)
+    stability = measure_string_stability(driver, speeds, humans, loop)
+    return Certificate(worst_cases, comfort, stability, OperatingDomain(*ranges))
 
 
 def _steps_of_mean(time_step: float) -> int:

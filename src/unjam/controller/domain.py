@@ -18,8 +18,7 @@ from unjam.worlds.record import Episode
 
 IRRELEVANT_PARAMETERS = {
     *("horizon", "emission_class", "remember_warmup", "population", "recordings", "begin", "window", "platoon")
-}
-"""scenario parameters that do not make it another scenario"""
+}  # scenario parameters that do not make it another scenario
 KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")  # for descriptions
 MAX_LISTED_PARAMETERS = 3  # in a note
 SB3_SUFFIX = ".zip"  # end of the names of models of Stable-Baselines3

@@ -13,7 +13,7 @@ import numpy as np
 from safetensors.numpy import load, save
 
 from unjam import __version__
-from unjam.controller.manifest import MANIFEST_FORMAT, driver_interface, read_manifest
+from unjam.controller.manifest import ACTION_NAME, MANIFEST_FORMAT, driver_interface, read_manifest
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import COMMON_FIELDS, FIELD_SIZES, LocalState
@@ -41,7 +41,6 @@ MAX_PART_BYTES, MAX_JSON_BYTES = 64 * 2**20, {MANIFEST_PART: 2**20, CERTIFICATE_
 """maximum sizes: of one part, and of parts in JSON, which take many times their size in memory"""
 LOCAL_HEADER_BYTES, INDEX_ENTRY_BYTES, ARCHIVE_END_BYTES = 30, 46, 22  # of a zip archive without extra fields
 MAX_SAMPLE_STEPS = 1000  # control steps
-ACTION_NAME = "acceleration"  # name of the recorded answers in a sample and of the output of a graph
 
 
 @dataclass(frozen=True)

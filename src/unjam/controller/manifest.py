@@ -17,6 +17,7 @@ from unjam.parameters import STRICT, build_dataclass, parameter_dataclass
 from unjam.tree import leaves
 
 MANIFEST_FORMAT = 5  # version of the schema, the only one that is read
+ACTION_NAME = "acceleration"  # name of the recorded answers in a sample and of the output of a graph
 JsonObject = dict[str, Any]
 _StrictPositive = Annotated[StrictFloat, Field(gt=0)]
 
@@ -114,9 +115,16 @@ def driver_interface(driver: Driver, action_limit: float | None = None) -> JsonO
         "observation": [{"name": name, "unit": STATE_UNITS[name]} for name in driver.requirements().input_fields],
         "networks": _network_inputs(driver),
         "memory": [_memory_entry(name, value[0]) for name, value in leaves(driver.initial_memory(1))],
-        "action": {"name": "acceleration", "unit": "m/s2", "low": low, "high": high},
+        "action": {"name": ACTION_NAME, "unit": "m/s2", "low": low, "high": high},
         "action_repeat": driver.action_repeat,
     }
+
+
+def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
+    """Return the names of a graph's inputs (state, memory) and outputs (acceleration, memory after it)."""
+    memory = [name for name, _ in leaves(driver.initial_memory(1))]
+    inputs = [*driver.requirements().input_fields, *(f"memory.{name}" for name in memory)]
+    return inputs, [ACTION_NAME, *(f"next.{name}" for name in memory)]
 
 
 def _network_inputs(driver: Driver, prefix: str = "") -> dict[str, list[JsonObject]]:

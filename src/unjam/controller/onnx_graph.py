@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from unjam.adapters.onnx_file import DESCRIPTION_KEY
-from unjam.controller.graph import ONNX_OPSET, graph_names
-from unjam.controller.manifest import driver_interface
+from unjam.controller.manifest import driver_interface, graph_names
+from unjam.controller.verify import ONNX_OPSET
 from unjam.drivers.command import Limits
 from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState, state_of_ones
@@ -78,20 +78,12 @@ def onnx_graph(driver: Driver, action_limit: float) -> bytes:
     arrays += [torch.as_tensor(value, dtype=torch.float64) for _, value in leaves(memory)]
     if driver.time_gaps(state, memory) is not None:
         raise InputError(f"onnx: {driver.describe()} is not allowed: a graph cannot command time gaps")
+    options: dict[str, Any] = {"input_names": inputs, "output_names": outputs, "custom_translation_table": exact}
     rows = torch.export.Dim("cavs")
+    options |= {"dynamic_shapes": (tuple({0: rows} for _ in arrays),), "opset_version": ONNX_OPSET}
+    module = ControllerModule(driver, action_limit).eval()
     with torch.no_grad():
-        program: Any = torch.onnx.export(
-            ControllerModule(driver, action_limit).eval(),
-            tuple(arrays),
-            input_names=inputs,
-            output_names=outputs,
-            dynamic_shapes=(tuple({0: rows} for _ in arrays),),
-            opset_version=ONNX_OPSET,
-            dynamo=True,
-            optimize=False,
-            custom_translation_table=exact,
-            verbose=False,
-        )
+        program: Any = torch.onnx.export(module, tuple(arrays), dynamo=True, optimize=False, verbose=False, **options)
     _simplify(program.model)
     proto = program.model_proto
     for value in (*proto.graph.input, *proto.graph.output, *proto.graph.value_info):

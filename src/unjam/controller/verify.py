@@ -1,6 +1,5 @@
 """Verification of a controller: whether it is undamaged, and whether its forms agree (`unjam verify`)."""
 
-import json
 import secrets
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,19 +12,23 @@ from unjam.controller import file as archive
 from unjam.controller.certificate import describe_worst_cases, make_certificate
 from unjam.controller.domain import road_description
 from unjam.controller.file import Controller, Floats, read_controller, read_sample, replay_states
-from unjam.controller.graph import check_graph, run_graph
-from unjam.controller.manifest import PROVENANCE_ENTRIES, driver_interface, first_difference, short_text
+from unjam.controller.manifest import PROVENANCE_ENTRIES, driver_interface, first_difference, graph_names, short_text
 from unjam.drivers.check import random_state
+from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_recipe, user_code_recipes
 from unjam.drivers.wrappers import FilteredDriver
-from unjam.errors import InputError, MissingPartError
+from unjam.errors import InputError, MissingPartError, import_optional
 from unjam.files import parse_json, reject_damaged, sha256_of, to_json
+from unjam.onnx_models import check_model, open_session, parse_model, run_session
 from unjam.text import format_count
+from unjam.tree import leaves
 
 REPLAY_TOLERANCE = 1e-9  # allowed difference between recorded accelerations and those on this machine [m/s2]
 CERTIFICATE_TOLERANCE = 1e-6  # allowed difference between the numbers of a certificate and those on this machine
 GRAPH_TOLERANCE = 1e-6  # allowed difference between graph and driver [m/s2]
+BATCH_TOLERANCE = 1e-9  # between equal rows [m/s2]: rounding of matrix products depends on their size
+ONNX_OPSET, ONNX_IR_VERSIONS = 20, range(10, 14)  # of graphs: version of the operators, versions of the format
 MAX_GRAPH_ROWS = 50  # CAVs in one run of a graph
 RANDOM_STATE_COUNT = 200  # to compare graph and driver, in addition to the maker's sample
 
@@ -40,8 +43,7 @@ class PartCheck:
     status: CheckStatus
     """`checked`: it was checked, and is right; `absent`: the controller has no such part; `stated`: only its maker can
     know it; `not checked`: it could not be checked on this machine"""
-    detail: str
-    """how it was checked, or why it was not"""
+    detail: str  # how it was checked, or why it was not
 
 
 def verify_controller_file(path: Path | str, signer: Path | str | None = None) -> list[PartCheck]:
@@ -70,15 +72,9 @@ def check_parts(controller: Controller, signer: Path | str | None = None) -> lis
             raise InputError(f"controller: has {min(tested)}, but no recorded sample to test it on")
         hidden = archive.MANIFEST_PART, archive.SIGNATURE_PART
         sizes = [f"{name} {len(part):,} bytes" for name, part in controller.parts.items() if name not in hidden]
-        return [
-            PartCheck("parts", "checked", f"{', '.join(sizes)}: each has the SHA-256 that the manifest names"),
-            signature,
-            *_check_driver(controller),
-            *_describe_provenance(controller),
-            _check_sample(controller),
-            _check_graph(controller),
-            _check_certificate(controller),
-        ]
+        parts = PartCheck("parts", "checked", f"{', '.join(sizes)}: each has the SHA-256 that the manifest names")
+        checks = [parts, signature, *_check_driver(controller), *_describe_provenance(controller)]
+        return [*checks, _check_sample(controller), _check_graph(controller), _check_certificate(controller)]
 
 
 def _check_signer(actual: str | None, signer: Path | str | None) -> PartCheck:
@@ -102,7 +98,7 @@ def _check_driver(controller: Controller) -> Iterator[PartCheck]:
     """Yield the results for the driver, its code, its weights, and the manifest's description of it."""
     driver, manifest = controller.driver, controller.manifest
     recipe, arrays = driver_recipe(driver)
-    stated, actual = manifest["driver"], _json_roundtrip(recipe)
+    stated, actual = manifest["driver"], parse_json(to_json(recipe))
     _require_same("manifest", first_difference(stated, actual, allows_missing=True, name="driver"))
     defaults = "; missing parameters have the defaults of this version" if first_difference(stated, actual) else ""
     detail = f"{driver.describe()}: built from its recipe, of which nothing was ignored{defaults}"
@@ -118,7 +114,7 @@ def _check_driver(controller: Controller) -> Iterator[PartCheck]:
         yield PartCheck("weights", "checked", f"{detail}; SHA-256 {sha256}")
     else:
         yield PartCheck("weights", "absent", f"the driver has no network; SHA-256 {sha256}")
-    interface = _json_roundtrip(driver_interface(driver, manifest.get("action_limit")))
+    interface = parse_json(to_json(driver_interface(driver, manifest.get("action_limit"))))
     _require_same("manifest", first_difference({name: manifest[name] for name in interface}, interface))
     yield PartCheck("manifest", "checked", f"{', '.join(interface)}: as the driver describes itself")
 
@@ -144,7 +140,7 @@ def _check_sample(controller: Controller) -> PartCheck:
         return PartCheck("sample", "absent", f"no recorded accelerations to repeat; {reason}")
     states, recorded = read_sample(controller.parts[archive.SAMPLE_PART])
     answers = replay_states(controller.driver, states, _action_limit(controller))
-    error = _max_error("its driver", answers, recorded, REPLAY_TOLERANCE)
+    error = _max_error("its driver", answers, recorded, REPLAY_TOLERANCE, "step {} of its sample")
     detail = f"the driver repeats them within {error:.1e} m/s2 (allowed {REPLAY_TOLERANCE:g})"
     return PartCheck("sample", "checked", f"{len(recorded):,} control steps: {detail}; their states are the maker's")
 
@@ -157,17 +153,49 @@ def _check_graph(controller: Controller) -> PartCheck:
     states, recorded = read_sample(controller.parts[archive.SAMPLE_PART])
     try:
         check_graph(part, driver)
-        sample_error = _max_error("its graph", run_graph(part, driver, states), recorded, GRAPH_TOLERANCE)
+        limits = GRAPH_TOLERANCE, "step {} of its sample"
+        sample_error = _max_error("its graph", run_graph(part, driver, states), recorded, *limits)
         random_states = _random_states(part, states)
         answers = replay_states(driver, random_states, _action_limit(controller))
         counts = 1, 2, 3 + secrets.randbelow(MAX_GRAPH_ROWS - 2)  # no maker can know them
         results = (run_graph(part, driver, random_states, rows) for rows in counts)
-        error = max(_max_error("its graph", each, answers, GRAPH_TOLERANCE, "random state") for each in results)
+        error = max(_max_error("its graph", each, answers, GRAPH_TOLERANCE, "random state {}") for each in results)
     except MissingPartError as missing:
         return PartCheck("graph", "not checked", str(missing))
     detail = f"within {sample_error:.1e} m/s2 of the sample and {error:.1e} of the driver"
     detail += f" on {RANDOM_STATE_COUNT} random states, for {', '.join(map(str, counts))} CAVs at once"
     return PartCheck("graph", "checked", f"pure arithmetic; {detail} (allowed {GRAPH_TOLERANCE:g})")
+
+
+def check_graph(part: bytes, driver: Driver) -> None:
+    """Raise `InputError` unless a graph has the inputs and outputs of a controller and only arithmetic between them."""
+    model = parse_model(part)
+    check_model(model, len(part), range(ONNX_OPSET, ONNX_OPSET + 1), ONNX_IR_VERSIONS)
+    graph, expected = model.graph, graph_names(driver)
+    found = [value.name for value in graph.input], [value.name for value in graph.output]
+    if found != expected:
+        raise InputError(f"graph: inputs and outputs {found} are not allowed; allowed: {expected}")
+    kinds = {value.type.tensor_type.elem_type for value in (*graph.input, *graph.output)}
+    if kinds != {import_optional("onnx").TensorProto.DOUBLE}:
+        raise InputError("graph: inputs and outputs of another type are not allowed; allowed: float64")
+
+
+def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) -> Floats:
+    """Return the accelerations of a checked graph for consecutive `states` [m/s2], all of shape (T,).
+
+    It runs for `rows` CAVs with the same observation at once. Raise `InputError` if onnxruntime refuses it or they get
+    different answers, `MissingPartError` without onnxruntime.
+    """
+    (inputs, _), session, answers = graph_names(driver), open_session(part), list[Floats]()
+    fields, memory = driver.requirements().input_fields, [each for _, each in leaves(driver.initial_memory(rows))]
+    for step in range(len(states.speed)):
+        now = states.select(np.full(rows, step))
+        values = [*(getattr(now, name) for name in fields), *memory]
+        acceleration, *memory = run_session(session, None, dict(zip(inputs, values, strict=True)))
+        answers.append(acceleration)
+    if any(each.shape != (rows,) or not (np.abs(each - each[0]) <= BATCH_TOLERANCE).all() for each in answers):
+        raise InputError(f"graph: {rows} CAVs with the same observation get different answers")
+    return np.array([each[0] for each in answers])
 
 
 def _random_states(part: bytes, states: LocalState) -> LocalState:
@@ -183,7 +211,7 @@ def _check_certificate(controller: Controller) -> PartCheck:
     if archive.CERTIFICATE_PART not in controller.parts:
         return PartCheck("certificate", "absent", "no worst cases were simulated; `unjam certify` does it")
     stated = parse_json(controller.parts[archive.CERTIFICATE_PART])  # before the simulations, in case it is damaged
-    actual = _json_roundtrip(make_certificate(controller))
+    actual = parse_json(to_json(make_certificate(controller)))
     _require_same("certificate", first_difference(stated, actual, CERTIFICATE_TOLERANCE))
     found = describe_worst_cases(actual, cast(FilteredDriver, controller.driver))
     return PartCheck("certificate", "checked", f"{found}: the same in repeated simulations")
@@ -197,10 +225,6 @@ def _action_limit(controller: Controller) -> float:
     return max(-low, high)
 
 
-def _json_roundtrip(value: Any) -> Any:
-    return json.loads(to_json(value))
-
-
 def _require_same(part: str, difference: tuple[str, Any, Any] | None) -> None:
     if difference is not None:
         name, stated, actual = difference
@@ -208,12 +232,11 @@ def _require_same(part: str, difference: tuple[str, Any, Any] | None) -> None:
         raise InputError(f"controller: its {part} says of {name or 'itself'}: {allowed}")
 
 
-def _max_error(form: str, actual: Floats, recorded: Floats, tolerance: float, step_label: str = "step") -> float:
+def _max_error(form: str, actual: Floats, recorded: Floats, tolerance: float, place: str) -> float:
     """Return the largest difference of accelerations [m/s2]; raise `InputError` if it exceeds the tolerance."""
     errors = np.abs(actual - recorded)
     if not (errors <= tolerance).all():  # also for NaN
         step = int(np.argmax(~(errors <= tolerance)))
-        place = f"{step_label} {step}" if step_label != "step" else f"step {step} of its sample"
-        allowed = f"{recorded[step]:.9g} to {tolerance:g}"
-        raise InputError(f"controller: {place}: {form} answers {actual[step]:.9g} m/s2; allowed: {allowed}")
+        found, allowed = f"{form} answers {actual[step]:.9g} m/s2", f"{recorded[step]:.9g} to {tolerance:g}"
+        raise InputError(f"controller: {place.format(step)}: {found}; allowed: {allowed}")
     return float(errors.max())

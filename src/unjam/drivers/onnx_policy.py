@@ -14,20 +14,17 @@ from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyMemory
 from unjam.errors import InputError, invalid_value, naming, unknown_name
 from unjam.onnx_models import check_model, open_session, parse_model, remove_texts, run_session, time_limit
 
-OPSETS, IR_VERSIONS = range(9, 26), range(4, 14)
-"""allowed versions of the operators and of the format"""
+OPSETS, IR_VERSIONS = range(9, 26), range(4, 14)  # allowed versions of the operators and of the format
 TYPES: dict[int, type[np.floating[Any]]] = {1: np.float32, 11: np.float64}
 """allowed types of inputs and outputs, by their numbers in ONNX"""
-MAX_MEMORY_NUMBERS = 100_000
-"""maximum count of numbers in the recurrent state of one CAV"""
+MAX_MEMORY_NUMBERS = 100_000  # maximum count of numbers in the recurrent state of one CAV
 
 
 class Tensor(NamedTuple):
     """An input or output of a graph."""
 
     type: type[np.floating[Any]]
-    shape: tuple[int, ...] | None
-    """0 for an axis without a fixed length; None: unknown"""
+    shape: tuple[int, ...] | None  # 0 for an axis without a fixed length; None: unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +32,11 @@ class OnnxPolicy:
     """A checked graph as the function of a policy."""
 
     graph: bytes
-    columns: dict[str, tuple[int, ...]]
-    """columns of the observation, by input"""
+    columns: dict[str, tuple[int, ...]]  # columns of the observation, by input
     output: str
     memory: tuple[PolicyMemory, ...]
-    tensors: dict[str, Tensor]
-    """its inputs"""
-    is_batched: bool
-    """whether the graph takes any number of rows; otherwise it runs once for each CAV"""
+    tensors: dict[str, Tensor]  # its inputs
+    is_batched: bool  # whether the graph takes any number of rows; otherwise it runs once for each CAV
 
     def initial_memory(self, n: int) -> Memory:
         """Return the initial recurrent state of `n` CAVs, in the types of the graph."""
@@ -82,8 +76,7 @@ class OnnxDriver(PolicyDriver):
     """A policy from an ONNX graph, alone or added to an expert; raises errors as `unjam.adapters.onnx_driver`."""
 
     policy: Any = field(init=False)  # an `OnnxPolicy`
-    graph: NDArray[np.uint8] = field(kw_only=True, repr=False)
-    """bytes of the graph"""
+    graph: NDArray[np.uint8] = field(kw_only=True, repr=False)  # bytes of the graph
 
     def __post_init__(self) -> None:
         with naming(f"driver {self.label}: "):

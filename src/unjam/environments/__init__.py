@@ -15,15 +15,12 @@ ENVIRONMENT_ARGUMENTS = {
         f"unjam/{name}-v1": {"scenario": f"{FAMILY_PREFIX}{name}"} | ({"cavs": 1} if "cavs" in road.options else {})
         for name, road in FAMILY.items()
     },
-}
-"""arguments of `RoadEnv`, by the Gymnasium id of the environment; closed roads of benchmarks have one CAV there"""
+}  # arguments of `RoadEnv`, by the Gymnasium id of the environment; closed roads of benchmarks have one CAV there
 
 
 def register_environments() -> None:
     """Register the environments with Gymnasium; their module is imported when one is made."""
     for name, arguments in ENVIRONMENT_ARGUMENTS.items():
         if name not in registry:
-            single, vector = (
-                f"unjam.environments.{each}" for each in ("gymnasium_env:RoadEnv", "slotted_vector_env:make_vector_env")
-            )
-            register(name, single, vector_entry_point=vector, kwargs=arguments)
+            vector = "unjam.environments.slotted_vector_env:make_vector_env"
+            register(name, "unjam.environments.gymnasium_env:RoadEnv", vector_entry_point=vector, kwargs=arguments)

@@ -1,11 +1,13 @@
 """A scenario with external actions, and with one CAV as a Gymnasium environment."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from copy import copy
+from functools import wraps
 from math import isfinite
-from typing import Any, ClassVar, NamedTuple
+from threading import RLock
+from typing import Any, ClassVar, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
 import gymnasium
 import numpy as np
@@ -19,7 +21,6 @@ from unjam.drivers.command import as_numbers
 from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features, memory_size, observation_size
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
-from unjam.environments.threads import CopyableLock, synchronized
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
 from unjam.measures.step_metrics import StepMetricMeans
 from unjam.parameters import check_integer, merge_changes, nest_keys
@@ -33,18 +34,35 @@ from unjam.text import one_line
 from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend, open_world
 from unjam.worlds.drive import DriveLoop
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
-from unjam.worlds.reward import (
-    Outcome,
-    Reward,
-    RewardLike,
-    is_packaged_reward,
-    make_reward,
-    step_reward_terms,
-    time_gap,
-)
+from unjam.worlds.reward import Outcome, RewardLike, is_packaged_reward, make_reward, step_reward_terms, time_gap
 from unjam.worlds.road_world import RoadWorld
 
 Observations = NDArray[np.float32]
+ResetOptions = dict[str, Any] | None  # parameters of the scenario for one episode
+P = ParamSpec("P")
+S = TypeVar("S")
+T = TypeVar("T")
+
+
+class CopyableLock:
+    """A reentrant lock; copies of its owner get their own."""
+
+    def __init__(self) -> None:
+        self.held = RLock()
+
+    def __reduce__(self) -> tuple[type[Self], tuple[()]]:
+        return type(self), ()
+
+
+def synchronized(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
+    """Return a method of an environment in which a second thread waits until the first has returned."""
+
+    @wraps(method)
+    def call(self: S, /, *arguments: P.args, **keywords: P.kwargs) -> T:
+        with self._road.lock.held:  # pyright: ignore[reportAttributeAccessIssue]
+            return method(self, *arguments, **keywords)
+
+    return call
 
 
 def as_action(action: Any, name: str) -> float:
@@ -77,15 +95,12 @@ class RoadStepResult(NamedTuple):
     """The result of one control step, with the CAVs that are on the road now."""
 
     cav_ids: list[str]
-    observations: Observations
-    """shape (CAVs, numbers)"""
-    departed: dict[str, Observations]
-    """last observations of the CAVs that left the road in this step"""
+    observations: Observations  # shape (CAVs, numbers)
+    departed: dict[str, Observations]  # last observations of the CAVs that left the road in this step
     reward: float
     reward_terms: dict[str, float]
     terminated: bool
-    truncated: bool
-    """whether the horizon is reached, or no CAV will be on the road again"""
+    truncated: bool  # whether the horizon is reached, or no CAV will be on the road again
 
 
 class RoadStepper:
@@ -110,7 +125,7 @@ class RoadStepper:
         self.scenario = self.episode_scenario = made
         """that of the constructor; `episode_scenario` is that of the last reset, with its options"""
         reward = reward or self.scenario.reward
-        self._reward, self.has_user_reward = make_reward(reward), not is_packaged_reward(reward)
+        self.reward, self.has_user_reward = make_reward(reward), not is_packaged_reward(reward)
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
         inputs = as_features(features)
         if not expert and (useless := [name for name in ("expert_acceleration", "expert_memory") if name in inputs]):
@@ -128,13 +143,10 @@ class RoadStepper:
         bound = np.full(observation_size(self._driver.features, driver), MAX_OBSERVATION, np.float32)
         self.observation_space = spaces.Box(-bound, bound, dtype=np.float32)
         low, high = (np.full(1, limit, np.float32) for limit in self.scenario.acceleration_limits)
-        self.action_space = spaces.Box(low, high, dtype=np.float32)
-        """action space of one CAV: an acceleration [m/s2]"""
+        self.action_space = spaces.Box(low, high, dtype=np.float32)  # action space of one CAV: an acceleration [m/s2]
         self._seed: int | None = None
-        self._episode_count = 0
-        """episodes since that seed"""
-        self.lock = CopyableLock()
-        """held during calls of the environment"""
+        self._episode_count = 0  # episodes since that seed
+        self.lock = CopyableLock()  # held during calls of the environment
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes for a copy; raise `InputError` after a reset: a simulation cannot be copied."""
@@ -158,9 +170,7 @@ class RoadStepper:
         self._check_scenario(scenario, backend)
         return scenario
 
-    def reset(
-        self, seed: int | None, generator: np.random.Generator, options: dict[str, Any] | None = None
-    ) -> Observations:
+    def reset(self, seed: int | None, generator: np.random.Generator, options: ResetOptions = None) -> Observations:
         """Start an episode, run its warm-up, and return the first observations.
 
         It is that of `seed`, or the next after the last seed, at first one from `generator`. `options` change
@@ -210,7 +220,7 @@ class RoadStepper:
             accelerations = np.array(accelerations)  # a backend may write into its own arrays later
         ends = bool(world.has_crashed), float(world.backlog)
         outcome = Outcome(np.array(world.speeds), accelerations, time_gaps, *ends, speed)
-        terms = step_reward_terms(self._reward, outcome, world.control_steps - 1, self.has_user_reward)
+        terms = step_reward_terms(self.reward, outcome, world.control_steps - 1, self.has_user_reward)
         terminated, reward = world.has_crashed, sum(terms.values())
         self._steps, self._return = self._steps + 1, self._return + reward
         if self._metric_means is not None:
@@ -237,11 +247,6 @@ class RoadStepper:
     def copy_driver(self) -> ExternalDriver:
         """Return a driver with the same expert and features, for other CAVs."""
         return copy(self._driver)
-
-    @property
-    def reward(self) -> Reward:
-        """The reward of control steps."""
-        return self._reward
 
     @property
     def world(self) -> RoadWorld:
@@ -305,10 +310,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
     ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {  # pyright: ignore[reportIncompatibleVariableOverride]
-        "render_modes": ["human", "rgb_array"],
-        "render_fps": 10,
-    }
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # pyright: ignore
 
     def __init__(
         self,
@@ -355,9 +357,7 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         self.action_space = self._road.action_space
 
     @synchronized
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: ResetOptions = None) -> tuple[Observations, dict[str, Any]]:
         """Start an episode: that of `seed`; without one, the next after that of the last seed.
 
         `options` are changes to the parameters of the scenario, as `changes` of the constructor, for this episode only:
@@ -399,9 +399,8 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         from unjam.reports.video import draw_road
 
         world = self._road.world
-        limit = world.road.limit_speed
-        is_known = np.isfinite(limit)  # not on user networks
-        max_speed = 2.0 * limit if is_known else self._road.episode_scenario.top_speed
+        limit = world.road.limit_speed  # unknown on user networks
+        max_speed = 2.0 * limit if np.isfinite(limit) else self._road.episode_scenario.top_speed
         return np.asarray(draw_road(world.scene(), max_speed, f"mean {np.mean(world.speeds):.1f} m/s"))
 
     @synchronized

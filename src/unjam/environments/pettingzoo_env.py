@@ -7,16 +7,14 @@ import numpy as np
 
 from unjam.drivers.observation import FeatureLike
 from unjam.drivers.user_driver import DriverLike
-from unjam.environments.gymnasium_env import RoadStepper, as_action
+from unjam.environments.gymnasium_env import ResetOptions, RoadStepper, as_action, synchronized
 from unjam.environments.slots import RoadAgents, SlottedRoadEnv
-from unjam.environments.threads import synchronized
 from unjam.errors import InputError
 from unjam.text import format_count
 from unjam.worlds.backend import BackendLike
 from unjam.worlds.reward import RewardLike
 
-API_TEST_OPTIONS = {"options": 1}
-"""options without a meaning, with which `parallel_api_test` of PettingZoo calls `reset`"""
+API_TEST_OPTIONS = {"options": 1}  # options without a meaning with which PettingZoo's `parallel_api_test` calls `reset`
 
 
 class ParallelRoadEnv(RoadAgents):
@@ -43,22 +41,17 @@ class ParallelRoadEnv(RoadAgents):
         road = RoadStepper(scenario, changes, reward, expert, features, backend)
         super().__init__(road, road.scenario.possible_cav_ids())
         self._agent_by_vehicle: dict[str, str] = {}
-        self._departed_agents: set[str] = set()
-        """agents whose vehicle has left the road; if it returns, only the expert drives it"""
+        self._departed_agents: set[str] = set()  # whose vehicle has left; if it returns, only the expert drives it
 
     @synchronized
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(self, seed: int | None = None, options: ResetOptions = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode as `RoadEnv.reset`; raise `InputError` if the road can then have other CAVs."""
         options = None if options == API_TEST_OPTIONS else options
         observations = self._road.reset(seed, np.random.default_rng(), options)
         if options and (others := {*self._road.episode_scenario.possible_cav_ids()}.difference(self.possible_agents)):
             self._road.end_episode()
-            allowed = "as many CAVs as in the constructor, or fewer"
-            raise InputError(
-                f"reset: options: {format_count(len(others), 'more CAV')} cannot be there; allowed: {allowed}"
-            )
+            more, allowed = format_count(len(others), "more CAV"), "as many CAVs as in the constructor, or fewer"
+            raise InputError(f"reset: options: {more} cannot be there; allowed: {allowed}")
         self._agent_by_vehicle.clear()
         self._departed_agents.clear()
         self.agents = self._assign_agents(self._road.world.cav_ids)
@@ -82,9 +75,8 @@ class ParallelRoadEnv(RoadAgents):
         )
         departed.update(leaving)
         # A vehicle that enters in the last control step does not become an agent.
-        observations = {
-            agent: each for agent, each in (leaving | present).items() if agent in previous or not has_ended
-        }
+        shown = leaving | present
+        observations = {agent: shown[agent] for agent in shown if agent in previous or not has_ended}
         self.agents = [] if has_ended else list(present)
         info = self._road.step_info(result, has_ended)
         return (
@@ -103,11 +95,6 @@ class ParallelRoadEnv(RoadAgents):
                 free = [agent for agent in self.possible_agents if agent not in taken]
                 self._agent_by_vehicle[name] = name if name in free else free[0]
         return [self._agent_by_vehicle[name] for name in vehicles]
-
-    @synchronized
-    def close(self) -> None:
-        """Close SUMO; further calls have no effect."""
-        self._road.close()
 
 
 @overload

@@ -8,8 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from unjam.environments.gymnasium_env import RoadStepper, as_action
-from unjam.environments.threads import synchronized
+from unjam.environments.gymnasium_env import ResetOptions, RoadStepper, as_action, synchronized
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import check_integer
 
@@ -45,6 +44,11 @@ class RoadAgents(ParallelEnv[str, Any, Any]):
     def render(self) -> None:
         """Draw nothing."""
 
+    @synchronized
+    def close(self) -> None:
+        """Close SUMO; further calls have no effect."""
+        self._road.close()
+
 
 class SlottedRoadEnv(RoadAgents):
     """A `ParallelRoadEnv` with the agents slot_0, slot_1, ..., all of which exist for the whole episode.
@@ -64,14 +68,11 @@ class SlottedRoadEnv(RoadAgents):
         count = check_integer("slots", slots, 1)
         super().__init__(environment._road, (f"slot_{number}" for number in range(count)))
         self._environment = environment
-        self._cavs: dict[str, str] = {}
-        """agent of the environment by occupied slot"""
+        self._cavs: dict[str, str] = {}  # agent of the environment by occupied slot
         self._without_slot: set[str] = set()
 
     @synchronized
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(self, seed: int | None = None, options: ResetOptions = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode, as `ParallelRoadEnv.reset`."""
         observations, infos = self._environment.reset(seed, options)
         self.agents = list(self.possible_agents)
@@ -120,16 +121,8 @@ class SlottedRoadEnv(RoadAgents):
         return {slot: observations[shown[slot]] if slot in shown else empty.copy() for slot in self.possible_agents}
 
     def _infos(self, infos: dict[str, Any], shown: dict[str, str], left: dict[str, str]) -> dict[str, Any]:
-        return {
-            slot: {
-                **infos.get(shown.get(slot, ""), {}),
-                "is_occupied": slot in self._cavs,
-                "has_left": slot in left,
-                "vehicle": shown.get(slot, ""),
-            }
-            for slot in self.possible_agents
-        }
-
-    def close(self) -> None:
-        """Close SUMO; further calls have no effect."""
-        self._environment.close()
+        found: dict[str, Any] = {}
+        for slot in self.possible_agents:
+            state = {"is_occupied": slot in self._cavs, "has_left": slot in left, "vehicle": shown.get(slot, "")}
+            found[slot] = infos.get(state["vehicle"], {}) | state
+        return found

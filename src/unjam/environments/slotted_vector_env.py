@@ -24,8 +24,7 @@ from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.support import required_batch_kind
 from unjam.worlds.reward import Outcome, RewardLike
 
-NO_SLOT = -1
-"""slot of CAVs that find no slot free"""
+NO_SLOT = -1  # slot of CAVs that find no slot free
 
 
 class SlottedEpisodes(Episodes):
@@ -33,8 +32,7 @@ class SlottedEpisodes(Episodes):
 
     def __init__(self, world: MotorwayBatch, driver: ExternalDriver, slots: int) -> None:
         self._shape = len(world.roads), slots
-        self._slots = np.zeros(0, np.intp)
-        """slot of each CAV on a road, or `NO_SLOT`"""
+        self._slots = np.zeros(0, np.intp)  # slot of each CAV on a road, or `NO_SLOT`
         self._departed: tuple[NDArray[Any], ...] = *np.zeros((2, 0), np.intp), np.zeros((0, 1))
         """road, slot and last observation of the CAVs that left their slots in the last control step"""
         super().__init__(world, driver, np.asarray)

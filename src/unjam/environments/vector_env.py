@@ -36,10 +36,8 @@ from unjam.worlds.batch.support import required_batch_kind, statistically_unsupp
 from unjam.worlds.episode import as_seed
 from unjam.worlds.reward import Outcome, RewardLike, validate_reward_terms
 
-EXPERT_CHECK_STEPS = 3
-"""random steps in which an expert must drive each row by itself, without a state of its own"""
-MAX_ENVIRONMENTS = 1_000_000
-"""maximum number of environments, of which each takes 2 kB or more"""
+EXPERT_CHECK_STEPS = 3  # random steps in which an expert must drive each row by itself, without a state of its own
+MAX_ENVIRONMENTS = 1_000_000  # maximum number of environments, of which each takes 2 kB or more
 OTHER_MODE = "allowed: vectorization_mode='async', which simulates in SUMO"
 
 
@@ -47,10 +45,8 @@ class _ArrayKind(NamedTuple):
     """Library and precision of the arrays of an environment, and its noise."""
 
     to_array: ArrayFactory
-    draw: DrawNormal | None
-    """draws the noise of all roads; None: each road has that of SUMO's episode"""
-    to_single: Callable[[Array], Array]
-    """returns an array in single precision"""
+    draw: DrawNormal | None  # draws the noise of all roads; None: each road has that of SUMO's episode
+    to_single: Callable[[Array], Array]  # returns an array in single precision
     no_gradient: Callable[[], AbstractContextManager[object]]
 
 
@@ -130,8 +126,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         "render_modes": [],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
-    _step_sums = staticmethod(step_metrics)
-    """returns what is summed over the control steps of an episode, by name, shape (W,)"""
+    _step_sums = staticmethod(step_metrics)  # returns what is summed over control steps, by name, shape (W,)
 
     def __init__(
         self,
@@ -182,13 +177,10 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._seeds: list[int | None] = [None] * num_envs
-        self._episode_counts = [0] * num_envs
-        """episodes of each environment since that seed, prepared ones included"""
+        self._episode_counts = [0] * num_envs  # episodes of each environment since that seed, prepared ones included
         self._episodes: Episodes | None = None
-        self._prepared: dict[int, tuple[Episodes, int]] = {}
-        """the next episode of an environment, as a row of started episodes"""
-        self._ended_rows: list[int] = []
-        """environments whose episode ended in the last step"""
+        self._prepared: dict[int, tuple[Episodes, int]] = {}  # next episode by environment: a row of started episodes
+        self._ended_rows: list[int] = []  # environments whose episode ended in the last step
 
     def _unsupported_reason(self, scenario: Scenario) -> str:
         """Return why this class has no environment of a scenario that batches simulate; empty if it has one."""
@@ -250,16 +242,13 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             super().reset(seed=as_seed(seed)[0])
             return list(range(int(seed), int(seed) + self.num_envs))
         try:
-            seeds = [
-                None if each is None else as_seed(index(each))[0]
-                for each in ([None] * self.num_envs if seed is None else seed)
-            ]
+            given = [None] * self.num_envs if seed is None else seed
+            seeds = [None if each is None else as_seed(index(each))[0] for each in given]
         except TypeError:
             raise invalid_value("seed", seed, "an integer, or one for each environment") from None
         if len(seeds) != self.num_envs:
-            raise InputError(
-                f"seed: {format_count(len(seeds), 'seed')} not allowed; allowed: {self.num_envs}, or a single one"
-            )
+            count = format_count(len(seeds), "seed")
+            raise InputError(f"seed: {count} not allowed; allowed: {self.num_envs}, or a single one")
         return seeds
 
     def make_batch(self, rows: Sequence[int]) -> Any:

@@ -40,9 +40,3 @@ def per_step(function: Callable[..., Floats], speeds: Floats) -> Floats:
         results.append(np.full(len(chunk), np.nan))
         results[-1][occupied] = function(chunk[occupied], axis=1)
     return np.concatenate([np.zeros(0), *results])
-
-
-def per_kilometer(episode: Episode, fuel: float, speeds: Floats) -> float:
-    """Return fuel per kilometer [ml/km], of a sum of rates in all steps [ml/s] and speeds, shape (T + 1, n) [m/s]."""
-    distance = sum(float(np.nansum(chunk)) for chunk in row_chunks(speeds[1:]))
-    return fuel / (distance / 1000.0) if distance else nan

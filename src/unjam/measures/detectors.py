@@ -16,44 +16,31 @@ from unjam.worlds.sumo.simulation import DetectorPassage
 
 DETECTOR_COLUMNS = ("position", "begin", "end", "flow_veh_per_h", "speed")
 """columns of a file of measurements, in addition to `edge` or `lane`"""
-GEH_LIMIT = 5.0
-"""GEH below which a simulated flow agrees with the measured flow"""
-SAME_PASSAGE_SECONDS = 10.0
-"""time within which a second passage of a vehicle over loops of the same edge is only a lane change [s]"""
+GEH_LIMIT = 5.0  # GEH below which a simulated flow agrees with the measured flow
+SAME_PASSAGE_SECONDS = 10.0  # time within which a second passage of loops of the same edge is only a lane change [s]
 
 
 @dataclass(frozen=True)
 class Measurement:
     """Measurement of a detector in an interval."""
 
-    place: str
-    """id of an edge, all lanes of which are counted, or of a lane"""
-    position: float
-    """position on the edge or lane [m]"""
-    begin: float
-    """begin of the interval, in simulation time [s]"""
-    end: float
-    """end of the interval, in simulation time [s]"""
-    flow: float
-    """flow [veh/h]"""
-    speed: float
-    """mean speed of the vehicles that passed [m/s]; NaN if unknown"""
+    place: str  # id of an edge, all lanes of which are counted, or of a lane
+    position: float  # position on the edge or lane [m]
+    begin: float  # begin of the interval, in simulation time [s]
+    end: float  # end of the interval, in simulation time [s]
+    flow: float  # flow [veh/h]
+    speed: float  # mean speed of the vehicles that passed [m/s]; NaN if unknown
 
 
 @dataclass(frozen=True)
 class Agreement:
     """Agreement of simulated traffic with measurements."""
 
-    geh: float
-    """mean GEH over all intervals of all detectors"""
-    geh_below_5: float
-    """share of the intervals with a GEH below 5"""
-    flow_rmse: float
-    """root mean square error of the flow [veh/h]"""
-    speed_rmse: float
-    """root mean square error of the speed [m/s]; NaN if no speed was measured"""
-    score: float
-    """objective of calibration, smaller is better: mean GEH over 5, plus speed error over mean measured speed"""
+    geh: float  # mean GEH over all intervals of all detectors
+    geh_below_5: float  # share of the intervals with a GEH below 5
+    flow_rmse: float  # root mean square error of the flow [veh/h]
+    speed_rmse: float  # root mean square error of the speed [m/s]; NaN if no speed was measured
+    score: float  # objective of calibration, to minimize: mean GEH over 5, plus speed error over mean measured speed
 
 
 def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
@@ -94,9 +81,8 @@ def _parse_measurement(file: str, line: int, kind: str, row: dict[str, str | Non
     context = f"{file}: line {line}"
     surplus: Any = row.get(None) or ()  # pyright: ignore[reportArgumentType]  (the key of cells without a column)
     if any(surplus) or None in row.values():
-        raise InputError(
-            f"{context}: has {'more' if any(surplus) else 'fewer'} cells than the header; allowed: as many"
-        )
+        number = "more" if any(surplus) else "fewer"
+        raise InputError(f"{context}: has {number} cells than the header; allowed: as many")
     place = (row[kind] or "").strip()
     if not place:
         raise invalid_value(f"{context}: {kind}", place, f"the id of one {kind}")

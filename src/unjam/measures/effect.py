@@ -1,13 +1,13 @@
 """Effect of CAVs on a road: paired differences to the human baseline on the same seeds."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import isfinite, nan
 from typing import Any
 
 import numpy as np
 
-from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, overall_feasibility
+from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, EpisodeRows, RowsByDriver, overall_feasibility
 from unjam.measures.statistics import (
     CONFIDENCE,
     Estimate,
@@ -23,14 +23,12 @@ from unjam.measures.statistics import (
     paired_difference,
 )
 
-MAX_FLOW_LOSS = 0.01
-"""loss of flow that the CI must exclude, as a share of the flow of the baseline"""
+MAX_FLOW_LOSS = 0.01  # loss of flow that the CI must exclude, as a share of the flow of the baseline
 SMALLEST_EFFECT = 0.005
 """difference of travel time below which there is neither gain nor harm, as a share of the baseline's travel time"""
 
 TIME_METRIC, FLOW_METRIC, FUEL_METRIC = "travel_time", "outflow_veh_per_h", "fuel_ml_per_km"
-POWER_FUEL_METRIC, LAG_METRIC = "fuel_by_power", "time_behind_leader"
-"""the second one is defined behind recorded vehicles alone"""
+POWER_FUEL_METRIC, LAG_METRIC = "fuel_by_power", "time_behind_leader"  # the second: behind recorded vehicles alone
 TOO_SMALL = f"less than {100 * SMALLEST_EFFECT:g} %, which is too small to matter"
 """text for a difference of travel time below `SMALLEST_EFFECT`"""
 
@@ -39,34 +37,22 @@ TOO_SMALL = f"less than {100 * SMALLEST_EFFECT:g} %, which is too small to matte
 class Effect:
     """Effect of CAVs. An `Estimate` is a paired difference to the human baseline, with its CI."""
 
-    travel_time: Estimate
-    """mean travel time of the vehicles of the demand, departure delay included [s]"""
-    flow: Estimate
-    """flow [veh/h]"""
+    travel_time: Estimate  # mean travel time of the vehicles of the demand, departure delay included [s]
+    flow: Estimate  # flow [veh/h]
     fuel: Estimate
     """fuel of all vehicles [ml/km]; behind a recorded vehicle by power, elsewhere by the scenario's emission class"""
-    hard_braking: Estimate
-    """vehicle-steps in which human drivers brake beyond 4.5 m/s2 [per million]"""
-    collisions: float
-    """difference of the number of vehicles in contact, in all episodes together"""
-    failed_episodes: int
-    """number of episodes that did not run"""
-    feasibility: str
-    """verdict on the CAVs themselves: `FEASIBLE`, or the first reason against it"""
-    baseline_travel_time: float
-    """mean travel time of the human baseline on these seeds [s]"""
-    baseline_flow: float
-    """mean flow of the human baseline on these seeds [veh/h]"""
+    hard_braking: Estimate  # vehicle-steps in which human drivers brake beyond 4.5 m/s2 [per million]
+    collisions: float  # difference of the number of vehicles in contact, in all episodes together
+    failed_episodes: int  # number of episodes that did not run
+    feasibility: str  # verdict on the CAVs themselves: `FEASIBLE`, or the first reason against it
+    baseline_travel_time: float  # mean travel time of the human baseline on these seeds [s]
+    baseline_flow: float  # mean flow of the human baseline on these seeds [veh/h]
     delay_reduction: Estimate
     """reduction of the delay, as a share of the delay of the human baseline; NaN if that is unknown or zero"""
-    speed: Estimate
-    """mean speed of all vehicles [m/s]"""
-    early_ends: int = 0
-    """number of episodes that ended early, with or without CAVs; only complete ones are compared"""
-    teleports: int = 0
-    """difference of the number of vehicles that SUMO teleported or removed, in all episodes together"""
-    baseline_teleport_share: float = 0.0
-    """number of teleports and removals in the human baseline, as a share of its vehicles"""
+    speed: Estimate  # mean speed of all vehicles [m/s]
+    early_ends: int = 0  # number of episodes that ended early, with or without CAVs; only complete ones are compared
+    teleports: int = 0  # difference of the number of vehicles that SUMO teleported or removed, in all episodes together
+    baseline_teleport_share: float = 0.0  # teleports and removals in the human baseline, as a share of its vehicles
 
     @property
     def summary(self) -> str:
@@ -104,6 +90,13 @@ class Effect:
         """Whether travel time is shown to be longer, and the difference is not shown to be too small to matter."""
         return self.travel_time.low > 0 and not self.is_too_small
 
+    @property
+    def harm_checks(self) -> tuple[tuple[bool, str], ...]:
+        """For travel time and for flow: whether it is shown to be worse, and the text that says so."""
+        longer = f"travel time is longer than that of the human baseline: {format_seconds(self.travel_time)}"
+        lower = f"flow is lower than that of the human baseline: {format_difference(self.flow)} veh/h"
+        return (self.is_longer, longer), (self.flow.high < 0, lower)
+
 
 def format_seconds(difference: Estimate) -> str:
     """Return a difference of times [s] with its CI as text."""
@@ -121,9 +114,7 @@ def is_measured(rows: Iterable[dict[str, Any]], metric: str) -> bool:
     return any(isfinite(row.get(metric, nan)) for row in rows)
 
 
-def effect_of(
-    rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str, Any]], confidence: float = CONFIDENCE
-) -> Effect:
+def effect_of(rows: EpisodeRows, baseline: EpisodeRows, confidence: float = CONFIDENCE) -> Effect:
     """Return the effect of a driver, from its rows of `measure` and those of the human baseline.
 
     Only seeds that both have are used.
@@ -150,7 +141,7 @@ def effect_of(
     )
 
 
-def _delay_reduction(rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str, Any]], confidence: float) -> Estimate:
+def _delay_reduction(rows: EpisodeRows, baseline: EpisodeRows, confidence: float) -> Estimate:
     pairs = [
         (metric_value(human, TIME_METRIC) - metric_value(row, TIME_METRIC), metric_value(human, "delay"))
         for row, human in pair_rows(rows, baseline)
@@ -161,7 +152,7 @@ def _delay_reduction(rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str
     return estimate(linearized_ratio(saved, delays).tolist(), confidence)
 
 
-def effects_by_driver(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, Effect]:
+def effects_by_driver(rows_by_driver: RowsByDriver) -> dict[str, Effect]:
     """Return the effect of each driver compared with the human baseline; empty without a baseline."""
     baseline = rows_by_driver.get("human", [])
     others = ((label, rows) for label, rows in rows_by_driver.items() if label != "human")
@@ -170,11 +161,4 @@ def effects_by_driver(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[s
 
 def describe_harm(effect: Effect) -> str:
     """Return whether travel time or flow is shown to be worse, as text; empty if neither is."""
-    return "; ".join(reason for is_worse, reason in harm_checks(effect) if is_worse)
-
-
-def harm_checks(effect: Effect) -> tuple[tuple[bool, str], ...]:
-    """Return for travel time and for flow: whether it is shown to be worse, and the text that says so."""
-    longer = f"travel time is longer than that of the human baseline: {format_seconds(effect.travel_time)}"
-    lower = f"flow is lower than that of the human baseline: {format_difference(effect.flow)} veh/h"
-    return (effect.is_longer, longer), (effect.flow.high < 0, lower)
+    return "; ".join(reason for is_worse, reason in effect.harm_checks if is_worse)

@@ -6,26 +6,20 @@ from typing import Any
 
 from unjam.text import format_count
 
-MIN_TIME_GAP_FRACTION = 0.9
-"""minimum time gap in every step, as a fraction of the required time gap"""
-DEFAULT_REQUIRED_TIME_GAP = 1.0
-"""required time gap on roads that do not define one [s]"""
-MIN_TIME_GAP_WITH_LANES = 0.8
-"""minimum time gap in every step on roads with lanes [s]; the recovery after cut-ins is excluded"""
+MIN_TIME_GAP_FRACTION = 0.9  # minimum time gap in every step, as a fraction of the required time gap
+DEFAULT_REQUIRED_TIME_GAP = 1.0  # required time gap on roads that do not define one [s]
+MIN_TIME_GAP_WITH_LANES = 0.8  # minimum time gap in all steps on roads with lanes [s], without recovery after cut-ins
 MAX_SHORT_TIME_GAP_SHARE = 1e-3
 """maximum share of the time with a time gap below the required one, on roads with lanes; the recovery is excluded"""
-MAX_CUT_IN_BRAKING = 9.0
-"""maximum braking after a cut-in [m/s2]: about the limit on dry asphalt"""
-MIN_FEASIBLE_TTC = 1.0
-"""minimum time to collision [s]"""
-MAX_FEASIBLE_BRAKING = 6.0
-"""maximum braking [m/s2]"""
-TOLERANCE = 1e-6
-"""tolerance of these limits for rounding errors"""
+MAX_CUT_IN_BRAKING = 9.0  # maximum braking after a cut-in [m/s2]: about the limit on dry asphalt
+MIN_FEASIBLE_TTC = 1.0  # minimum time to collision [s]
+MAX_FEASIBLE_BRAKING = 6.0  # maximum braking [m/s2]
+TOLERANCE = 1e-6  # tolerance of these limits for rounding errors
 
+EpisodeRows = Sequence[dict[str, Any]]  # a row of metrics for each episode, failed ones included
+RowsByDriver = dict[str, list[dict[str, Any]]]
 FEASIBLE = "feasible"
-HARD_BRAKING_METRIC = "human_braking_beyond_4_5"
-"""metric of human drivers whose value must not exceed that of the human baseline"""
+HARD_BRAKING_METRIC = "human_braking_beyond_4_5"  # must not exceed that of the human baseline
 
 
 def feasibility(row: dict[str, Any], baseline_braking: float | None = None) -> str:
@@ -46,6 +40,7 @@ def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tup
     min_time_gap = MIN_TIME_GAP_WITH_LANES if has_lanes else MIN_TIME_GAP_FRACTION * required
     short, cut_in = (row[name] if has_lanes else 0.0 for name in ("share_short_time_gap", "cut_in_max_braking"))
     baseline = "unknown, -d human measures it" if baseline_braking is None else _rate_text(baseline_braking)
+    rate = f"{_rate_text(human_braking)} times in a million vehicle-steps (without CAVs: {baseline})"
     collided, contacts, braking = row["status"] == "collision", float(row.get("contacts", 0)), row["cav_max_braking"]
     checks = (  # value, largest allowed value, reason
         (collided * (1.0 + row["collisions"]), 0.0, f"{format_count(row['collisions'], 'vehicle')} in contact"),
@@ -56,12 +51,7 @@ def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tup
         (-row["cav_min_ttc"], TOLERANCE - MIN_FEASIBLE_TTC, f"{row['cav_min_ttc']:.2f} s to a collision"),
         (braking, TOLERANCE + MAX_FEASIBLE_BRAKING, f"brakes with {braking:.1f} m/s2"),
         (row["override_share"], 0.0, f"the simulator overrides {100 * row['override_share']:.2g} % of its commands"),
-        (
-            human_braking,
-            baseline_braking or 0.0,
-            f"human drivers brake beyond 4.5 m/s2 {_rate_text(human_braking)} times in a million vehicle-steps "
-            f"(without CAVs: {baseline})",
-        ),
+        (human_braking, baseline_braking or 0.0, f"human drivers brake beyond 4.5 m/s2 {rate}"),
     )
     return [(number, value, reason) for number, (value, limit, reason) in enumerate(checks) if value > limit]
 
@@ -71,20 +61,19 @@ def _rate_text(rate: float) -> str:
     return f"{rate:,.0f}" if rate >= 100.0 else f"{rate:.3g}"
 
 
-def feasibility_by_driver(rows_by_driver: dict[str, list[dict[str, Any]]]) -> dict[str, str]:
+def feasibility_by_driver(rows_by_driver: RowsByDriver) -> dict[str, str]:
     """Return the verdict on each driver of a road; that of the human baseline is empty."""
-    return {
-        label: overall_feasibility(rows, baseline_rows(label, rows_by_driver)) for label, rows in rows_by_driver.items()
-    }
+    baselines = {label: baseline_rows(label, rows_by_driver) for label in rows_by_driver}
+    return {label: overall_feasibility(rows, baselines[label]) for label, rows in rows_by_driver.items()}
 
 
-def baseline_rows(label: str, rows_by_driver: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+def baseline_rows(label: str, rows_by_driver: RowsByDriver) -> list[dict[str, Any]]:
     """Return the rows of the human baseline for a driver; in a comparison of results, those of the same result."""
     result, _, _ = label.rpartition(": ")
     return rows_by_driver.get(f"{result}: human", rows_by_driver.get("human", []))
 
 
-def overall_feasibility(rows: Sequence[dict[str, Any]], baseline: Sequence[dict[str, Any]] = ()) -> str:
+def overall_feasibility(rows: EpisodeRows, baseline: EpisodeRows = ()) -> str:
     """Return one verdict on all episodes of a driver, with the number of episodes that violate a limit.
 
     The reason is the first limit that any episode violates, with the value of the worst episode. `baseline` has the

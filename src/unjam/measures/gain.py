@@ -9,18 +9,14 @@ from typing import Any
 import numpy as np
 
 from unjam.measures.effect import FLOW_METRIC, MAX_FLOW_LOSS
-from unjam.measures.feasibility import FEASIBLE, overall_feasibility
+from unjam.measures.feasibility import FEASIBLE, EpisodeRows, overall_feasibility
 from unjam.measures.statistics import Estimate, estimate, linearized_ratio, paired_difference
 from unjam.worlds.record import Floats
 
-MIN_GAIN, MAX_GAIN = -1.0, 1.5
-"""range to which gains are clipped"""
+MIN_GAIN, MAX_GAIN = -1.0, 1.5  # range to which gains are clipped
 MIN_REFERENCE_GAIN = 0.03
 """smallest improvement by the reference, as a share of the baseline's performance; below it there is nothing to gain"""
-MEAN_GAIN = "mean gain"
-"""name of the objective of tuning on several roads"""
-
-EpisodeRows = Sequence[dict[str, Any]]
+MEAN_GAIN = "mean gain"  # name of the objective of tuning on several roads
 
 
 def performance(row: dict[str, Any]) -> float:
@@ -73,9 +69,7 @@ def normalized_gain(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequenc
     """
     result = estimate(normalized_differences(rows, baseline, reference).tolist())
     limit = 0.0 if is_gain_capped(rows, baseline, reference) else MAX_GAIN
-    mean, low, high = (
-        min(float(np.clip(each, MIN_GAIN, MAX_GAIN)), limit) for each in (result.mean, result.low, result.high)
-    )
+    mean, low, high = (float(np.clip(each, MIN_GAIN, limit)) for each in (result.mean, result.low, result.high))
     return Estimate(mean, low, high, result.count)
 
 

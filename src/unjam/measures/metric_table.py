@@ -2,12 +2,12 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from unjam.drivers.registry import DRIVERS
-from unjam.measures.feasibility import feasibility_by_driver
+from unjam.measures.feasibility import RowsByDriver, feasibility_by_driver
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import (
     Estimate,
@@ -21,15 +21,11 @@ from unjam.measures.statistics import (
 )
 
 Value = TypeVar("Value")
-RowsByDriver = dict[str, list[dict[str, Any]]]
-"""rows of metrics by driver: one row for each episode, failed ones included"""
-HUMAN_LABEL = "human"
-"""label of the human baseline"""
+HUMAN_LABEL = "human"  # label of the human baseline
 CAV_METRICS = {name for name, metric in METRICS.items() if metric.label.startswith("CAV")} | {
     *("min_ttc", "min_time_gap", "max_jerk", "filter_override_share", "override_share", "yield_share"),
     *("shield_override_share", "shield_max_braking"),
-}
-"""metrics of CAVs; in the human baseline, those of the human drivers in their places"""
+}  # metrics of CAVs; in the human baseline, those of the human drivers in their places
 
 
 @dataclass(frozen=True)
@@ -37,8 +33,7 @@ class TableCell:
     """A number in a table, as text."""
 
     mean: str
-    interval: str = ""
-    """CI, or the range without a CI; with the number of episodes if some are left out"""
+    interval: str = ""  # CI, or the range without a CI; with the number of episodes if some are left out
 
     def __str__(self) -> str:
         return f"{self.mean} {self.interval}".strip()
@@ -73,9 +68,8 @@ def choose_baseline(rows_by_driver: RowsByDriver, requested: str = "") -> str:
         return requested
     if len(rows_by_driver) < 2 or HUMAN_LABEL in rows_by_driver:
         return HUMAN_LABEL if len(rows_by_driver) > 1 else ""
-    returns = {
-        label: metric_estimate(rows, "return").mean for label, rows in rows_by_driver.items() if driver_rank(label) == 1
-    }
+    experts = {label: rows for label, rows in rows_by_driver.items() if driver_rank(label) == 1}
+    returns = {label: metric_estimate(rows, "return").mean for label, rows in experts.items()}
     return max(returns, key=lambda label: np.nan_to_num(returns[label], nan=-np.inf), default="")
 
 
@@ -90,7 +84,7 @@ def metric_table(
     has_cavs = any(map(driver_rank, rows_by_driver))
     compared = {label: rows for label, rows in rows_by_driver.items() if baseline and label != baseline}
     headings = [*rows_by_driver, *(f"{label} − {baseline}" for label in compared)]
-    pairs = {label: len(pair_rows(rows, rows_by_driver[baseline])) for label, rows in compared.items()}
+    reference = rows_by_driver[baseline] if compared else []
     table = list[TableRow]()
     if has_cavs:
         verdicts = [TableCell(verdict or "–") for verdict in feasibility_by_driver(rows_by_driver).values()]
@@ -98,11 +92,9 @@ def metric_table(
         table.append(TableRow("feasible", "", description, [*verdicts, *(TableCell("") for _ in compared)]))
     if compared:
         description = f"Share of seeds with a larger return than {baseline}; a tie counts half. Wilson's interval."
-        improvements = [
-            probability_of_improvement(paired_differences([rows], rows_by_driver[baseline], "return"))
-            for rows in compared.values()
-        ]
-        cells = [*(TableCell("") for _ in rows_by_driver), *(estimate_cell(each, 2) for each in improvements)]
+        differences = (paired_differences([rows], reference, "return") for rows in compared.values())
+        improvements = (estimate_cell(probability_of_improvement(each), 2) for each in differences)
+        cells = [*(TableCell("") for _ in rows_by_driver), *improvements]
         table.append(TableRow("probability of improvement", "in return", description, cells))
     for name in names:
         metric = METRICS[name]
@@ -112,10 +104,9 @@ def metric_table(
         if not any(each.count for each, _ in estimates):
             continue  # it is not defined on this road
         cells = [estimate_cell(each, metric.digits, episodes) for each, episodes in estimates]
-        cells += [
-            estimate_cell(paired_difference(rows, rows_by_driver[baseline], name), metric.digits, pairs[label], "+")
-            for label, rows in compared.items()
-        ]
+        for rows in compared.values():
+            difference, pairs = paired_difference(rows, reference, name), len(pair_rows(rows, reference))
+            cells.append(estimate_cell(difference, metric.digits, pairs, "+"))
         table.append(TableRow(metric.label, metric.unit, " ".join((metric.function.__doc__ or "").split()), cells))
     return headings, table
 

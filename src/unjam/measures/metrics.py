@@ -2,24 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from math import inf, isfinite, nan
 from typing import Any, Literal
 
 import numpy as np
 
-from unjam.measures.averages import mean_of_present, mean_over_cavs, per_kilometer, per_step
+from unjam.measures import platoon_metrics as platoon
+from unjam.measures.averages import mean_of_present, mean_over_cavs, per_step, row_chunks
 from unjam.measures.feasibility import feasibility
-from unjam.measures.platoon_metrics import (
-    amplification,
-    cav_fuel_by_power,
-    cav_gap_95,
-    cav_max_gap,
-    cav_mean_gap,
-    fuel_by_power,
-    human_fuel_by_power,
-    period_amplification,
-    time_behind_leader,
-)
 from unjam.scenarios.scenario import sumo_seed
 from unjam.worlds.audit import BRAKING_THRESHOLDS, OVERRIDE_TOLERANCE, BrakingStatistics
 from unjam.worlds.record import VEHICLE_GROUPS, Episode, Floats
@@ -27,16 +18,11 @@ from unjam.worlds.reward import episode_reward_terms, eq16_reward
 
 STEADY_STATE_STEPS = 1000
 """number of control steps at the end of an episode that are its steady state; in a shorter episode the second half"""
-STANDING_SPEED = 0.1
-"""speed below which a vehicle counts as standing [m/s]: SUMO's threshold of a halting vehicle"""
-MAX_CALM_SPEED_STD = 0.3
-"""standard deviation of speed across vehicles below which there is no wave [m/s]"""
-MIN_CALM_SECONDS = 60.0
-"""time without a wave after which the wave counts as dissolved [s]"""
-GASOLINE_DENSITY = 742.0
-"""density of gasoline in SUMO's PollutantsInterface [mg/ml]"""
-SHARE_BOUNDS, UNBOUNDED = (0.0, 1.0), (-inf, inf)
-"""bounds of metrics that are shares, and of metrics that can be negative"""
+STANDING_SPEED = 0.1  # speed below which a vehicle counts as standing [m/s]: SUMO's threshold of a halting vehicle
+MAX_CALM_SPEED_STD = 0.3  # standard deviation of speed across vehicles below which there is no wave [m/s]
+MIN_CALM_SECONDS = 60.0  # time without a wave after which the wave counts as dissolved [s]
+GASOLINE_DENSITY = 742.0  # density of gasoline in SUMO's PollutantsInterface [mg/ml]
+SHARE_BOUNDS, UNBOUNDED = (0.0, 1.0), (-inf, inf)  # bounds of shares, and of metrics that can be negative
 PEAK_END_SECONDS = 600.0
 """duration at the end of the demand peak in which flow is counted [s]; there it is the capacity, not the demand"""
 
@@ -192,7 +178,8 @@ def fuel_ml_per_km(episode: Episode) -> float:
     """
     if episode.fuel.size == 0:
         return nan
-    return per_kilometer(episode, float(np.nansum(episode.fuel)) / GASOLINE_DENSITY, episode.speeds)
+    distance = sum(float(np.nansum(chunk)) for chunk in row_chunks(episode.speeds[1:]))  # [m/s], over all steps
+    return float(np.nansum(episode.fuel)) / GASOLINE_DENSITY / (distance / 1000.0) if distance else nan
 
 
 def outflow_veh_per_h(episode: Episode) -> float:
@@ -331,14 +318,11 @@ def travel_time_metric(group: str) -> EpisodeFunction:
 class Metric:
     """A metric, and how tables show it."""
 
-    function: EpisodeFunction
-    """computes the metric; its docstring is the description in tables"""
+    function: EpisodeFunction  # computes the metric; its docstring is the description in tables
     label: str
     unit: str
-    digits: int = 2
-    """number of decimal places"""
-    bounds: tuple[float, float] = (0.0, inf)
-    """smallest and largest possible value"""
+    digits: int = 2  # number of decimal places
+    bounds: tuple[float, float] = (0.0, inf)  # smallest and largest possible value
 
 
 def _braking_metrics(group: Literal["CAV", "human"]) -> dict[str, Metric]:
@@ -365,6 +349,8 @@ def _braking_metrics(group: Literal["CAV", "human"]) -> dict[str, Metric]:
     }
 
 
+_share = partial(Metric, unit="", digits=4, bounds=SHARE_BOUNDS)
+
 METRICS: dict[str, Metric] = {
     "mean_speed": Metric(mean_speed, "mean speed", "m/s"),
     "mean_speed_step_average": Metric(mean_speed_step_average, "mean speed, average over steps", "m/s"),
@@ -385,9 +371,7 @@ METRICS: dict[str, Metric] = {
     "min_ttc": Metric(min_ttc, "minimum time to collision", "s"),
     "min_time_gap": Metric(min_time_gap, "minimum time gap", "s"),
     "cav_min_ttc": Metric(cav_min_ttc, "CAV's minimum time to collision", "s"),
-    "share_short_time_gap": Metric(
-        share_short_time_gap, "CAV's share of time with a time gap below 1 s", "", 4, SHARE_BOUNDS
-    ),
+    "share_short_time_gap": _share(share_short_time_gap, "CAV's share of time with a time gap below 1 s"),
     "max_drac": Metric(max_drac, "CAV's maximum DRAC", "m/s2"),
     "max_jerk": Metric(max_jerk, "CAV's maximum jerk", "m/s3", 1),
     "cav_max_braking": Metric(cav_max_braking, "CAV's maximum braking", "m/s2"),
@@ -395,28 +379,24 @@ METRICS: dict[str, Metric] = {
     **_braking_metrics("CAV"),
     "human_max_braking": Metric(human_max_braking, "human drivers' maximum braking", "m/s2"),
     **_braking_metrics("human"),
-    "filter_override_share": Metric(
-        filter_override_share, "control steps in which the safety filter braked", "", 4, SHARE_BOUNDS
-    ),
-    "override_share": Metric(
-        override_share, "commands overridden by the simulator in car following", "", 4, SHARE_BOUNDS
-    ),
-    "yield_share": Metric(yield_share, "commands overridden by the simulator at a crossing", "", 4, SHARE_BOUNDS),
+    "filter_override_share": _share(filter_override_share, "control steps in which the safety filter braked"),
+    "override_share": _share(override_share, "commands overridden by the simulator in car following"),
+    "yield_share": _share(yield_share, "commands overridden by the simulator at a crossing"),
     "collisions": Metric(collisions, "vehicles in collisions", "", 0),
-    "shield_override_share": Metric(shield_override_share, "commands overridden by the simulator", "", 4, SHARE_BOUNDS),
+    "shield_override_share": _share(shield_override_share, "commands overridden by the simulator"),
     "shield_max_braking": Metric(shield_max_braking, "maximum braking added by SUMO", "m/s2"),
     "fuel_ml_per_km": Metric(fuel_ml_per_km, "fuel by emission model", "ml/km", 1),
-    "fuel_by_power": Metric(fuel_by_power, "fuel by power", "ml/km", 1),
-    "cav_fuel_by_power": Metric(cav_fuel_by_power, "CAV's fuel by power", "ml/km", 1),
-    "human_fuel_by_power": Metric(human_fuel_by_power, "human drivers' fuel by power", "ml/km", 1),
-    "cav_mean_gap": Metric(cav_mean_gap, "CAV's mean gap", "m", 1),
-    "cav_gap_95": Metric(cav_gap_95, "CAV's gap, 95 %", "m", 1),
-    "cav_max_gap": Metric(cav_max_gap, "CAV's largest gap", "m", 1),
-    "time_behind_leader": Metric(time_behind_leader, "time behind the recorded vehicle", "s", 1),
-    "amplification": Metric(amplification, "amplification of speed std", "", 2),
-    "amplification_long": Metric(period_amplification(inf, 60.0), "amplification, above 60 s", "", 2),
-    "amplification_medium": Metric(period_amplification(60.0, 20.0), "amplification, 20 to 60 s", "", 2),
-    "amplification_short": Metric(period_amplification(20.0, 4.0), "amplification, 4 to 20 s", "", 2),
+    "fuel_by_power": Metric(platoon.fuel_by_power, "fuel by power", "ml/km", 1),
+    "cav_fuel_by_power": Metric(platoon.cav_fuel_by_power, "CAV's fuel by power", "ml/km", 1),
+    "human_fuel_by_power": Metric(platoon.human_fuel_by_power, "human drivers' fuel by power", "ml/km", 1),
+    "cav_mean_gap": Metric(platoon.cav_mean_gap, "CAV's mean gap", "m", 1),
+    "cav_gap_95": Metric(platoon.cav_gap_95, "CAV's gap, 95 %", "m", 1),
+    "cav_max_gap": Metric(platoon.cav_max_gap, "CAV's largest gap", "m", 1),
+    "time_behind_leader": Metric(platoon.time_behind_leader, "time behind the recorded vehicle", "s", 1),
+    "amplification": Metric(platoon.amplification, "amplification of speed std", "", 2),
+    "amplification_long": Metric(platoon.period_amplification(inf, 60.0), "amplification, above 60 s", "", 2),
+    "amplification_medium": Metric(platoon.period_amplification(60.0, 20.0), "amplification, 20 to 60 s", "", 2),
+    "amplification_short": Metric(platoon.period_amplification(20.0, 4.0), "amplification, 4 to 20 s", "", 2),
     "outflow_veh_per_h": Metric(outflow_veh_per_h, "flow", "veh/h", 0),
     "travel_time": Metric(mean_travel_time, "travel time, departure delay included", "s", 1),
     **{

@@ -2,85 +2,64 @@
 
 import re
 from collections import Counter
-from collections.abc import Sequence
-from typing import Any
 
 from unjam.errors import InputError
-from unjam.measures.metric_table import RowsByDriver
+from unjam.measures.feasibility import EpisodeRows, RowsByDriver
 from unjam.measures.statistics import count_teleports, has_ended_early
 from unjam.text import format_count
 
-MAX_EARLY_END_SHARE = 0.05
-"""maximum share of the baseline's episodes that end early; with more of them comparisons would mislead"""
-MAX_WARNING_KINDS = 10
-"""kinds of SUMO's warnings that are shown, the most frequent first"""
-MAX_BACKLOG_SHARE = 0.05
-"""share of the vehicles in the insertion backlog at the end, above which there is a note"""
+MAX_EARLY_END_SHARE = 0.05  # share of the baseline's episodes that may end early; with more, comparisons would mislead
+MAX_WARNING_KINDS = 10  # kinds of SUMO's warnings that are shown, the most frequent first
+MAX_BACKLOG_SHARE = 0.05  # share of the vehicles in the insertion backlog at the end, above which there is a note
 MAX_UNFINISHED_SHARE, MAX_DELAY_SHARE = 0.05, 1 / 3
 """share of the vehicles that have not arrived at the end, above which there is a note, and share of delay in their
 travel time, above which traffic is still congested"""
 LOST_DEMAND_PATTERN = re.compile(
     "sorted by departure time|no (valid )?route|discard|removing vehicle|not reachable|inserted", re.IGNORECASE
-)
-"""pattern of SUMO's warnings about missing demand, which are listed first"""
+)  # pattern of SUMO's warnings about missing demand, which are listed first
 
 
 def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return all notes on the episodes of several drivers, the most serious first."""
     lost, others = warning_notes(rows_by_driver)
-    kinds = (
-        early_end_notes,
-        _backlog_notes,
-        _unfinished_trip_notes,
-        _entrance_notes,
-        teleport_notes,
-        _repeated_drive_notes,
-    )
-    notes = (note(rows_by_driver) for note in kinds)
+    traffic = early_end_notes, _backlog_notes, _unfinished_trip_notes, _entrance_notes
+    notes = (note(rows_by_driver) for note in (*traffic, teleport_notes, _repeated_drive_notes))
     return [*lost, *(each for group in notes for each in group), *others]
 
 
-def count_early_ends(rows: Sequence[dict[str, Any]]) -> dict[str, int]:
+def count_early_ends(rows: EpisodeRows) -> dict[str, int]:
     """Return the number of episodes that ended early, by reason."""
     return dict(Counter(row.get("reason") or row["status"] for row in rows if has_ended_early(row)))
 
 
 def early_end_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note for each driver with episodes that ended early, with the reasons."""
-    return [
-        f"{label}: {_early_end_text(rows)}; means are over complete episodes only"
-        for label, rows in rows_by_driver.items()
-        if count_early_ends(rows)
-    ]
+    early = ((label, rows) for label, rows in rows_by_driver.items() if count_early_ends(rows))
+    return [f"{label}: {_early_end_text(rows)}; means are over complete episodes only" for label, rows in early]
 
 
-def _early_end_text(rows: Sequence[dict[str, Any]]) -> str:
+def _early_end_text(rows: EpisodeRows) -> str:
     counts = count_early_ends(rows)
     reasons = ", ".join(f"{reason} ({count})" if len(counts) > 1 else reason for reason, count in counts.items())
     return f"{sum(counts.values())} of {format_count(len(rows), 'episode')} ended early: {reasons}"
 
 
-def check_baseline(rows: Sequence[dict[str, Any]], planned_episodes: int = 0) -> None:
+def check_baseline(rows: EpisodeRows, planned_episodes: int = 0) -> None:
     """Raise `InputError` if so many episodes of the human baseline ended early that comparisons would mislead.
 
     `planned_episodes` is their planned number, if it is larger than that of the `rows` so far.
     """
     if sum(count_early_ends(rows).values()) > MAX_EARLY_END_SHARE * max(len(rows), planned_episodes):
-        raise InputError(
-            f"human: {_early_end_text(rows)}; allowed: {100 * MAX_EARLY_END_SHARE:g} %, because CAVs are compared with "
-            "the baseline"
-        )
+        reason = "because CAVs are compared with the baseline"
+        raise InputError(f"human: {_early_end_text(rows)}; allowed: {100 * MAX_EARLY_END_SHARE:g} %, {reason}")
 
 
 def teleport_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note for each driver with teleports, which do not exist in real traffic."""
     counts = {label: count_teleports(rows) for label, rows in rows_by_driver.items()}
-    return [
-        f"{label}: SUMO teleported or removed {format_count(count, 'vehicle')}, which had waited longer than "
-        "time-to-teleport or collided"
-        for label, count in counts.items()
-        if count
-    ]
+    found = {label: format_count(count, "vehicle") for label, count in counts.items() if count}
+    reason = "which had waited longer than time-to-teleport or collided"
+    return [f"{label}: SUMO teleported or removed {vehicles}, {reason}" for label, vehicles in found.items()]
 
 
 def _repeated_drive_notes(rows_by_driver: RowsByDriver) -> list[str]:

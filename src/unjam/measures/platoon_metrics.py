@@ -10,8 +10,7 @@ from unjam.measures.averages import mean_over_cavs, row_chunks
 from unjam.physics.fuel import fuel_rate
 from unjam.worlds.record import VEHICLE_GROUPS, Episode, Floats
 
-MIN_WAVE_STD = 0.05
-"""standard deviation of the recorded speed below which there are no waves that could be amplified [m/s]"""
+MIN_WAVE_STD = 0.05  # std of the recorded speed below which there are no waves that could be amplified [m/s]
 
 
 def fuel_by_power(episode: Episode) -> float:
@@ -74,9 +73,8 @@ def time_behind_leader(episode: Episode) -> float:
     """
     if not episode.has_recorded_leader:
         return nan
-    passed = float(
-        np.interp(episode.positions[-1, 0], episode.replayed_motion[:, 0, 0], np.arange(len(episode.speeds)))
-    )
+    leader = episode.replayed_motion[:, 0, 0]
+    passed = float(np.interp(episode.positions[-1, 0], leader, np.arange(len(episode.speeds))))
     return (episode.control_steps - passed) * episode.control_step
 
 

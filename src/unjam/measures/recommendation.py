@@ -9,73 +9,53 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, inf, isfinite
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from unjam.measures.effect import (
-    MAX_FLOW_LOSS,
-    TIME_METRIC,
-    TOO_SMALL,
-    Effect,
-    format_seconds,
-    harm_checks,
-    is_too_small,
-)
-from unjam.measures.feasibility import FEASIBLE
+from unjam.measures.effect import MAX_FLOW_LOSS, TIME_METRIC, TOO_SMALL, Effect, format_seconds, is_too_small
+from unjam.measures.feasibility import FEASIBLE, EpisodeRows
 from unjam.measures.statistics import Estimate, format_difference, format_percent, metric_estimate
 from unjam.text import format_count
 
 MAX_TELEPORT_SHARE = 0.01
 """share of the baseline's vehicles that SUMO may teleport or remove; with more of them travel times mean nothing"""
-MAX_CAV_SLOWDOWN = 0.1
-"""share by which CAVs may be slower than with their ACC alone: a controller must not sacrifice them"""
+MAX_CAV_SLOWDOWN = 0.1  # share by which CAVs may be slower than with ACC alone: a controller must not sacrifice them
 NEGLIGIBLE_DELAY_SHARE = 0.05
 """delay of the human baseline up to which there is nothing to gain, as a share of the free-flow travel time"""
-MIN_VERDICT_SEEDS = 10
-"""minimum number of seeds for a recommendation; with fewer the CI is not reliable"""
-RECOMMENDED, NOT_RECOMMENDED, UNDECIDED = "recommended", "not recommended", "not yet known"
-"""verdicts on a controller, and on a road"""
+MIN_VERDICT_SEEDS = 10  # minimum number of seeds for a recommendation; with fewer the CI is not reliable
+RECOMMENDED, NOT_RECOMMENDED, UNDECIDED = "recommended", "not recommended", "not yet known"  # on a controller or road
 ACC_BASELINE = "ACC vehicles alone"
 
 
 def rejection_reasons(effect: Effect) -> list[str]:
     """Return all reasons against a recommendation."""
-    time, max_loss = format_seconds(effect.travel_time), MAX_FLOW_LOSS * effect.baseline_flow
+    time, change, flow = effect.travel_time, format_seconds(effect.travel_time), format_difference(effect.flow)
+    is_known = time.low > 0 or time.high < 0 or effect.is_too_small
+    keeps_flow = effect.flow.high < 0 or effect.flow.low >= -MAX_FLOW_LOSS * effect.baseline_flow
+    teleported = f"SUMO teleports or removes {100 * effect.baseline_teleport_share:.1f} % of the vehicles"
+    teleports, contacts = (format_count(each, "more vehicle") for each in (effect.teleports, round(effect.collisions)))
+    braking = f"{format_difference(effect.hard_braking)} times in a million vehicle-steps (the sign of the mean counts)"
     # Too few seeds give NaN, with which every comparison is false: then a check fails.
     checks = (
         (
-            effect.travel_time.count >= MIN_VERDICT_SEEDS or effect.is_infeasible,
-            f"{format_count(effect.travel_time.count, 'test seed')}, where {MIN_VERDICT_SEEDS} are needed",
+            time.count >= MIN_VERDICT_SEEDS or effect.is_infeasible,
+            f"{format_count(time.count, 'test seed')}, where {MIN_VERDICT_SEEDS} are needed",
         ),
         (not effect.failed_episodes, f"{format_count(effect.failed_episodes, 'episode')} failed"),
         (not effect.early_ends, f"{format_count(effect.early_ends, 'episode')} ended early"),
         (
             effect.baseline_teleport_share <= MAX_TELEPORT_SHARE,
-            f"nothing can be concluded: in the human baseline SUMO teleports or removes "
-            f"{100 * effect.baseline_teleport_share:.1f} % of the vehicles (limit {100 * MAX_TELEPORT_SHARE:g} %)",
+            f"nothing can be concluded: in the human baseline {teleported} (limit {100 * MAX_TELEPORT_SHARE:g} %)",
         ),
-        (
-            effect.teleports <= 0,
-            f"{format_count(effect.teleports, 'more vehicle')} teleported or removed than without CAVs",
-        ),
-        *((not is_worse, reason) for is_worse, reason in harm_checks(effect)),
-        (not effect.is_too_small, f"travel time differs from that of the human baseline by {TOO_SMALL}: {time}"),
-        (
-            effect.travel_time.low > 0 or effect.travel_time.high < 0 or effect.is_too_small,
-            f"travel time is not shown to be shorter than that of the human baseline: {time}",
-        ),
-        (
-            effect.flow.high < 0 or effect.flow.low >= -max_loss,
-            f"flow may be lower by more than {100 * MAX_FLOW_LOSS:g} %: {format_difference(effect.flow)} veh/h",
-        ),
+        (effect.teleports <= 0, f"{teleports} teleported or removed than without CAVs"),
+        *((not is_worse, reason) for is_worse, reason in effect.harm_checks),
+        (not effect.is_too_small, f"travel time differs from that of the human baseline by {TOO_SMALL}: {change}"),
+        (is_known, f"travel time is not shown to be shorter than that of the human baseline: {change}"),
+        (keeps_flow, f"flow may be lower by more than {100 * MAX_FLOW_LOSS:g} %: {flow} veh/h"),
         (effect.feasibility == FEASIBLE, f"infeasible: {effect.feasibility or 'no CAV drove'}"),
-        (
-            effect.collisions <= 0,
-            f"{format_count(round(effect.collisions), 'more vehicle')} in contact than without CAVs",
-        ),
+        (effect.collisions <= 0, f"{contacts} in contact than without CAVs"),
         (
             effect.hard_braking.mean <= 0,
-            "human drivers brake beyond 4.5 m/s² more often than in the human baseline: "
-            f"{format_difference(effect.hard_braking)} times in a million vehicle-steps (the sign of the mean counts)",
+            f"human drivers brake beyond 4.5 m/s² more often than in the human baseline: {braking}",
         ),
     )
     return [reason for is_fine, reason in checks if not is_fine]
@@ -102,8 +82,7 @@ class AccResult:
     property_effect: Estimate | None = None
     """difference of travel time to ACC vehicles with all properties of the vehicles that they replace [s]; None: these
     ACC vehicles have the same properties"""
-    missing_seeds: float = 0.0
-    """number of further test seeds with which the interval is narrow enough"""
+    missing_seeds: float = 0.0  # number of further test seeds with which the interval is narrow enough
 
     @property
     def has_enough_seeds(self) -> bool:
@@ -125,11 +104,8 @@ class AccResult:
             change = f"is not shown to differ ({seeds}, where {MIN_VERDICT_SEEDS} are needed)"
         elif self.effect.is_too_small:
             change = f"differs by {TOO_SMALL},"
-        text = (
-            f"{ACC_BASELINE} at a penetration rate of {format_percent(self.penetration_rate)}: travel time "
-            f"{change} compared with the human baseline. "
-            f"Differences: {self.effect.summary}."
-        )
+        label = f"{ACC_BASELINE} at a penetration rate of {format_percent(self.penetration_rate)}"
+        text = f"{label}: travel time {change} compared with the human baseline. Differences: {self.effect.summary}."
         if self.effect.feasibility != FEASIBLE:
             text += f" They are infeasible themselves: {self.effect.feasibility or 'no CAV drove'}."
         if self.property_effect is None:
@@ -144,12 +120,9 @@ class ControllerResult:
     penetration_rate: float
     driver: str
     effect: Effect
-    difference_to_acc: Estimate
-    """difference of travel time to ACC vehicles at the same penetration rate [s]"""
-    flow_difference_to_acc: Estimate
-    """difference of flow to the same ACC vehicles [veh/h]"""
-    missing_seeds: float = 0.0
-    """number of further test seeds that a verdict needs"""
+    difference_to_acc: Estimate  # difference of travel time to ACC vehicles at the same penetration rate [s]
+    flow_difference_to_acc: Estimate  # difference of flow to the same ACC vehicles [veh/h]
+    missing_seeds: float = 0.0  # number of further test seeds that a verdict needs
     cav_speed_change: Estimate | None = None
     """relative change of the CAVs' own mean speed, compared with the same ACC vehicles; None: unknown"""
 
@@ -227,11 +200,10 @@ class RoadVerdict(NamedTuple):
     """The answer of an assessment."""
 
     verdict: str
-    sentence: str
-    """the answer in one sentence"""
+    sentence: str  # the answer in one sentence
 
 
-def road_verdict(results: Sequence[ControllerResult], baseline: Sequence[dict[str, Any]] = ()) -> RoadVerdict:
+def road_verdict(results: Sequence[ControllerResult], baseline: EpisodeRows = ()) -> RoadVerdict:
     """Return the answer of an assessment: the recommended controller, or why there is none.
 
     `baseline` has the rows of the human baseline, which show whether traffic is nearly free-flowing.
@@ -241,20 +213,16 @@ def road_verdict(results: Sequence[ControllerResult], baseline: Sequence[dict[st
         time, to_acc = best.effect.travel_time.mean, best.difference_to_acc.mean
         share = 100 * abs(best.effect.relative_travel_time)
         gain = f"{-time:.1f} s ({share:.1f} %) shorter than in human-only traffic"
-        return RoadVerdict(
-            RECOMMENDED,
-            f"Recommended: {best.label}, because travel time is {gain} and {-to_acc:.1f} s shorter than with "
-            f"{ACC_BASELINE}.",
-        )
+        reason = f"travel time is {gain} and {-to_acc:.1f} s shorter than with {ACC_BASELINE}"
+        return RoadVerdict(RECOMMENDED, f"Recommended: {best.label}, because {reason}.")
     travel_time, delay = (metric_estimate(baseline, name).mean for name in (TIME_METRIC, "delay"))
     if (delay_share := delay / (travel_time - delay)) <= NEGLIGIBLE_DELAY_SHARE:
         within = max(1, ceil(100 * delay_share))
         reason = f"there is nothing to gain, because human-only traffic is within {within} % of free flow"
     elif undecided := [each for each in results if each.verdict == UNDECIDED]:
         best, fastest = _quickest(undecided) or undecided[0], ", the fastest so far" if len(undecided) > 1 else ""
-        return RoadVerdict(
-            UNDECIDED, f"Not yet known whether to recommend {best.label}{fastest}: {best.open_question}."
-        )
+        sentence = f"Not yet known whether to recommend {best.label}{fastest}: {best.open_question}."
+        return RoadVerdict(UNDECIDED, sentence)
     elif best := _quickest(results):
         reason = f"no controller passes the rule; the fastest is {best.label}, but {best.reasons[0]}"
     else:

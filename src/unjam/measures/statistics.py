@@ -12,17 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from unjam.measures.feasibility import EpisodeRows
 from unjam.measures.metrics import METRICS, UNBOUNDED
 
 CONFIDENCE = 0.95
-MIN_INTERVAL_VALUES = 3
-"""minimum number of values for a CI; that of two values is thirteen times as wide as their distance"""
+MIN_INTERVAL_VALUES = 3  # minimum number of values for a CI; that of two is thirteen times as wide as their distance
 
 METRICS_DEFINED_AT_EARLY_END = {
     *("collisions", "min_ttc", "min_time_gap", "cav_min_ttc", "max_drac", "max_jerk", "shield_max_braking"),
     *("cav_max_braking", "cut_in_max_braking", "human_max_braking"),
-}
-"""metrics of conflicts, which are also defined for episodes that ended early"""
+}  # metrics of conflicts, which are also defined for episodes that ended early
 RETURN_METRICS = {"return", "return_eq16"}
 """metrics that are also defined for episodes with a collision, because the reward contains it"""
 MIN_VERDICT_TRAININGS = 10
@@ -92,7 +91,7 @@ def display_digits(value: Estimate, digits: int) -> int:
     return digits + 2 if value.mean and not round(value.mean, digits) else digits
 
 
-def count_teleports(rows: Sequence[dict[str, Any]]) -> int:
+def count_teleports(rows: EpisodeRows) -> int:
     """Return the number of vehicles that SUMO teleported or removed in all episodes together."""
     return sum(row.get("teleports", 0) for row in rows)
 
@@ -108,27 +107,23 @@ def metric_value(row: dict[str, Any], name: str) -> float:
     return row[name] if counts or (name in RETURN_METRICS and row["status"] == "collision") else nan
 
 
-def metric_estimate(rows: Sequence[dict[str, Any]], name: str) -> Estimate:
+def metric_estimate(rows: EpisodeRows, name: str) -> Estimate:
     """Return the estimate of a metric over the rows of `measure`."""
     return estimate([metric_value(row, name) for row in rows], bounds=METRICS[name].bounds)
 
 
-def summarize(rows: Sequence[dict[str, Any]]) -> dict[str, Estimate]:
+def summarize(rows: EpisodeRows) -> dict[str, Estimate]:
     """Return the estimate of every metric over the rows of `measure`."""
     return {name: metric_estimate(rows, name) for name in METRICS}
 
 
-def pair_rows(
-    rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]]
-) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+def pair_rows(rows: EpisodeRows, others: EpisodeRows) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """Return the pairs of rows with equal seeds."""
     by_seed = {str(row["seed"]): row for row in others}
     return [(row, by_seed[str(row["seed"])]) for row in rows if str(row["seed"]) in by_seed]
 
 
-def paired_difference(
-    rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]], name: str, confidence: float = CONFIDENCE
-) -> Estimate:
+def paired_difference(rows: EpisodeRows, others: EpisodeRows, name: str, confidence: float = CONFIDENCE) -> Estimate:
     """Return the estimate of the paired difference of a metric between two sets of rows."""
     differences = [metric_value(row, name) - metric_value(other, name) for row, other in pair_rows(rows, others)]
     return estimate(differences, confidence=confidence)
@@ -144,7 +139,7 @@ def linearized_ratio(numerators: Any, denominators: Any) -> Any:
     return ratio + (numerators - ratio * denominators) / np.mean(denominators)
 
 
-def relative_difference(rows: Sequence[dict[str, Any]], others: Sequence[dict[str, Any]], name: str) -> Estimate:
+def relative_difference(rows: EpisodeRows, others: EpisodeRows, name: str) -> Estimate:
     """Return the estimate of the paired difference of a metric, relative to its mean in the other rows.
 
     Only seeds with both values are used, as for the difference itself. It is unknown where all other values are zero.
@@ -229,7 +224,7 @@ def estimate_over_trainings(
     return replace(result, low=nan, high=nan) if is_bimodal(values) else result
 
 
-def paired_differences(runs: Sequence[Sequence[dict[str, Any]]], others: Sequence[dict[str, Any]], name: str) -> Any:
+def paired_differences(runs: Sequence[EpisodeRows], others: EpisodeRows, name: str) -> Any:
     """Return the differences of a metric, shape (trainings, seeds), on the seeds that all have."""
     tables = [{str(row["seed"]): metric_value(row, name) for row in rows} for rows in (others, *runs)]
     seeds = [seed for seed in tables[0] if all(np.isfinite(table.get(seed, nan)) for table in tables)]

@@ -7,8 +7,7 @@ import numpy as np
 from unjam.physics.arrays import Array, clamp_min, namespace, square_root
 from unjam.worlds.reward import Outcome
 
-BLOCK_STEPS = 256
-"""control steps whose metrics `StepMetricMeans` computes together: one by one they take a fifth of `env.step`"""
+BLOCK_STEPS = 256  # control steps that `StepMetricMeans` measures together: one by one they take a fifth of `env.step`
 
 
 def step_metrics(outcome: Outcome) -> dict[str, Array]:

@@ -14,65 +14,44 @@ from unjam.physics.arrays import Floats
 from unjam.scenarios.motorway import Motorway
 from unjam.worlds.record import Episode
 
-MERGING_LENGTH = 300.0
-"""length of a merging section that counts as the bottleneck: of a longer one the downstream end [m]"""
-INTERVAL = 60.0
-"""time over which detectors count [s]"""
+MERGING_LENGTH = 300.0  # maximum length of a bottleneck: of a longer merging section the downstream end [m]
+INTERVAL = 60.0  # time over which detectors count [s]
 BREAKDOWN_MINUTES = 5
 """number of intervals for which traffic must stay slow, and over which the flow before and after it is averaged"""
-BREAKDOWN_SPEED_RATIO = 0.65
-"""share of the speed limit below which traffic is congested: 65 km/h at a limit of 100 km/h"""
+BREAKDOWN_SPEED_RATIO = 0.65  # share of the limit below which traffic is congested: 65 km/h at a limit of 100 km/h
 UPSTREAM_DETECTOR, DOWNSTREAM_DISTANCE = -200.0, 300.0
 """position of the detector that sees the breakdown [m], and distance of the one that measures the discharge downstream
 of the merging section [m]"""
-CELL = 100.0
-"""length of the cells in which speeds are averaged [m]"""
-WAVE_DISTANCE = 400.0
-"""distance between two compared speed series [m]: a wave needs a minute and a half for it"""
-WAVE_SMOOTHING, MAX_WAVE_LAG = 20.0, 240.0
-"""averaging time of these series, and longest time that a wave may need [s]"""
+CELL = 100.0  # length of the cells in which speeds are averaged [m]
+WAVE_DISTANCE = 400.0  # distance between two compared speed series [m]: a wave needs a minute and a half for it
+WAVE_SMOOTHING, MAX_WAVE_LAG = 20.0, 240.0  # averaging time of these series, and longest time that a wave may need [s]
 APPROACH = (-1700.0, UPSTREAM_DETECTOR)
 """range in which time gaps are measured, upstream of the disturbance by the merging section [m]"""
-LANE_CHANGE_RANGE = (-1700.0, -500.0)
-"""range in which lane changes are counted: not those because of the ramp [m]"""
-FOLLOWING_TIME_GAP = 4.0
-"""time gap below which a vehicle counts as following [s]"""
-DENSE_MINUTES = 10
-"""number of intervals before a breakdown in which free traffic is dense"""
+LANE_CHANGE_RANGE = (-1700.0, -500.0)  # range in which lane changes are counted: not those because of the ramp [m]
+FOLLOWING_TIME_GAP = 4.0  # time gap below which a vehicle counts as following [s]
+DENSE_MINUTES = 10  # number of intervals before a breakdown in which free traffic is dense
 FREE_SPEED_RATIO, CONGESTED_SPEEDS = 0.7, (2.0, 12.0)
 """smallest speed of free traffic as a share of the limit, and range of speeds in congestion [m/s]"""
-MERGE_DETECTOR = 1.0
-"""position of the detectors on the ramp's lane and the right lane next to it [m]"""
+MERGE_DETECTOR = 1.0  # position of the detectors on the ramp's lane and the right lane next to it [m]
 NEAR_MERGE, BRAKING_QUANTILE = -500.0, 0.999
 """position from which, to the end of the merging section, braking is measured [m], and the quantile"""
-MIN_SAMPLES = 100
-"""number of values from which a median or quantile is meaningful"""
+MIN_SAMPLES = 100  # number of values from which a median or quantile is meaningful
 
 
 @dataclass(frozen=True)
 class TrafficFacts:
     """Facts of one episode; NaN where the episode does not show them."""
 
-    breakdown_time: float = nan
-    """when traffic upstream of the merging section becomes slow for several minutes [s]"""
-    flow_before: float = nan
-    """flow downstream in the minutes before the breakdown [veh/h per lane]"""
-    highest_flow: float = nan
-    """highest flow downstream over as many minutes, before a breakdown or at any time [veh/h per lane]"""
-    discharge: float = nan
-    """flow downstream while traffic upstream is congested, without its first minutes [veh/h per lane]"""
-    congested_speed: float = nan
-    """mean speed at the detector upstream in the same time [m/s]"""
-    wave_speed: float = nan
-    """speed of stop-and-go waves; negative upstream [m/s]"""
-    merge_ratio: float = nan
-    """flow of the ramp over that of the right lane next to it, while traffic upstream is congested"""
-    free_time_gap: float = nan
-    """median net time gap of followers in the free traffic before a breakdown [s]"""
-    congested_time_gap: float = nan
-    """median net time gap of followers in congestion [s]"""
-    lane_changes_per_km: float = nan
-    """lane changes per vehicle and km before a breakdown, far from the ramp"""
+    breakdown_time: float = nan  # when traffic upstream of the merging section becomes slow for several minutes [s]
+    flow_before: float = nan  # flow downstream in the minutes before the breakdown [veh/h per lane]
+    highest_flow: float = nan  # highest downstream flow in as many minutes, before a breakdown or ever [veh/h per lane]
+    discharge: float = nan  # downstream flow while upstream is congested, without the first minutes [veh/h per lane]
+    congested_speed: float = nan  # mean speed at the detector upstream in the same time [m/s]
+    wave_speed: float = nan  # speed of stop-and-go waves; negative upstream [m/s]
+    merge_ratio: float = nan  # flow of the ramp over that of the right lane, while traffic upstream is congested
+    free_time_gap: float = nan  # median net time gap of followers in the free traffic before a breakdown [s]
+    congested_time_gap: float = nan  # median net time gap of followers in congestion [s]
+    lane_changes_per_km: float = nan  # lane changes per vehicle and km before a breakdown, far from the ramp
     hardest_braking: float = nan
     """99.9 % quantile of decelerations from 500 m upstream to the end of the merging section [m/s2]"""
 

@@ -1,13 +1,12 @@
 """Verdicts on drivers: feasible or not, better or worse than a baseline, and the numbers that matter on a road."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from unjam.measures.effect import FLOW_METRIC, FUEL_METRIC, LAG_METRIC, POWER_FUEL_METRIC, TIME_METRIC, is_measured
-from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
-from unjam.measures.metric_table import HUMAN_LABEL, RowsByDriver, estimate_cell, metric_table
+from unjam.measures.feasibility import FEASIBLE, RowsByDriver, feasibility_by_driver
+from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell, metric_table
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, count_teleports, pair_rows, paired_difference, relative_difference
 from unjam.text import format_count
@@ -15,14 +14,10 @@ from unjam.text import format_count
 if TYPE_CHECKING:  # imported late, so that commands start quickly
     import pandas as pd
 
-Rows = Sequence[dict[str, Any]]
-"""a row of metrics for each episode"""
 HIGHER_IS_BETTER = {"mean_speed", "mean_speed_steady", "outflow_veh_per_h", "min_ttc"}
 """metrics that are compared with the baseline, of which lower values are worse; of the others they are better"""
-MAX_RELATIVE_CHANGE = 10.0
-"""change from which it is not shown as a share of the baseline, which is nearly zero then"""
-FEW_SEEDS = 10
-"""number of seeds from which a verdict rarely changes with more of them"""
+MAX_RELATIVE_CHANGE = 10.0  # change from which it is not shown as a share of the baseline, which is nearly zero then
+FEW_SEEDS = 10  # number of seeds from which a verdict rarely changes with more of them
 NEITHER_IS_BETTER = {"cav_mean_gap"}
 """metrics of which neither direction is better: a larger gap can dissolve a wave, and lets vehicles cut in"""
 
@@ -31,12 +26,9 @@ NEITHER_IS_BETTER = {"cav_mean_gap"}
 class RoadMetrics:
     """What matters on a kind of road."""
 
-    compared: tuple[str, ...]
-    """metrics that are compared with the baseline; the first one decides"""
-    others: tuple[str, ...]
-    """metrics that a short table shows besides"""
-    headline: tuple[str, ...]
-    """metrics of a driver that is compared with none; the first two are the most important"""
+    compared: tuple[str, ...]  # metrics that are compared with the baseline; the first one decides
+    others: tuple[str, ...]  # metrics that a short table shows besides
+    headline: tuple[str, ...]  # metrics of a driver that is compared with none; the first two are the most important
 
 
 CLOSED_ROAD = RoadMetrics(
@@ -44,9 +36,8 @@ CLOSED_ROAD = RoadMetrics(
     ("time_to_dissolve",),
     ("mean_speed", "speed_limit_ratio_steady", "speed_std_fleet_steady", POWER_FUEL_METRIC),
 )
-OPEN_ROAD = RoadMetrics(
-    (TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC), ("mean_speed",), (TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC)
-)
+_OPEN_ROAD_METRICS = TIME_METRIC, FLOW_METRIC, POWER_FUEL_METRIC
+OPEN_ROAD = RoadMetrics(_OPEN_ROAD_METRICS, ("mean_speed",), _OPEN_ROAD_METRICS)
 RECORDED_ROAD = RoadMetrics(
     (POWER_FUEL_METRIC, FLOW_METRIC, "cav_mean_gap"),
     (LAG_METRIC, "amplification_medium"),
@@ -85,8 +76,7 @@ class DifferenceText:
     """A paired difference to the baseline, as text."""
 
     label: str
-    text: str
-    """mean and CI with the unit, and the mean as a share of the baseline"""
+    text: str  # mean and CI with the unit, and the mean as a share of the baseline
     is_better: bool | None
 
 
@@ -95,12 +85,9 @@ class Verdict:
     """What is shown of a driver compared with the baseline on the same seeds."""
 
     driver: str
-    feasibility: str
-    """`FEASIBLE`, the first reason against it, or empty"""
-    comparison: str
-    """whether the metric that decides is better or worse, and at which price"""
-    is_better: bool | None
-    """whether the metric that decides is shown to be better; None: undecided"""
+    feasibility: str  # `FEASIBLE`, the first reason against it, or empty
+    comparison: str  # whether the metric that decides is better or worse, and at which price
+    is_better: bool | None  # whether the metric that decides is shown to be better; None: undecided
     differences: tuple[DifferenceText, ...] = ()
 
     @property
@@ -119,17 +106,12 @@ class Verdict:
 def verdicts(rows_by_driver: RowsByDriver, baseline: str = "") -> list[Verdict]:
     """Return the verdict on each driver but the baseline, empty: human drivers; none without this baseline."""
     reference = baseline or HUMAN_LABEL
-    names = road_metrics(rows_by_driver).compared
     found = feasibility_by_driver(rows_by_driver) if rows_by_driver.get(reference) else {}
-    return [
-        _verdict(label, rows_by_driver, reference, feasible, names)
-        for label, feasible in found.items()
-        if label != reference
-    ]
+    return [_verdict(label, rows_by_driver, reference, found[label]) for label in found if label != reference]
 
 
-def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible: str, names: Sequence[str]) -> Verdict:
-    rows, others = rows_by_driver[label], rows_by_driver[reference]
+def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible: str) -> Verdict:
+    rows, others, names = rows_by_driver[label], rows_by_driver[reference], road_metrics(rows_by_driver).compared
     name_of_others = "human drivers" if reference == HUMAN_LABEL else reference
     checked = (*names, FUEL_METRIC) if names[0] == POWER_FUEL_METRIC else names
     differences = {name: paired_difference(rows, others, name) for name in checked}
@@ -137,15 +119,12 @@ def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible:
     if not pairs:
         return Verdict(label, "", f"no episode can be compared with {name_of_others}", None)
     changes = {name: is_better(name, difference) for name, difference in differences.items()}
-    texts = (
-        DifferenceText(
-            METRICS[name].label.removesuffix(", departure delay included"),
-            _difference_text(name, difference, relative_difference(rows, others, name).mean),
-            changes[name],
-        )
-        for name, difference in differences.items()
-        if difference.count and name in names
-    )
+    texts = list[DifferenceText]()
+    for name in names:
+        if differences[name].count:
+            title = METRICS[name].label.removesuffix(", departure delay included")
+            text = _difference_text(name, differences[name], relative_difference(rows, others, name).mean)
+            texts.append(DifferenceText(title, text, changes[name]))
     prices = [text for name, text in PRICES.items() if changes.get(name) is False]
     own, paired = zip(*pair_rows(rows, others), strict=True)
     if (teleports := count_teleports(own) - count_teleports(paired)) > 0:

@@ -32,14 +32,12 @@ EFFECT_METRICS = (
     ("flow", "outflow_veh_per_h", "flow", "veh/h", 0),
     ("fuel", "fuel_ml_per_km", "fuel by emission model", "ml/km", 1),
     ("hard_braking", "human_braking_beyond_4_5", "human drivers' braking beyond 4.5 m/s²", "per million", 0),
-)
-"""field of an effect, its metric, and label, unit and digits in tables"""
+)  # field of an effect, its metric, and label, unit and digits in tables
 HUMAN_BASELINE_LABEL, ACC_LABEL = "human baseline", "ACC alone"
 OPTION_HEADINGS = (
     *("CAVs", "driver", "travel time − human [s]", "travel time − ACC [s]"),
     *("flow − human [veh/h]", "flow − ACC [veh/h]", "feasibility", "verdict"),
-)
-"""columns of the main table: differences to the human baseline and to ACC vehicles alone"""
+)  # columns of the main table: differences to the human baseline and to ACC vehicles alone
 ACC_DIFFERENCES = "difference_to_acc", "flow_difference_to_acc"
 MISSING = Estimate(nan, nan, nan, 0)
 
@@ -78,7 +76,8 @@ def render_assessment(folder: Path) -> str:
     assessment, results = parse_assessment(json.loads(path.read_text())), read_results(folder)
     names = {"human": HUMAN_BASELINE_LABEL}
     panels = [replace(each, driver=names.get(each.driver, each.driver)) for each in results.plot_episodes.values()]
-    plotted = {label: results.rows.get(label, []) for label in results.plot_episodes}
+    plotted = ((label, results.rows.get(label)) for label in results.plot_episodes)  # of the first episode of each
+    times = {label: f"{rows[0][TIME_METRIC]:.1f} s" if rows else "not measured" for label, rows in plotted}
     return render_template(
         "assessment.html",
         assessment=assessment,
@@ -90,33 +89,18 @@ def render_assessment(folder: Path) -> str:
         candidate_rows=[_tuning_row(each) for each in assessment["candidates"]],
         effect_figure=figures.data_uri(effect_figure(assessment)),
         space_time=figures.data_uri(space_time.space_time_figure(panels)) if panels else "",
-        panels=[f"{names.get(label, label)}, {_first_travel_time(rows)}" for label, rows in plotted.items()],
+        panels=[f"{names.get(label, label)}, {time}" for label, time in times.items()],
         has_lane_maps=space_time.has_lane_maps(panels),
         percent=format_percent,
-        breakable=breakable_label,
+        breakable=lambda label: Markup("<wbr>").join(split_label(label)),  # names of drivers may be long
         max_flow_loss=MAX_FLOW_LOSS,
         min_test_seeds=MIN_VERDICT_SEEDS,
         command=original_command(results),
     )
 
 
-def _first_travel_time(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the travel time of the first episode, which is that of the picture, as text."""
-    return f"{rows[0][TIME_METRIC]:.1f} s" if rows else "not measured"
-
-
-def breakable_label(text: str) -> Markup:
-    """Return the name of a driver, with line breaks allowed after punctuation, because it may be long."""
-    return Markup("<wbr>").join(split_label(text))
-
-
 def _option_label(option: dict[str, Any]) -> str:
     return f"{format_percent(option['penetration_rate'])}: {option['driver']}"
-
-
-def _parse_estimate(value: Any) -> Any:
-    """Return the JSON of an estimate as an `Estimate`, null as NaN, and other values unchanged."""
-    return Estimate(**replace_null(value)) if isinstance(value, dict) else nan if value is None else value
 
 
 def _rates_without_controller(assessment: dict[str, Any]) -> list[tuple[float, dict[str, Any]]]:
@@ -131,19 +115,17 @@ def _rates_without_controller(assessment: dict[str, Any]) -> list[tuple[float, d
 
 
 def parse_assessment(document: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of `assessment.json` with its estimates as `Estimate`."""
+    """Return the content of `assessment.json` with its estimates as `Estimate`, and NaN in place of null."""
 
-    def parse_values(values: dict[str, Any]) -> dict[str, Any]:
-        return {
-            key: parse_values(value) if key == "effect" else _parse_estimate(value) for key, value in values.items()
-        }
+    def parse(value: Any, key: str = "effect") -> Any:
+        if key == "effect":
+            return {name: parse(each, name) for name, each in value.items()}
+        return Estimate(**replace_null(value)) if isinstance(value, dict) else nan if value is None else value
 
-    groups = {
-        name: [*map(parse_values, document[name])] for name in ("controller_results", "acc_results", "candidates")
-    }
+    groups = {key: [*map(parse, document[key])] for key in ("controller_results", "acc_results", "candidates")}
     for each in groups["acc_results"]:
         each["driver"] = ACC_LABEL
-    return {**document, **groups, "baseline": parse_values(document["baseline"])}
+    return {**document, **groups, "baseline": parse(document["baseline"])}
 
 
 def option_rows(assessment: dict[str, Any]) -> list[list[str]]:
@@ -201,17 +183,10 @@ def _evaluated_options(assessment: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _tuning_row(option: dict[str, Any]) -> dict[str, Any]:
     effect = option["effect"]
-    return {
-        "label": _option_label(option),
-        "cells": [
-            format_difference(effect["travel_time"], 1),
-            format_difference(effect["flow"]),
-            format_difference(effect["fuel"], 1),
-            f"{effect['collisions']:.0f}",
-            str(effect["travel_time"].count),
-        ],
-        "texts": [effect["feasibility"] or "–", option["rejection_reason"] or "selected"],
-    }
+    cells = [format_difference(effect[name], digits) for name, digits in (("travel_time", 1), ("flow", 0), ("fuel", 1))]
+    cells += [f"{effect['collisions']:.0f}", str(effect["travel_time"].count)]
+    texts = [effect["feasibility"] or "–", option["rejection_reason"] or "selected"]
+    return {"label": _option_label(option), "cells": cells, "texts": texts}
 
 
 @rc_context(figures.PLOT_STYLE)

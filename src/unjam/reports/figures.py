@@ -17,20 +17,15 @@ from unjam.measures.statistics import Estimate
 from unjam.reports.results import PlotEpisode, kept_row, seconds_by_part
 from unjam.text import one_line, printable
 
-SPEED_COLORMAP = "viridis"
-"""slow is dark, fast is bright: readable with color blindness and in print"""
+SPEED_COLORMAP = "viridis"  # slow is dark, fast is bright: readable with color blindness and in print
 TEXT_COLOR, MUTED_COLOR, GRID_COLOR = "#1f2933", "#697586", "#e4e7eb"
 CAV_PLOT_COLOR = "#d7263d"
 LINE_COLORS = ["#7b8794", "#e07a1f", "#2b6cb0", "#2f855a", "#b83280", "#805ad5", "#1a202c", "#00a3c4"]
 """colors of drivers, in the order of the legend"""
-FIGURE_WIDTH = 10.5
-"""width of a figure of the page [inch]; it is legible from 760 pixels on, the smallest width there"""
-MAX_LABEL_LENGTH = 34
-"""maximum length of the label of a driver in a figure [characters]"""
-DPI = 130
-"""pixels per inch of rasterized parts"""
-MAX_PLOT_TIMES = 600
-"""maximum number of times of an episode that a figure shows"""
+FIGURE_WIDTH = 10.5  # width of a figure of the page [inch]; it is legible from 760 pixels on, the smallest width there
+MAX_LABEL_LENGTH = 34  # maximum length of the label of a driver in a figure [characters]
+DPI = 130  # pixels per inch of rasterized parts
+MAX_PLOT_TIMES = 600  # maximum number of times of an episode that a figure shows
 
 PLOT_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -202,8 +197,7 @@ def training_time_figure(progress: Sequence[dict[str, Any]]) -> Figure:
     totals = {f"{part} {seconds:.0f} s": seconds for part, seconds in seconds_by_part(progress).items()}
     figure = stacked_bars({"": totals}, "wall time [s]", height=1.5)
     axes = figure.axes[0]
-    axes.set_yticks([])
-    axes.margins(x=0)
+    axes.set(yticks=[], xmargin=0.0)
     axes.spines["left"].set_visible(False)
     return figure
 

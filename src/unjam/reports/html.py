@@ -30,18 +30,13 @@ from unjam.text import printable
 from unjam.worlds.record import assign_columns
 
 MAX_PANELS = 6
-MAX_REPLAY_FRAMES = 600
-"""maximum number of frames of a replay, which interpolates between them"""
-MAX_REPLAY_VALUES = 600_000
-"""vehicles times frames of all drivers of a replay: about three megabytes"""
-MAX_MERGE_DISTANCE = 50.0
-"""a merge is drawn at the vehicle that was nearest to it, if that was no farther away [m]"""
-REPLAY_NAN = 65535
-"""code of NaN in the arrays of a replay"""
-WORST_SHARE = 0.9
-"""share of the largest variance of speeds at which a replay opens"""
-REPLAY_STEP = 0.5
-"""time between two frames of the replay [s]"""
+Sources = Sequence[tuple[str, Results]]  # folders of results, with their names
+MAX_REPLAY_FRAMES = 600  # maximum number of frames of a replay, which interpolates between them
+MAX_REPLAY_VALUES = 600_000  # vehicles times frames of all drivers of a replay: about three megabytes
+MAX_MERGE_DISTANCE = 50.0  # a merge is drawn at the vehicle that was nearest to it, if that was no farther away [m]
+REPLAY_NAN = 65535  # code of NaN in the arrays of a replay
+WORST_SHARE = 0.9  # share of the largest variance of speeds at which a replay opens
+REPLAY_STEP = 0.5  # time between two frames of the replay [s]
 
 
 def write_report_page(folders: Sequence[Path], target: Path) -> Path:
@@ -74,13 +69,8 @@ def render_template(template: str, **values: Any) -> str:
 
     Values in figures, JSON and addresses are encoded, and must be printable before.
     """
-    environment = Environment(
-        loader=PackageLoader("unjam.reports", "page"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    options: dict[str, Any] = {"undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(loader=PackageLoader("unjam.reports", "page"), autoescape=True, **options)
     common = {"version": __version__, "style": _page_file("report.css"), "downloads": _page_file("downloads.js")}
     return printable(environment.get_template(template).render(**common, **values))
 
@@ -140,15 +130,14 @@ def render_report(results: Sequence[Results]) -> str:
 
 
 def _report_figures(
-    sources: Sequence[tuple[str, Results]], columns: Sequence[ReportColumn], panels: Sequence[PlotEpisode]
+    sources: Sources, columns: Sequence[ReportColumn], panels: Sequence[PlotEpisode]
 ) -> dict[str, Figure]:
     found: dict[str, Figure] = {}
     if panels:
         found["time_series"] = figures.time_series_figure(panels)
     if runs := {name: result.progress for name, result in sources if result.progress}:
-        found["learning_curve"] = figures.learning_curve_figure(
-            runs, _expert_returns(sources), *_test_returns(sources, columns)
-        )
+        test_returns, expert = _test_returns(sources, columns)
+        found["learning_curve"] = figures.learning_curve_figure(runs, _expert_returns(sources), test_returns, expert)
     if len(sources) == 1 and sources[0][1].progress:
         progress, model = sources[0][1].progress, sources[0][1].model
         found["training_time"] = figures.training_time_figure(progress)
@@ -160,9 +149,7 @@ def _report_figures(
     return found
 
 
-def _test_returns(
-    sources: Sequence[tuple[str, Results]], columns: Sequence[ReportColumn]
-) -> tuple[dict[str, Estimate], str]:
+def _test_returns(sources: Sources, columns: Sequence[ReportColumn]) -> tuple[dict[str, Estimate], str]:
     """Return the returns on test seeds by driver, and the expert of a single training, of which they are differences.
 
     Human drivers are left out then: their returns are often so small that the other differences would not be visible.
@@ -175,7 +162,7 @@ def _test_returns(
     return {name: paired_difference(rows[name], rows[expert], "return") for name in rows if name in others}, expert
 
 
-def _expert_returns(sources: Sequence[tuple[str, Results]]) -> dict[str, float]:
+def _expert_returns(sources: Sources) -> dict[str, float]:
     """Return the return of the expert of each run on the validation seeds, with which its curve starts."""
     returns: dict[str, float] = {}
     has_several_roads = len({result.metadata.get("scenario") for _, result in sources}) > 1

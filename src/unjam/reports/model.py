@@ -21,8 +21,7 @@ PREDICTED_QUANTITIES = {
     "follower_speed": ("follower speed", "m/s"),
     "follower_gap": ("follower gap", "m"),
     "reward": ("reward", ""),
-}
-"""label and unit of each predicted quantity"""
+}  # label and unit of each predicted quantity
 ERROR_KINDS = ("change", "base", "model")
 """quantities with a root mean square: the predicted changes, the errors of the base model and of the learned model"""
 BASE_LABELS = {
@@ -34,16 +33,13 @@ BASE_LABELS = {
     "acc": ("ACC alone", "physics with an adaptive cruise control follower"),
     "ovm": ("OVM alone", "physics with a follower of the optimal velocity model"),
     "none": ("no change", "the assumption that nothing changes"),
-}
-"""label and description of each base model"""
+}  # label and description of each base model
 WAVE_HEADINGS = ("mean speed [m/s]", "std across vehicles [m/s]", "slowest vehicle [m/s]")
-ERROR_PRECISION = 1e-5
-"""errors below this are rounding errors of single precision [m/s, m, reward]"""
+ERROR_PRECISION = 1e-5  # errors below this are rounding errors of single precision [m/s, m, reward]
 
 MODEL_COLOR, BASE_COLOR, CHANGE_COLOR, RECORDED_COLOR = LINE_COLORS[2], LINE_COLORS[1], LINE_COLORS[0], TEXT_COLOR
 ESTIMATORS = ("unexplained_variance", "transitions", "total_variation", "training_loss")
-REPLAYED_QUANTITIES = ("leader_speed", "leader_gap", "follower_gap")
-"""quantities with errors drawn over the time ahead"""
+REPLAYED_QUANTITIES = ("leader_speed", "leader_gap", "follower_gap")  # quantities with errors drawn over the time ahead
 ERROR_BINS = (("leader_speed", "leader_gap"), ("leader_speed", "speed"), ("reward", "leader_gap"))
 """pairs of a quantity and of the state over which its errors are drawn"""
 STEPS_LABEL = "environment steps [thousands]"
@@ -196,24 +192,16 @@ def _wave_caption(facts: dict[str, Any]) -> str:
 def wave_figure(facts: dict[str, Any]) -> Figure:
     """Draw a recorded episode and rollouts from its start; waves are dark bands."""
     lane_names, episodes = tuple(facts.get("lane_names", ())), list[PlotEpisode]()
+    common: dict[str, Any] = {"control_step": facts["control_step"], "lane_names": lane_names}
+    common["loop_length"] = nan if facts["loop_length"] is None else facts["loop_length"]
+    common["outline"] = np.zeros((0 if lane_names else 1, 3))
     for label, road in facts["waves"].items():
         arrays = (road.get(name, np.zeros((0, 0))) for name in ("speeds", "positions", "lanes"))
         speeds, positions, lanes = (np.array(array, np.float64) for array in arrays)
         columns = tuple(str(column) for column in range(speeds.shape[1]))
-        episodes.append(
-            PlotEpisode(
-                driver=_base_label(facts) if label == "base" else label,
-                control_step=facts["control_step"],
-                loop_length=nan if facts["loop_length"] is None else facts["loop_length"],
-                lane_names=lane_names,
-                outline=np.zeros((0 if lane_names else 1, 3)),
-                vehicle_ids=columns,
-                cav_ids=tuple(columns[cav] for cav in road["cav_columns"]),
-                speeds=speeds,
-                positions=positions,
-                lane_indices=lanes,
-            )
-        )
+        own = {"driver": _base_label(facts) if label == "base" else label, "vehicle_ids": columns, "speeds": speeds}
+        own |= {"cav_ids": tuple(columns[cav] for cav in road["cav_columns"])}
+        episodes.append(PlotEpisode(**common, **own, positions=positions, lane_indices=lanes))
     return space_time_figure(episodes)
 
 

@@ -17,31 +17,22 @@ from unjam.files import INVALID_DATA_ERRORS, read_json_lines, sha256_of
 from unjam.folders import reject_unsafe_files
 from unjam.measures.metric_table import driver_rank
 from unjam.measures.metrics import METRICS
-from unjam.worlds.record import Episode, Floats
+from unjam.worlds.record import Episode
 
 Float32s = NDArray[np.float32]
 
-EVALUATION_FILE = "evaluation.json"
-"""metrics of each driver"""
-PLOT_EPISODES_FILE = "plot_episodes.safetensors"
-"""arrays of the episodes that figures show"""
-PLOT_EPISODES_HASH = "plot_episodes_sha256"
-"""entry of the evaluation with the hash of that file"""
-MODEL_FILE = "model.json"
-"""facts about the learned model of a run"""
-VEHICLE_ARRAYS = ("speeds", "positions", "gaps", "poses", "lane_indices")
-"""arrays with a row per time and a column per vehicle"""
-PLOT_ARRAYS = (*VEHICLE_ARRAYS, "replayed_motion", "outline", "backlog", "lane_lines")
-"""arrays of an episode that figures need"""
-FULL_RATE_ARRAYS = ("speeds", "backlog")
-"""arrays that an episode has for every control step, not only for snapshots"""
-NO_LANE = -1
-"""lanes are stored as small integers, which have no NaN"""
+EVALUATION_FILE = "evaluation.json"  # metrics of each driver
+PLOT_EPISODES_FILE = "plot_episodes.safetensors"  # arrays of the episodes that figures show
+PLOT_EPISODES_HASH = "plot_episodes_sha256"  # entry of the evaluation with the hash of that file
+MODEL_FILE = "model.json"  # facts about the learned model of a run
+VEHICLE_ARRAYS = ("speeds", "positions", "gaps", "poses", "lane_indices")  # arrays of shape (times, vehicles, ...)
+PLOT_ARRAYS = (*VEHICLE_ARRAYS, "replayed_motion", "outline", "backlog", "lane_lines")  # arrays that figures need
+FULL_RATE_ARRAYS = ("speeds", "backlog")  # arrays that an episode has for every control step, not only for snapshots
+NO_LANE = -1  # lanes are stored as small integers, which have no NaN
 EPISODE_ENTRIES = (
     *("control_step", "seed", "drawn_values", "loop_length", "crossings", "branches", "limit_speed", "merge_positions"),
     *("vehicle_ids", "cav_ids", "vehicle_columns", "lane_names"),
-)
-"""fields of an episode that figures need, without the arrays"""
+)  # fields of an episode that figures need, without the arrays
 
 
 @dataclass(frozen=True)
@@ -82,16 +73,11 @@ def to_plot_episode(driver: str, episode: Episode) -> PlotEpisode:
     """Return the data of an episode for figures; its `control_step` is the time between two snapshots."""
     values = {name: getattr(episode, name) for name in (*EPISODE_ENTRIES, *PLOT_ARRAYS)}
     values |= {name: values[name][:: episode.snapshot_stride] for name in FULL_RATE_ARRAYS}
-    if episode.has_recorded_leader:
-        values |= _moving_scene(episode)
+    if episode.has_recorded_leader:  # in a plane that moves with the recorded vehicle, which is at its origin
+        behind = episode.positions - episode.replayed_motion[:, :1, 0]
+        line = np.array([[behind.min(), 0.0], [0.0, 0.0]])
+        values |= {"poses": np.stack([behind, 0.0 * behind, 0.0 * behind], -1), "lane_lines": line}
     return PlotEpisode(**{**values, "control_step": episode.control_step * episode.snapshot_stride}, driver=driver)
-
-
-def _moving_scene(episode: Episode) -> dict[str, Floats]:
-    """Return poses and the line of the road in a plane that moves with the recorded vehicle, which is at its origin."""
-    behind = episode.positions - episode.replayed_motion[:, :1, 0]
-    poses = np.stack([behind, 0.0 * behind, 0.0 * behind], -1)
-    return {"poses": poses, "lane_lines": np.array([[behind.min(), 0.0], [0.0, 0.0]])}
 
 
 def pack_episode(episode: PlotEpisode) -> dict[str, Float32s]:
@@ -112,13 +98,11 @@ def pack_episode(episode: PlotEpisode) -> dict[str, Float32s]:
 
 def unpack_episode(arrays: dict[str, Any]) -> dict[str, Any]:
     """Return the arrays that `pack_episode` was given."""
-    is_present = arrays.get("is_present")
-    if is_present is None:
-        return arrays
-    unpacked = {name: array for name, array in arrays.items() if name != "is_present"}
-    for name in VEHICLE_ARRAYS:
-        packed = arrays.get(name)
-        if packed is not None and len(packed) == is_present.sum():
+    unpacked = dict(arrays)
+    if (is_present := unpacked.pop("is_present", None)) is None:
+        return unpacked
+    for name in unpacked.keys() & set(VEHICLE_ARRAYS):
+        if len(packed := arrays[name]) == is_present.sum():
             unpacked[name] = np.full((*is_present.shape, *packed.shape[1:]), np.nan, np.float32)
             values = np.where(packed == NO_LANE, np.nan, packed) if name == "lane_indices" else packed
             unpacked[name][is_present] = values
@@ -130,18 +114,12 @@ class Results:
     """The content of a run folder, or of a folder of `unjam drive`."""
 
     folder: Path
-    metadata: dict[str, Any]
-    """scenario, reward, expert, label of the trained controller, manifest"""
-    rows: dict[str, list[dict[str, Any]]]
-    """rows of metrics by driver, one for each episode"""
-    plot_episodes: dict[str, PlotEpisode]
-    """episodes for figures, by driver"""
-    progress: list[dict[str, Any]] = field(default_factory=list)
-    """a row per iteration of training; empty without training"""
-    config: str = ""
-    """configuration of the run, as TOML"""
-    model: dict[str, Any] | None = None
-    """facts about the learned model; None without one"""
+    metadata: dict[str, Any]  # scenario, reward, expert, label of the trained controller, manifest
+    rows: dict[str, list[dict[str, Any]]]  # rows of metrics by driver, one for each episode
+    plot_episodes: dict[str, PlotEpisode]  # episodes for figures, by driver
+    progress: list[dict[str, Any]] = field(default_factory=list)  # a row per iteration of training; empty without one
+    config: str = ""  # configuration of the run, as TOML
+    model: dict[str, Any] | None = None  # facts about the learned model; None without one
 
     @property
     def trained_label(self) -> str | None:
@@ -209,15 +187,13 @@ def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:
     """Return the rows of a run's progress without damaged rows, such as one that a crash truncated."""
-    return [row for row in read_json_lines(folder / "progress.jsonl") if _is_progress(row)]
 
+    def is_progress(row: dict[str, Any]) -> bool:
+        counts = row.get("iteration"), row.get("environment_steps", 0)
+        returns = row.get("return_validation"), row.get("return_expert")
+        return {*map(type, counts)} <= {int} and {*map(type, returns)} <= {int, float, type(None)}
 
-def _is_progress(row: dict[str, Any]) -> bool:
-    counts = row.get("iteration"), row.get("environment_steps", 0)
-    returns = row.get("return_validation"), row.get("return_expert")
-    return all(isinstance(each, int) for each in counts) and all(
-        isinstance(each, int | float | None) for each in returns
-    )
+    return list(filter(is_progress, read_json_lines(folder / "progress.jsonl")))
 
 
 def validation_gains(progress: Sequence[dict[str, Any]]) -> tuple[float, float] | None:
@@ -225,17 +201,16 @@ def validation_gains(progress: Sequence[dict[str, Any]]) -> tuple[float, float] 
 
     If the best is not positive, the run kept the untrained network, which has the return of the expert.
     """
-    returns = [row["return_validation"] for row in progress if row["return_validation"] is not None]
     expert = progress[0]["return_expert"] or 0.0 if progress else 0.0
-    return (max(returns) - expert, returns[-1] - expert) if returns else None
+    gains = [row["return_validation"] - expert for row in progress if row["return_validation"] is not None]
+    return (max(gains), gains[-1]) if gains else None
 
 
 def kept_row(progress: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
     """Return the row of progress after which the best network in validation was saved; None: none was better."""
-    rows = [row for row in progress if row["return_validation"] is not None]
-    best = max(rows, key=lambda row: row["return_validation"], default=None)
-    is_better = best is not None and best["return_validation"] > (progress[0]["return_expert"] or 0.0)
-    return best if is_better else None
+    expert = progress[0]["return_expert"] or 0.0 if progress else 0.0
+    rows = [row for row in progress if row["return_validation"] is not None and row["return_validation"] > expert]
+    return max(rows, key=lambda row: row["return_validation"], default=None)
 
 
 def seconds_by_part(progress: Sequence[dict[str, Any]]) -> dict[str, float]:

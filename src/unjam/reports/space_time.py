@@ -14,20 +14,14 @@ from matplotlib.figure import Figure
 from unjam.reports import figures
 from unjam.reports.results import Float32s, PlotEpisode
 
-SPEED_FIELD_POSITIONS = 250
-"""number of positions along the road at which a figure shows a speed"""
+SPEED_FIELD_POSITIONS = 250  # number of positions along the road at which a figure shows a speed
 FILL_DISTANCE, FILL_SECONDS = 10.0, 1.4
 """distance from a vehicle up to which a figure shows its speed: meters, plus seconds of driving"""
-MAX_TIME_BINS, MAX_POSITION_BINS = 240, 100
-"""maximum numbers of cells of a lane map, in time and along the road"""
-MIN_SAMPLES_PER_CELL = 4
-"""mean number of samples in a cell that leaves hardly any cell empty"""
-PANEL_WIDTH = 4.75
-"""width of a figure of one driver [inch]: a page has up to three next to each other, and on a phone one per row"""
-SCALE_QUANTILE = 0.98
-"""quantile of all speeds that has the brightest color; faster vehicles have it too"""
-MAX_LANE_MAPS = 4
-"""maximum number of lane maps; of more lanes, those with the most traffic are drawn"""
+MAX_TIME_BINS, MAX_POSITION_BINS = 240, 100  # maximum numbers of cells of a lane map, in time and along the road
+MIN_SAMPLES_PER_CELL = 4  # mean number of samples in a cell that leaves hardly any cell empty
+PANEL_WIDTH = 4.75  # width of a driver's figure [inch]: up to three are next to each other, on a phone one per row
+SCALE_QUANTILE = 0.98  # quantile of all speeds that has the brightest color; faster vehicles have it too
+MAX_LANE_MAPS = 4  # maximum number of lane maps; of more lanes, those with the most traffic are drawn
 HUMAN_LINE_STYLE: dict[str, Any] = {"colors": "white", "linewidths": 0.35, "alpha": 0.35}
 CAV_LINE_STYLE: dict[str, Any] = {"colors": figures.CAV_PLOT_COLOR, "linewidths": 1.6}
 
@@ -117,12 +111,8 @@ def _branch_row(episodes: Sequence[PlotEpisode], branch: str, is_main: bool) -> 
 
     def draw(axes: Axes, episode: PlotEpisode, scale: Normalize) -> None:
         stride = max(1, len(episode.times) // figures.MAX_PLOT_TIMES)
-        arrays = (
-            episode.times,
-            _branch_positions(episode, branch, is_main),
-            _with_replayed(episode, episode.speeds, 1),
-        )
-        times, positions, speeds = (array[::stride] for array in arrays)
+        positions = _branch_positions(episode, branch, is_main)[::stride]
+        times, speeds = episode.times[::stride], _with_replayed(episode, episode.speeds, 1)[::stride]
         axes.grid(False)
         axes.set_ylim(*extent)
         for start, end in episode.crossings:
@@ -230,9 +220,8 @@ def lane_map_figure(episodes: Sequence[PlotEpisode], shown: Sequence[PlotEpisode
     extents = [_lane_range(episodes, lane) for lane in lanes]
     max_span = max(end - start for start, end in extents)
     longest = max(episode.times[-1] for episode in episodes)
-    rows = [
-        _lane_row(episodes[0], lane, (longest, *extent), max_span) for lane, extent in zip(lanes, extents, strict=True)
-    ]
+    ranges = zip(lanes, extents, strict=True)
+    rows = [_lane_row(episodes[0], lane, (longest, *extent), max_span) for lane, extent in ranges]
     return episode_grid(episodes, rows, 0.4 + 1.75 * sum(row.height for row in rows), shown)
 
 

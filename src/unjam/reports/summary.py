@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from unjam.measures.effect import LAG_METRIC, POWER_FUEL_METRIC
+from unjam.measures.feasibility import EpisodeRows
 from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, driver_rank, estimate_cell
 from unjam.measures.metrics import METRICS
 from unjam.measures.notes import early_end_notes
@@ -19,24 +20,20 @@ from unjam.measures.statistics import (
     pair_rows,
     paired_difference,
 )
-from unjam.measures.verdict import Rows, Verdict, is_better, road_metrics, verdicts
+from unjam.measures.verdict import Verdict, is_better, road_metrics, verdicts
 from unjam.reports.results import PlotEpisode, Results, kept_row
 from unjam.text import format_count, printable
 
-CLOSE_TIME_GAP = 1.0
-"""time gap below which the report has a note [s]; the paper's h_max"""
-FORMULA_STARTS = {*"=+-@\t\r\n"}
-"""first letters of a cell that a spreadsheet takes for a formula"""
-MAX_LIMIT_RATIO = 1.01
-"""ratio of mean speed to the limit above which the report has a note"""
+CLOSE_TIME_GAP = 1.0  # time gap below which the report has a note [s]; the paper's h_max
+FORMULA_STARTS = {*"=+-@\t\r\n"}  # first letters of a cell that a spreadsheet takes for a formula
+MAX_LIMIT_RATIO = 1.01  # ratio of mean speed to the limit above which the report has a note
 COMPARED_METRICS = (
     *("mean_speed", "mean_speed_steady", "outflow_veh_per_h", "travel_time", "delay", "insertion_backlog_veh"),
     *(POWER_FUEL_METRIC, "share_standing", "speed_std_fleet", "speed_std_fleet_steady"),
     *("time_to_dissolve", "min_ttc"),
     *("human_max_braking", "human_braking_beyond_3_5", "human_braking_beyond_4_5", "human_braking_beyond_9"),
     *("cav_mean_gap", LAG_METRIC, "amplification_long", "amplification_medium", "amplification_short", "collisions"),
-)
-"""metrics with the same meaning in the human baseline and with CAVs, in the order of the table"""
+)  # metrics with the same meaning in the human baseline and with CAVs, in the order of the table
 
 
 @dataclass(frozen=True)
@@ -46,10 +43,8 @@ class ReportColumn:
     name: str
     rows: list[dict[str, Any]]
     episode: PlotEpisode | None
-    baseline_rows: list[dict[str, Any]] | None = None
-    """rows of the baseline in the same folder; None for the baseline itself"""
-    verdict: Verdict | None = None
-    """the verdict compared with the baseline"""
+    baseline_rows: list[dict[str, Any]] | None = None  # rows of its folder's baseline; None for the baseline itself
+    verdict: Verdict | None = None  # the verdict compared with the baseline
 
 
 def report_columns(results: Sequence[Results]) -> list[ReportColumn]:
@@ -155,10 +150,8 @@ def main_finding(result: Results) -> str:
     if expert in experts:
         gain = paired_difference(rows, experts[expert], "return")
         seeds = format_count(gain.count, "test seed")
-        sentences.append(
-            f"Return difference to its expert, {expert} (return {returns[expert]:,.0f}), on {seeds}: "
-            f"{format_difference(gain)}. {gain_verdict(gain)}"
-        )
+        finding = f"Return difference to its expert, {expert} (return {returns[expert]:,.0f}), on {seeds}"
+        sentences.append(f"{finding}: {format_difference(gain)}. {gain_verdict(gain)}")
         if row := kept_row(result.progress):
             steps = f"{row['environment_steps']:,} environment steps"
             sentences.append(f"The network is that after {steps}, the best in validation.")
@@ -172,7 +165,7 @@ def main_finding(result: Results) -> str:
     return " ".join(sentences) or f"On {seeds} the mean return of the trained controller is {mean:.0f}."
 
 
-def _traffic_finding(rows: Rows, expert_rows: Rows, expert: str, name: str) -> str:
+def _traffic_finding(rows: EpisodeRows, expert_rows: EpisodeRows, expert: str, name: str) -> str:
     """Return whether the metric that decides on this road is better than that of the expert, as a sentence."""
     metric, change = METRICS[name], paired_difference(rows, expert_rows, name)
     finding = {None: "no difference is shown", True: "better", False: "worse"}[is_better(name, change)]
@@ -191,12 +184,14 @@ def _drive_finding(result: Results) -> str:
 
 
 def _mean_text(rows: Sequence[dict[str, Any]], name: str) -> str:
-    """Return a mean with its unit; what follows a comma in the name of the metric is after it, in parentheses."""
-    (label, _, detail), found = METRICS[name].label.partition(", "), metric_estimate(rows, name)
-    value = (
-        f"{label} {found.mean:.{METRICS[name].digits}f} {METRICS[name].unit}".strip() if found.count else f"{label} –"
-    )
-    return f"{value} ({detail})" if detail else value
+    """Return a mean with its label; what follows a comma in the name of the metric is after it, in parentheses."""
+    label, _, detail = METRICS[name].label.partition(", ")
+    return f"{label} {_mean_with_unit(rows, name)}{detail and f' ({detail})'}"
+
+
+def _mean_with_unit(rows: EpisodeRows, name: str) -> str:
+    metric, found = METRICS[name], metric_estimate(rows, name)
+    return f"{found.mean:.{metric.digits}f} {metric.unit}".strip() if found.count else "–"
 
 
 def report_notes(result: Results) -> list[str]:
@@ -222,11 +217,9 @@ def _driver_notes(result: Results, label: str) -> list[str]:
         )
     share = metric_estimate(rows, "shield_override_share").mean
     if share > 0.01:
-        hardest = max(row["shield_max_braking"] for row in rows)
-        notes.append(
-            f"{label} relies on SUMO's safety check: it overrides {100 * share:.1f}\u00a0% of commands, and adds up to "
-            f"{hardest:.1f} m/s² of braking."
-        )
+        overrides = f"it overrides {100 * share:.1f}\u00a0% of commands"
+        braking = f"adds up to {max(row['shield_max_braking'] for row in rows):.1f} m/s² of braking"
+        notes.append(f"{label} relies on SUMO's safety check: {overrides}, and {braking}.")
     return notes
 
 
@@ -235,12 +228,8 @@ def key_figures(result: Results) -> list[dict[str, str]]:
     if len(result.rows) > 1:
         return []
     [(label, rows)] = result.rows.items()
-    cards = []
-    for name in road_metrics(result.rows).headline:
-        metric, found = METRICS[name], metric_estimate(rows, name)
-        value = f"{found.mean:.{metric.digits}f} {metric.unit}".strip() if found.count else "–"
-        cards.append({"label": metric.label, "value": value, "detail": label})
-    return cards
+    names = road_metrics(result.rows).headline
+    return [{"label": METRICS[name].label, "value": _mean_with_unit(rows, name), "detail": label} for name in names]
 
 
 def baseline_differences(columns: Sequence[ReportColumn]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -19,21 +20,14 @@ from unjam.worlds.ordered_road import poses_along
 from unjam.worlds.record import Episode
 from unjam.worlds.road_world import RoadScene
 
-FRAME_SIZE = 640
-"""width and height of a frame [pixels]"""
-ROAD_MARGIN = 8.0
-"""margin around the road [m]"""
-OVERSAMPLING = 2
-"""factor by which pictures are drawn larger and then reduced, for smooth edges"""
-MIN_VEHICLE_PIXELS = 7.0
-"""length of a vehicle on a large road, where the true length would be invisible"""
+FRAME_SIZE = 640  # width and height of a frame [pixels]
+ROAD_MARGIN = 8.0  # margin around the road [m]
+OVERSAMPLING = 2  # factor by which pictures are drawn larger and then reduced, for smooth edges
+MIN_VEHICLE_PIXELS = 7.0  # length of a vehicle on a large road, where the true length would be invisible
 ROAD_COLOR = "#dfe3e8"
-MAX_TITLE_WIDTH = 36
-"""maximum length of a line of the title, which must fit into a ring [characters]"""
-MIN_EMPTY_CENTER = 0.15
-"""empty radius around the center that a caption there needs, relative to the size of the road"""
-LEGEND_WIDTH, LEGEND_HEIGHT = 110, 10
-"""size of the scale of speeds [pixels]"""
+MAX_TITLE_WIDTH = 36  # maximum length of a line of the title, which must fit into a ring [characters]
+MIN_EMPTY_CENTER = 0.15  # empty radius around the center that a caption there needs, relative to the size of the road
+LEGEND_WIDTH, LEGEND_HEIGHT = 110, 10  # size of the scale of speeds [pixels]
 FRAMES_PER_SECOND = 20
 VIDEO_FORMATS = (".gif", ".webp", ".mp4")
 
@@ -60,25 +54,15 @@ def draw_road(scene: RoadScene, max_speed: float, caption: str) -> Image.Image:
         pen.line(to_pixels(line), fill=ROAD_COLOR, width=max(OVERSAMPLING, round(4 * scale)), joint="curve")
     colors = color_table()
     for vehicle in np.flatnonzero(~np.isnan(scene.speeds)):
-        is_cav = bool(scene.is_cav[vehicle])
-        pen.polygon(
-            to_pixels(_vehicle_corners(scene.poses[vehicle], enlargement)),
-            fill=colors[min(len(colors) - 1, int(scene.speeds[vehicle] / max_speed * len(colors)))],
-            outline=CAV_PLOT_COLOR if is_cav else None,
-            width=3 * OVERSAMPLING if is_cav else 1,
-        )
+        color = colors[min(len(colors) - 1, int(scene.speeds[vehicle] / max_speed * len(colors)))]
+        outline, width = (CAV_PLOT_COLOR, 3 * OVERSAMPLING) if scene.is_cav[vehicle] else (None, 1)
+        corners = to_pixels(_vehicle_corners(scene.poses[vehicle], enlargement))
+        pen.polygon(corners, fill=color, outline=outline, width=width)
     distances = np.linalg.norm(np.concatenate([_densify_line(line, size / 100) for line in lines]) - center, axis=1)
     is_centered = distances.min() > MIN_EMPTY_CENTER * size
-    corner = 0.03 * pixels
-    pen.multiline_text(
-        (pixels / 2, pixels / 2) if is_centered else (corner, corner),
-        caption,
-        fill=TEXT_COLOR,
-        font=ImageFont.load_default(22 * OVERSAMPLING),
-        anchor="mm" if is_centered else "la",
-        align="center" if is_centered else "left",
-        spacing=12,
-    )
+    place, anchor, align = (0.5, "mm", "center") if is_centered else (0.03, "la", "left")
+    style: dict[str, Any] = {"fill": TEXT_COLOR, "font": ImageFont.load_default(22 * OVERSAMPLING), "spacing": 12}
+    pen.multiline_text((place * pixels, place * pixels), caption, anchor=anchor, align=align, **style)
     _draw_legend(pen, max_speed, pixels)
     return image.reduce(OVERSAMPLING)
 
