@@ -1,3 +1,4 @@
+from dataclasses import replace
 from math import pi
 
 import numpy as np
@@ -67,8 +68,8 @@ def test_waits_anew_when_the_queue_is_broken() -> None:
 
 def pacer_of(lap: float) -> Pacer:
     harmonics, gain, gap = TUNED_PACES[lap]
-    shares = {"gathering_gap": GATHERED_LAP_FRACTION, "regathering_gap": BROKEN_LAP_FRACTION}
-    return Pacer(harmonics=harmonics, gap_gain=gain, target_gap=gap, **shares)
+    ready, broken = GATHERED_LAP_FRACTION, BROKEN_LAP_FRACTION
+    return Pacer(harmonics=harmonics, gap_gain=gain, target_gap=gap, gathering_gap=ready, regathering_gap=broken)
 
 
 @pytest.mark.parametrize("lap", TUNED_PACES)
@@ -79,10 +80,9 @@ def test_varying_is_the_pacer_that_was_tuned_for_the_nearest_lap(lap: float) -> 
 
 @pytest.mark.parametrize("share", [0.3, 0.47, 0.6])
 def test_varying_pacer_has_no_use_for_the_parameters_that_its_description_names(share: float) -> None:
-    without_effect = {"lap_time": 90.0, "harmonics": (5.0,), "gap_gain": 0.3, "target_gap": 0.2}
-    without_effect |= {"gathering_gap": 0.2, "regathering_gap": 0.55}
     states = [state(gap=each * 450, lap_fraction=0.4) for each in (0.7, share)]
-    other = Pacer(use_tuned=True, **without_effect)
+    pace = Pacer(use_tuned=True, lap_time=90.0, harmonics=(5.0,), gap_gain=0.3, target_gap=0.2)
+    other = replace(pace, gathering_gap=0.2, regathering_gap=0.55)
     assert commanded_speed(other, *states) == commanded_speed(Pacer(use_tuned=True), *states)
 
 
