@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 
 from unjam.measures import statistics
 from unjam.measures.feasibility import feasibility_by_driver, overall_feasibility
-from unjam.measures.metric_table import estimate_cell
 from unjam.measures.metrics import METRICS
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
 from unjam.reports.results import PlotEpisode, read_results, validation_gains
@@ -37,6 +36,7 @@ from unjam_paper.study import (
     StudyFolder,
     Table,
     TrainedRun,
+    estimate_text,
     number_text,
     planned_runs,
     trainings_text,
@@ -212,7 +212,7 @@ def _checkpoint_table(road: str, folder: Path) -> pd.DataFrame:
             difference = statistics.estimate_over_trainings(last - best, bounds=(-inf, 0.0))
             cells = {"": VARIANTS[row["variant"]].label, "trainings": len(values)}
             cells |= {"best trained": number_text(best.mean(), 0), "last checkpoint": number_text(last.mean(), 0)}
-            cells |= {"last − best": str(estimate_cell(difference, 0, sign="+"))}
+            cells |= {"last − best": estimate_text(difference, 0, "+")}
             table.append({**cells, "kept the untrained network": f"{row['untrained_count']} of {len(values)}"})
     return pd.DataFrame(table)
 

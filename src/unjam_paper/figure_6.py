@@ -22,16 +22,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from unjam.following.four_regimes import MIN_REGIME_GAP, FourRegimesSettings, make_four_regimes
 from unjam.following.leader_replay import add_residual, as_driver_model, idm_function
 from unjam.following.networks import NetworkSettings, batched_network, fit_one_step
-from unjam.physics.arrays import clamp_min
+from unjam.physics.arrays import Floats, clamp_min
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
-from unjam.recordings.trajectories import (
-    SPLITS,
-    Floats,
-    FollowingSamples,
-    following_samples,
-    select_splits,
-    split_by_driver,
-)
+from unjam.recordings.trajectories import SPLITS, FollowingSamples, following_samples, select_splits, split_by_driver
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
 from unjam_paper.results_file import read_part, write_part
 from unjam_paper.study import Study, StudyFolder, Table

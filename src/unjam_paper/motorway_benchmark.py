@@ -28,7 +28,7 @@ from unjam_paper.do_no_harm import HARM_METRICS
 from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF, EnsembleSetting
 from unjam_paper.motorway_methods import CANDIDATE_SEED, CANDIDATES_PER_METHOD, METHODS, Candidate
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, measure_tasks
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, mean_text, measure_tasks
 
 HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
 SENSING_PART, SENSITIVITY_PART, PACKAGED_PART = "sensing", "sensitivity", "packaged"
@@ -301,14 +301,14 @@ def comparison_table(folder: Path) -> pd.DataFrame:
         if OPPONENT not in rows:
             continue
         setting, human, own = SETTINGS[number], rows[HUMAN_LABEL], rows[CONTROLLER]
-        delay = estimate([row[TIME_METRIC] - setting.free_flow_time for row in human])
+        delay = mean_text([row[TIME_METRIC] - setting.free_flow_time for row in human], 0)
         table.append(
             {
                 "motorway": number,
                 "road": setting.road,
                 "demand": setting.demand,
                 "CAVs": f"{100 * rate:g} %",
-                "delay of human traffic [s]": str(estimate_cell(delay, 0)),
+                "delay of human traffic [s]": delay,
                 "of which unavoidable [s]": f"{setting.unavoidable_delay:.0f}",
                 "waiting at entrances [s]": f"{np.mean([row['waiting_at_entrances'] for row in human]):.0f}",
                 **{name: _percent(_delay_change(rows, *pair, number)) for name, pair in COMPARISONS.items()},
@@ -379,10 +379,9 @@ def sensitivity_table(folder: Path) -> pd.DataFrame:
     table: Table = []
     for name, rows in _read_measured(folder, SENSITIVITY_PART).items():
         pairs = pair_rows(rows[CONTROLLER], rows[HUMAN_LABEL])
-        gains = estimate([own[TIME_METRIC] - each[TIME_METRIC] for own, each in pairs])
-        human = estimate([each[TIME_METRIC] for _, each in pairs])
-        row = {"changed": name, "human traffic [s]": str(estimate_cell(human, 0))}
-        table.append(row | {"change [s]": str(estimate_cell(gains, 1, sign="+"))})
+        gains = [own[TIME_METRIC] - each[TIME_METRIC] for own, each in pairs]
+        row = {"changed": name, "human traffic [s]": mean_text([each[TIME_METRIC] for _, each in pairs], 0)}
+        table.append(row | {"change [s]": mean_text(gains, 1, "+")})
     return pd.DataFrame(table)
 
 

@@ -15,15 +15,13 @@ import pandas as pd
 
 from unjam.drivers import Human
 from unjam.measures.effect import TIME_METRIC
-from unjam.measures.metric_table import estimate_cell
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import estimate
 from unjam.scenarios import Motorway, make_scenario
 from unjam.seeds import tuning_seeds
 from unjam.worlds.episode import run_episode
 from unjam_paper.human_traffic import POPULATIONS, TARGETS, fact_values, measure_scenario
 from unjam_paper.results_file import read_part
-from unjam_paper.study import Study, Table
+from unjam_paper.study import Study, Table, mean_text
 
 SETTINGS_PER_HALF, DESIGN_SEED = 12, 20261128
 CAPACITY_SEEDS = 5
@@ -177,10 +175,8 @@ def settings_table(folder: Path) -> pd.DataFrame:
     capacities, table = read_part(folder, CAPACITY_PART), list[dict[str, Any]]()
     for setting in SETTINGS:
         rows = capacities[str(setting.number)]["episodes"]
-        facts = {
-            TARGETS[name].name: str(estimate_cell(estimate(fact_values(rows, name)), TARGETS[name].digits))
-            for name in ("highest_flow", "discharge", "capacity_drop")
-        }
+        targets = {name: TARGETS[name] for name in ("highest_flow", "discharge", "capacity_drop")}
+        facts = {each.name: mean_text(fact_values(rows, name), each.digits) for name, each in targets.items()}
         # The median, because the estimate of a single episode may be many times any real speed.
         wave, speeds = TARGETS["wave_speed"], fact_values(rows, "wave_speed")
         facts[f"{wave.name}: median (episodes)"] = f"{np.median(speeds):.{wave.digits}f} ({len(speeds)})"

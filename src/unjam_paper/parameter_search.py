@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from optuna.distributions import FloatDistribution
 
+from unjam.drivers import Human
 from unjam.drivers.driver import Driver
 from unjam.physics.arrays import Floats
 from unjam.physics.fuel import fuel_rate
@@ -18,6 +19,7 @@ from unjam_paper.fuel_optimal_plan import PlanLimits
 ELITE_SHARE, KEPT_SHARE, SMALLEST_SPREAD = 0.2, 0.3, 0.03
 """share of candidates that define the next generation; share of the last distribution that stays; smallest standard
 deviation of a parameter, relative to its range"""
+SEARCH_SEED = 0
 LIMITS = PlanLimits()
 """limits of a candidate"""
 MEAN_GAP_PRICE, MAX_GAP_PRICE, TIME_GAP_PRICE = 0.3, 0.2, 20.0
@@ -79,13 +81,11 @@ def search_parameters(
     scenarios: Sequence[Recorded],
     driver: Driver,
     space: Mapping[str, FloatDistribution],
-    human: RowScores,
-    seed: int,
     budget: SearchBudget,
     limits: PlanLimits = LIMITS,
 ) -> list[dict[str, Any]]:
     """Return the best candidate after each generation: its parameters, fuel relative to human drivers [%], gaps."""
-    generator = np.random.default_rng(seed)
+    human, generator = measure_candidates(scenarios, Human()), np.random.default_rng(SEARCH_SEED)
     mean, spread = np.full(len(space), 0.5), np.full(len(space), 0.35)
     best: dict[str, Any] = {"score": np.inf}
     history = list[dict[str, Any]]()

@@ -29,7 +29,7 @@ from unjam.drivers.smooth_acc import SmoothACC
 from unjam.errors import InputError
 from unjam.files import make_folder
 from unjam.measures.feasibility import FEASIBLE
-from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
+from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import METRICS, measure
 from unjam.measures.statistics import estimate_on_shared_seeds
 from unjam.onnx_models import parse_model
@@ -45,9 +45,9 @@ from unjam.worlds.batch.run import run_batches
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.fuel_optimal_plan import PlanLimits, PlannedDriver, plan_speeds
-from unjam_paper.parameter_search import SearchBudget, measure_candidates, search_parameters
+from unjam_paper.parameter_search import SearchBudget, search_parameters
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, trainings_text
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, estimate_text, group_rows, trainings_text
 
 TUNED_METHOD = "smooth-acc"
 """the law that residuals are added to"""
@@ -108,7 +108,7 @@ DRIVE_METRICS = (
 )
 IDEAL_CAR: dict[str, Any] = {"actuator": Actuator(), "safety": SafetyFilter(active=False), "actuation": "raw"}
 """the car of a plan"""
-SEARCH_SEED, SEARCH_BUDGET = 0, SearchBudget()
+SEARCH_BUDGET = SearchBudget()
 PLAN_LABEL = "plan that knows the recording"
 DRIVES_PARTS = {TRAINING_DRIVES_PART: TRAINING_MONTH, TEST_DRIVES_PART: TEST_MONTH}
 SETTING_METRICS = "fuel_by_power", "cav_mean_gap", "min_time_gap", "feasibility"
@@ -178,10 +178,9 @@ def untuned_driver(method: str) -> Driver:
 
 def tune_driver(folder: str, method: str, workers: int) -> Table:
     """Return the best candidates of a method after each generation, on the training drives."""
-    scenarios = recorded_drives(Path(folder))
-    human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
-    driver, space = untuned_driver(method), SEARCH_SPACES[method]
-    return search_parameters(scenarios, driver, space, human, SEARCH_SEED, SEARCH_BUDGET)
+    return search_parameters(
+        recorded_drives(Path(folder)), untuned_driver(method), SEARCH_SPACES[method], SEARCH_BUDGET
+    )
 
 
 def tuned_name(rows: Table, method: str) -> str:
@@ -347,7 +346,7 @@ class DriveResults:
         if label in (HUMAN_LABEL, baseline):
             return NO_VALUE_TEXT
         values = self.change(label, metric, is_relative, baseline)
-        return str(estimate_cell(estimate_on_shared_seeds(values), 2, sign="+"))
+        return estimate_text(estimate_on_shared_seeds(values), 2, "+")
 
 
 def _short_name(label: str) -> str:

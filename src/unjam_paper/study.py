@@ -294,7 +294,7 @@ class DriverComparison:
         if list(labels) == [baseline]:
             return NO_VALUE_TEXT
         values = (self.values(labels, metric) - self.values([baseline], metric)).mean(0)
-        return str(estimate_cell(estimate_on_shared_seeds(values), digits, sign="+"))
+        return estimate_text(estimate_on_shared_seeds(values), digits, "+")
 
     def min_time_gap(self, labels: Sequence[str]) -> str:
         """Return the minimum time gap of all episodes; a dash if no vehicle was faster than 1 m/s."""
@@ -319,14 +319,19 @@ def group_rows(rows: Table, name: str) -> dict[Any, Table]:
     return groups
 
 
-def mean_text(values: Floats, digits: int) -> str:
+def estimate_text(found: Estimate | None, digits: int, sign: str = "") -> str:
+    """Return a mean with its 95 % CI or range; a dash without values."""
+    return NO_VALUE_TEXT if found is None else str(estimate_cell(found, digits, sign=sign))
+
+
+def mean_text(values: Sequence[float] | Floats, digits: int, sign: str = "") -> str:
     """Return the mean of independent values with its 95 % CI."""
-    return str(estimate_cell(estimate(values.ravel().tolist()), digits))
+    return estimate_text(estimate(np.ravel(values).tolist()), digits, sign)
 
 
 def trainings_text(values: Sequence[float] | Floats, digits: int, sign: str = "") -> str:
     """Return the mean of one number per training with its 95 % CI or range; a dash without values."""
-    return str(estimate_cell(estimate_over_trainings(list(values)), digits, sign=sign))
+    return estimate_text(estimate_over_trainings(list(values)), digits, sign)
 
 
 def number_text(value: float | None, digits: int, sign: str = "") -> str:
