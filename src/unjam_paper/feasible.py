@@ -80,8 +80,8 @@ the ranges of `unjam tune`. From an even standstill this is the limit speed"""
 PACER_LONG_TUNED = (
     "pacer:use_tuned=true,gathering_speed=1.96,gathering_gap=0.319,regathering_gap=0.1595,time_constant=0.0966"
 )
-"""result of `unjam tune figure-eight --expert pacer --max-string-gain 0 --reward eq16 --steps 4860000`, without
-parameters that have no effect (of its gaps only `use_tuned` counts); with 600,000 steps it is `unjam:figure-eight-tuned-ideal`"""
+"""result of `unjam tune figure-eight --expert pacer --max-string-gain 0 --reward eq16 --steps 4860000`; both gaps
+have no effect with `use_tuned`. With 600,000 steps it is `unjam:figure-eight-tuned-ideal`"""
 PACER_TUNED_LABEL, PACER_GENTLE_LABEL = "pacer, tuned", "pacer, tuned, gentle"
 PACER_LONG_LABEL = "pacer, tuned, training budget"
 FEASIBILITY_STUDY_METRICS = (
