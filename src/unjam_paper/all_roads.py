@@ -12,14 +12,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from unjam.benchmarks.episodes import (
-    EPISODES_PER_ROAD,
-    FAMILY_TEST_SEEDS,
-    Seeds,
-    drive_by_label,
-    family_metrics,
-    run_in_batches,
-)
+from unjam.benchmarks.episodes import FAMILY_TEST_SEEDS, Seeds, drive_by_label, family_metrics, run_in_batches
 from unjam.controller import PACKAGED_PREFIX
 from unjam.measures import gain
 from unjam.measures.feasibility import FEASIBLE, overall_feasibility
@@ -48,7 +41,7 @@ from unjam_paper.results_file import StudyPart, read_parts
 from unjam_paper.study import PlannedRun, Study, StudyFolder
 from unjam_paper.variants import RINGS_EXPERT, SHARED_RINGS_EXPERT, VARIANTS
 
-EXPERT_SELECTION_SEEDS = tuning_seeds(EPISODES_PER_ROAD, 1000)
+EXPERT_SELECTION_SEEDS = tuning_seeds(len(FAMILY_TEST_SEEDS), 1000)
 PI_TUNED_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
 """result of `unjam tune rings --expert pi --max-string-gain 0`"""
 PI_TUNED_ON_ALL = (
@@ -275,10 +268,7 @@ ALL_ROADS_STUDY = Study(
     title="gain of one controller on every road of the family, training roads and unseen roads",
     make_parts=lambda study_folder, seeds: road_parts(FAMILY, _family_drivers, FAMILY_TEST_SEEDS, in_batches=False),
     minutes=60.0,
-    tables={
-        **{name: partial(all_roads_table, parts) for name, parts in TABLE_PARTS.items()},
-        "drivers": all_drivers_table,
-    },
+    tables={**{name: partial(all_roads_table, own) for name, own in TABLE_PARTS.items()}, "drivers": all_drivers_table},
 )
 
 

@@ -66,11 +66,8 @@ IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "delay 0.2 s, lag 0.5 s": {"actuator": Actuator(delay=0.2, lag=0.5)},
     "delay 0.5 s, lag 0.5 s": {"actuator": Actuator(delay=0.5, lag=0.5)},
     **{
-        label: {
-            "sensors": Sensors(**dict.fromkeys(SENSED, error)),
-            "safety": SafetyFilter(**dict.fromkeys(SENSED, error)),
-        }
-        for label, error in {"gap and speed off by up to 0.3": 0.3, "off by up to 1.0": 1.0}.items()
+        label: {"sensors": Sensors(**dict.fromkeys(SENSED, off)), "safety": SafetyFilter(**dict.fromkeys(SENSED, off))}
+        for label, off in {"gap and speed off by up to 0.3": 0.3, "off by up to 1.0": 1.0}.items()
     },
     "every tenth reading missing": {"sensors": Sensors(dropout=0.1)},
     "every third reading missing": {"sensors": Sensors(dropout=1.0 / 3.0)},

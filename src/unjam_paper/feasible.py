@@ -46,10 +46,8 @@ SEEDS_PER_SIZE = 10
 """test seeds for each length or radius"""
 PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL = "PI, tuned", "gap PI, tuned", "gap PI, tuned on the jammed ring"
 GAP_PI_JAMMED_LONG_LABEL = f"{GAP_PI_JAMMED_LABEL}, double budget"
-GAP_PI_RETUNED_LABEL, GAP_PI_IDEAL_LABEL = (
-    "gap PI, tuned for usual cars",
-    "gap PI, tuned on the jammed ring for ideal cars",
-)
+GAP_PI_RETUNED_LABEL = "gap PI, tuned for usual cars"
+GAP_PI_IDEAL_LABEL = "gap PI, tuned on the jammed ring for ideal cars"
 IDEAL_RESIDUAL_LABEL = "residual trained for ideal cars"
 PI_LONG_TUNED = (
     "pi:window=13.31,catch_up_speed=1.193,gap_lower=5.997,gap_upper=58.76,"
@@ -237,9 +235,7 @@ def feasible_study(title: str, variants: Mapping[str, str], minutes: float) -> S
     """Return the study that compares trainings with tuned experts of closed roads; `variants`: one by road."""
     return Study(
         title=title,
-        make_runs=lambda seeds: [
-            run for road, variant in variants.items() for run in planned_runs([road], [variant], seeds)
-        ],
+        make_runs=lambda seeds: [run for road, name in variants.items() for run in planned_runs([road], [name], seeds)],
         make_parts=partial(_feasible_parts, variants),
         minutes=minutes,
         tables={road: partial(feasible_table, road) for road in variants},

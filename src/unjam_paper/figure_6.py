@@ -225,9 +225,7 @@ def _set_log_axes(axes: Axes, title: str) -> None:
 
 FIGURE_6 = Study(
     title="networks that learn car following, with and without a car-following model",
-    make_parts=lambda study_folder, seeds: {
-        f"figure-6/{fit.name}": (measure_fit, (fit,)) for fit in four_regime_fits()
-    },
+    make_parts=lambda folder, seeds: {f"figure-6/{fit.name}": (measure_fit, (fit,)) for fit in four_regime_fits()},
     write=_write_figure_6,
     minutes=25.0,
     figures={"figure-6": lambda folder: figure_6(read_part(folder, "figure-6")["rows"])},

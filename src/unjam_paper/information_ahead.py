@@ -46,10 +46,7 @@ LATENCIES: tuple[float | None, ...] = (None, 0.0, 5.0, 15.0)
 FOLLOWERS = 5
 VALUE_BUDGET = SearchBudget(generations=10, size=24)
 SHARED_SPACE = {name: SEARCH_SPACES["smooth-acc"][name] for name in ("time_gap", "averaging_time", "leader_weight")}
-SPACE_AHEAD = {
-    "ahead_weight": FloatDistribution(0.0, 1.0),
-    "ahead_averaging_time": FloatDistribution(1.0, 60.0, log=True),
-}
+SPACE_AHEAD = {"ahead_weight": FloatDistribution(0, 1), "ahead_averaging_time": FloatDistribution(1, 60, log=True)}
 FIXED_PARAMETERS = {
     **{"gap_gain": 0.05, "catch_up_speed": 2.7, "time_constant": 0.3},
     **{"acceleration_limit": 0.53, "braking_limit": 0.36, "largest_gap": 91.0},
@@ -110,9 +107,7 @@ def measure_value(folder: str, count: int, latency: float | None, workers: int) 
     return [{"between": count, "latency": latency, **best}]
 
 
-def measure_test_value(
-    folder: str, count: int, found: Mapping[float | None, Mapping[str, float]], workers: int
-) -> Table:
+def measure_test_value(folder: str, count: int, found: dict[float | None, dict[str, float]], workers: int) -> Table:
     """Return the fuel on each test drive by latency with the parameters that were found, and that of the plan."""
     scenarios = roads_with_vehicles_between(Path(folder), count, TEST_MONTH)
     human = measure_candidates(scenarios, Human())

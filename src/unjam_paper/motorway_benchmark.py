@@ -46,7 +46,7 @@ BENCHMARK_RATES = (0.05, 0.1)
 """penetration rates with which methods are tuned and compared"""
 STUDY_NAME = "motorway-benchmark"
 CONTROLLER_METHOD = "jam-ahead"
-TEST_SETTINGS = range(SETTINGS_PER_HALF, len(SETTINGS))
+TUNING_SETTINGS, TEST_SETTINGS = SETTINGS[:SETTINGS_PER_HALF], range(SETTINGS_PER_HALF, len(SETTINGS))
 TEST_SEEDS, HARM_SEEDS, HUMAN_SEEDS = 20, 10, 5
 """episodes on a setting of the test half with and without a breakdown; of human traffic on one of the tuning half"""
 FIRST_EPISODES, FINALISTS = 4, 4
@@ -132,10 +132,7 @@ def measure_candidate(method: str, number: int, settings: Sequence[int], workers
 def measure_finalist(method: str, number: int, workers: int) -> list[dict[str, Any]]:
     """Return one episode of a candidate on each setting of the tuning half, as a list of one row."""
     candidate, (seed, *_) = METHODS[method].candidate(number), tuning_seeds(1)
-    jobs = [
-        (setting, candidate, BENCHMARK_RATES[(setting.number + number) % 2], seed)
-        for setting in SETTINGS[:SETTINGS_PER_HALF]
-    ]
+    jobs = [(each, candidate, BENCHMARK_RATES[(each.number + number) % 2], seed) for each in TUNING_SETTINGS]
     return [{"method": method, "candidate": number, "episodes": run_jobs(jobs, workers)}]
 
 
@@ -148,7 +145,7 @@ def measure_test(label: str, candidate: Candidate, rate: float, number: int, cou
 def measure_packaged(source: str, workers: int) -> Table:
     """Return one episode of the packaged law for motorways on each setting of the tuning half and penetration rate."""
     candidate, (seed, *_) = Candidate(PACKAGED_LAW, {"roadside.source": source}), tuning_seeds(1)
-    pairs = product(SETTINGS[:SETTINGS_PER_HALF], BENCHMARK_RATES)
+    pairs = product(TUNING_SETTINGS, BENCHMARK_RATES)
     rows = run_jobs([(setting, candidate, rate, seed) for setting, rate in pairs], workers)
     return [{"driver": source, **row} for row in rows]
 

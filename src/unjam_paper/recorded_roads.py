@@ -178,9 +178,8 @@ def untuned_driver(method: str) -> Driver:
 
 def tune_driver(folder: str, method: str, workers: int) -> Table:
     """Return the best candidates of a method after each generation, on the training drives."""
-    return search_parameters(
-        recorded_drives(Path(folder)), untuned_driver(method), SEARCH_SPACES[method], SEARCH_BUDGET
-    )
+    drives = recorded_drives(Path(folder))
+    return search_parameters(drives, untuned_driver(method), SEARCH_SPACES[method], SEARCH_BUDGET)
 
 
 def tuned_name(rows: Table, method: str) -> str:

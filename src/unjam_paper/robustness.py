@@ -78,13 +78,10 @@ VOLUME_ROADS = ("ring-5", "ring-11", "ring")
 """roads of Figure 10; controllers of the last are transferred to `TRANSFER_ROADS`"""
 VOLUME_VARIANTS = ("trpo", "ppo", "sac", "without-model", "proposed", "ours")
 TRANSFER_VARIANTS, TRANSFER_SOURCE, TRANSFER_EPISODES = ("proposed", "ours"), "ring", 20
+LONG_RING = {"scenario_options.vehicles": 44, "scenario_options.length": [520, 520]}
 TRANSFER_ROADS: dict[str, dict[str, Any]] = {
     **{f"{count} vehicles": STUDY_ROADS[road] for count, road in ((5, "ring-5"), (11, "ring-11"), (22, "ring"))},
-    "44 vehicles on 520 m": {
-        **STUDY_ROADS["ring"],
-        "scenario_options.vehicles": 44,
-        "scenario_options.length": [520, 520],
-    },
+    "44 vehicles on 520 m": STUDY_ROADS["ring"] | LONG_RING,
 }
 
 
@@ -170,12 +167,9 @@ def _transfer_table(folder: Path) -> pd.DataFrame:
 ROBUSTNESS = Study(
     title="packaged controllers with roads, human drivers and sensors that differ from training",
     make_parts=lambda study_folder, seeds: {
-        f"robustness/{road}, {name}": (
-            condition_rows,
-            (road, name, changes, ROAD_CONTROLLERS[road], CONDITION_EPISODES),
-        )
+        f"robustness/{road}, {key}": (condition_rows, (road, key, changes, ROAD_CONTROLLERS[road], CONDITION_EPISODES))
         for road, conditions in ROAD_CONDITIONS.items()
-        for name, changes in conditions.items()
+        for key, changes in conditions.items()
     },
     minutes=20.0,
     tables={road: partial(_robustness_table, road) for road in ROAD_CONDITIONS},

@@ -36,15 +36,13 @@ class Variant:
 
 
 def reduced_step_variants(
-    prefix: str, batch_steps: int, steps: int, horizon: int = 3000, **common_changes: Any
+    prefix: str, batch_steps: int, steps: int, horizon: int = 3000, **common: Any
 ) -> dict[str, Variant]:
     """Return `best` with an eighth of the steps of a road: alone, with twice as many, and with a model of the road.
 
     With the model, seven eighths of each iteration are episodes of `horizon` control steps in it.
     """
-    few, double = (
-        {"backend": "batch", **common_changes, "trpo.steps_per_iteration": times * batch_steps} for times in (1, 2)
-    )
+    few, double = ({"backend": "batch", **common, "trpo.steps_per_iteration": times * batch_steps} for times in (1, 2))
     model = {"model.model_ratio": 7.0, "model.kind": "road", "model.rollout_starts": "first", "model.k_max": horizon}
     return {
         f"{prefix}-few": Variant("unjam residual, few steps", "best", few, steps),

@@ -57,12 +57,10 @@ def check_driver(
         memory = after
 
 
-def check_row_independence(
-    compute: Callable[[slice], Any], label: str, unit: str = "CAVs", rows: int = PROBE_ROWS
-) -> None:
-    """Raise `InputError` if the first axis of what `compute` returns for `rows` rows is not the rows by themselves."""
-    together = np.asarray(compute(slice(rows)))
-    alone = np.concatenate([compute(slice(row, row + 1)) for row in range(rows)])
+def check_row_independence(compute: Callable[[slice], Any], label: str, unit: str = "CAVs") -> None:
+    """Raise `InputError` if the first axis of what `compute` returns for rows is not the rows by themselves."""
+    together = np.asarray(compute(slice(PROBE_ROWS)))
+    alone = np.concatenate([compute(slice(row, row + 1)) for row in range(PROBE_ROWS)])
     tolerance = MAX_PROBE_DIFFERENCE * max(1.0, float(np.abs(np.nan_to_num(alone)).max(initial=0.0)))
     if together.shape != alone.shape or not np.allclose(together, alone, rtol=0.0, atol=tolerance, equal_nan=True):
         raise InputError(f"{label}: {unit} influence each other; allowed: rows that are computed independently")

@@ -97,7 +97,7 @@ class Pacer(FormulaDriver):
     def _pace(self, state: LocalState) -> Array:
         """Return the pace by the free road ahead; with `use_tuned` of the nearest lap, for tensors, by all laps."""
         if not self.use_tuned:
-            return _limited_pace(state, self.harmonics, self.gap_gain, self.target_gap, self.lap_time)
+            return _pace_of(state, self.harmonics, self.gap_gain, self.target_gap, self.lap_time)
         loop, laps = state.loop_length, [*TUNED_PACES]
         if isinstance(loop, float):
             laps = [min(laps, key=lambda lap: abs(loop - lap))]
@@ -106,7 +106,7 @@ class Pacer(FormulaDriver):
         pace, nearest, xp = loop * 0.0, loop * 0.0 + inf, namespace(loop)
         for lap in laps:
             closer = abs(loop - lap) < nearest
-            pace = xp.where(closer, _limited_pace(state, *TUNED_PACES[lap]), pace)
+            pace = xp.where(closer, _pace_of(state, *TUNED_PACES[lap]), pace)
             nearest = xp.where(closer, abs(loop - lap), nearest)
         return pace
 
@@ -115,14 +115,12 @@ class Pacer(FormulaDriver):
         return as_column(memory["has_gathered"])
 
 
-def _limited_pace(
-    state: LocalState, harmonics: Harmonics, gap_gain: float, target_gap: float, lap_time: float = nan
-) -> Array:
+def _pace_of(state: LocalState, harmonics: Harmonics, gain: float, target_gap: float, lap_time: float = nan) -> Array:
     xp, loop, angle = namespace(state.speed), state.loop_length, lap_angle(state)
     pace = angle * 0.0 + harmonics[0] if harmonics else loop / lap_time
     for number, (cosine, sine) in enumerate(zip(harmonics[1::2], harmonics[2::2], strict=True), start=1):
         pace = pace + cosine * xp.cos(number * angle) + sine * xp.sin(number * angle)
-    return clamp_min(pace + gap_gain * (state.leader_gap - target_gap * loop), MIN_PACE)
+    return clamp_min(pace + gain * (state.leader_gap - target_gap * loop), MIN_PACE)
 
 
 @parameter_dataclass(frozen=True, config=STRICT)

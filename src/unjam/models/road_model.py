@@ -225,10 +225,8 @@ def fit_human_model(
     model.noise.fill_(sigma)
     targets = torch.from_numpy((rows.intended_speed - rows.base_speed)[:, None])
     fit = ensemble.fit_ensemble(model, _inputs(*rows[:ROAD_MODEL_INPUTS]), targets, is_holdout, settings, generator)
-    base_error, model_error = (
-        ensemble.root_mean_square(fit.targets),
-        ensemble.root_mean_square(fit.targets - fit.predictions),
-    )
+    base_error = ensemble.root_mean_square(fit.targets)
+    model_error = ensemble.root_mean_square(fit.targets - fit.predictions)
     is_base_enough = base_error < ensemble.MIN_CHANGE or model_error**2 > (1.0 - min_error_reduction) * base_error**2
     if settings.fallback_to_base and is_base_enough:
         model.output_mask.zero_()

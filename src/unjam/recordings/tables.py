@@ -190,10 +190,8 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     rows = "\n".join(lines[header + 1 :])
     if separator != "," and re.search(r"\d,\d", rows) and not re.search(r"\d\.\d", rows):
         options["decimal"] = ","
-    widest = (
-        0 if separator == r"\s+" else max(map(len, csv.reader(lines[header + 1 :], delimiter=separator)), default=0)
-    )
-    surplus = [f"surplus {number}" for number in range(widest - len(cells))]
+    width = 0 if separator == r"\s+" else max(map(len, csv.reader(lines[header + 1 :], delimiter=separator)), default=0)
+    surplus = [f"surplus {number}" for number in range(width - len(cells))]
     if surplus:  # pandas would take the first columns for an index, and shift all others
         names = options.get("names") or next(csv.reader([lines[header]], delimiter=separator))
         options = {"header": 0, **options, "names": [*names, *surplus]}

@@ -125,17 +125,14 @@ def _user_network_types_xml(scenario: Scenario, road: UserNetworkRoad) -> str:
         drivers = enumerate(road.drivers if name in road.calibrated_types else ())
         models = {reader.CALIBRATED_TYPE_TEMPLATE.format(name, number): _idm_attributes(idm) for number, idm in drivers}
         if name in cav_types:
-            models |= {
-                reader.CAV_TYPE_TEMPLATE.format(base): {**model, **cav} for base, model in {name: {}, **models}.items()
-            }
+            bases = {name: {}, **models}.items()
+            models |= {reader.CAV_TYPE_TEMPLATE.format(base): {**model, **cav} for base, model in bases}
         for variant, model in models.items():
-            lines.append(_type_variant_xml(variant, attributes, model, files.type_parameters.get(name, {})))
+            lines.append(_variant_xml(variant, attributes, model, files.type_parameters.get(name, {})))
     return "\n".join(["<additional>", *lines, "</additional>"])
 
 
-def _type_variant_xml(
-    name: str, attributes: XMLAttributes, car_following: XMLAttributes, parameters: dict[str, str]
-) -> str:
+def _variant_xml(name: str, attributes: XMLAttributes, car_following: XMLAttributes, parameters: dict[str, str]) -> str:
     keys = filter(reader.is_harmless_attribute, attributes.keys() - CAR_FOLLOWING_ATTRIBUTES)
     others = {key: attributes[key] for key in sorted(keys)}
     if attributes.get("carFollowModel") == "W99":  # which accelerates by its own parameter
