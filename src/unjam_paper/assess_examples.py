@@ -109,13 +109,11 @@ def write_on_ramp(folder: Path) -> Path:
     return write_configuration(folder, options)
 
 
+TRUCK_ROAD = OpenTestRoad((RoadSection(3000.0, 2, 33.0),), (0.75,), trucks=0.15)
 EXAMPLES: dict[str, Example] = {
     "a free road": (partial(write_road_files, OpenTestRoad((RoadSection(3000.0, 2, 25.0),), (0.15,))), 0.1),
     "a signalised grid": (write_grid, 0.1),
-    "a road with 15 % trucks": (
-        partial(write_road_files, OpenTestRoad((RoadSection(3000.0, 2, 33.0),), (0.75,), trucks=0.15)),
-        0.1,
-    ),
+    "a road with 15 % trucks": (partial(write_road_files, TRUCK_ROAD), 0.1),
     "an on-ramp with SUMO's default vehicles": (write_ramp, 0.05),
     "the scenario on-ramp as files": (write_on_ramp, 0.1),
 }

@@ -133,9 +133,8 @@ def comparison_rows(study_folder: StudyFolder, road: str, variants: Sequence[str
         row |= {"best_expert": label == best, "feasibility": verdicts[label]}
         row |= estimate_metrics(found, COMPARISON_METRICS)
         row["gain_over_best_expert"] = asdict(statistics.paired_difference(found, references[best], metric))
-        values = {
-            key: [each[name] for each in found if np.isfinite(each[name])] for key, (name, _) in PAPER_COLUMNS.items()
-        }
+        columns = {key: [each[name] for each in found] for key, (name, _) in PAPER_COLUMNS.items()}
+        values = {key: [each for each in column if np.isfinite(each)] for key, column in columns.items()}
         rows.append({**row, "paper_convention": {key: _mean_and_std(each) for key, each in values.items()}})
     trained = study_folder.trained_runs(road, variants, seeds)
     return [*rows, *(_variant_row(road, variant, runs, references) for variant, runs in trained.items())]

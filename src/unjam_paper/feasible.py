@@ -216,11 +216,8 @@ def feasible_table(road: str, folder: Path) -> pd.DataFrame:
         row["dissolved after [s]"] = _dissolution_text(comparison.values(group, "time_to_dissolve"))
         row["min time gap [s]"] = comparison.min_time_gap(group)
         own_gains = [gains[each] for each in group if each in gains]
-        row["string gain"] = (
-            " to ".join(f"{gain:.2f}" for gain in sorted({min(own_gains), max(own_gains)}))
-            if own_gains
-            else NO_VALUE_TEXT
-        )
+        ends = sorted({min(own_gains), max(own_gains)}) if own_gains else []
+        row["string gain"] = " to ".join(f"{gain:.2f}" for gain in ends) or NO_VALUE_TEXT
         rows.append({**row, "feasible": comparison.feasibility(group)})
     table = pd.DataFrame(rows)
     return table.loc[:, (table != NO_VALUE_TEXT).any()]

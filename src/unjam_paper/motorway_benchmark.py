@@ -323,10 +323,8 @@ def summary_table(folder: Path) -> pd.DataFrame:
     table: Table = []
     for rate in BENCHMARK_RATES if comparisons else ():
         own = [(number, rows) for number, each, rows in comparisons if each == rate]
-        changes = {
-            name: [_delay_change(rows, *pair, number).mean for number, rows in own]
-            for name, pair in COMPARISONS.items()
-        }
+        pairs = COMPARISONS.items()
+        changes = {name: [_delay_change(rows, *pair, number).mean for number, rows in own] for name, pair in pairs}
         flows = [relative_difference(rows[CONTROLLER], rows[HUMAN_LABEL], FLOW_METRIC).mean for _, rows in own]
         table.append(
             {

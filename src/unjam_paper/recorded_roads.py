@@ -390,7 +390,6 @@ def assumptions_table(folder: Path) -> pd.DataFrame:
     """Return the change of fuel by each driver under other assumptions, and by SUMO's emission model."""
     in_sumo = DriveResults(read_part(folder, SUMO_FUEL_PART))
     labels = [label for label in in_sumo.groups() if label != HUMAN_LABEL]
-
     parts = {setting: TEST_DRIVES_PART if setting == STANDARD_SETTING else setting for setting in DRIVE_SETTINGS}
     rows = [(name, DriveResults(read_part(folder, part)), "fuel_by_power") for name, part in parts.items()]
     rows.append(("fuel by SUMO's emission model", in_sumo, "fuel_ml_per_km"))
