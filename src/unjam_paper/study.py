@@ -341,7 +341,7 @@ def number_text(value: float | None, digits: int, sign: str = "") -> str:
 
 def interval_text(entries: Mapping[str, Any], digits: int, sign: str = "") -> str:
     """Return an estimate of a results file as pages show it: with its 95 % CI, else with the range if it is known."""
-    names = [each.name for each in fields(Estimate) if each.name in entries]
-    known = Estimate(**{name: nan if entries[name] is None else entries[name] for name in names})
+    values: dict[str, Any] = {name: nan if value is None else value for name, value in entries.items()}
+    known = Estimate(**{each.name: values[each.name] for each in fields(Estimate) if each.name in values})
     ci = format_ci(known, f"{sign}.{digits}f")
     return with_no_break_spaces(f"{number_text(known.mean, digits, sign)} {ci}".strip())
