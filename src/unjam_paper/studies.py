@@ -123,12 +123,8 @@ STUDIES: dict[str, Study] = {
     "all-roads-trained": all_roads.joint_training_study(
         "gain of one residual, and of TRPO and PPO without an expert, on all roads of the family",
         {"all-roads": 10, "all-roads-trpo": 5, "all-roads-ppo": 5},
-        *(
-            ALL_ROADS_GROUP,
-            all_roads.ALL_ROADS_BASELINES,
-            None,
-            all_roads.FAMILY_TEST_SEEDS[:5],
-        ),  # for each of twenty trainings
+        # five seeds for each of twenty trainings
+        *(ALL_ROADS_GROUP, all_roads.ALL_ROADS_BASELINES, None, all_roads.FAMILY_TEST_SEEDS[:5]),
     ),
 }
 STUDY_GROUPS: dict[str, tuple[str, ...]] = {

@@ -58,7 +58,7 @@ def check_driver(
 
 
 def check_row_independence(compute: Callable[[slice], Any], label: str, unit: str = "CAVs") -> None:
-    """Raise `InputError` if the first axis of what `compute` returns for rows is not the rows by themselves."""
+    """Raise `InputError` if the first axis of what `compute` returns is not the rows by themselves."""
     together = np.asarray(compute(slice(PROBE_ROWS)))
     alone = np.concatenate([compute(slice(row, row + 1)) for row in range(PROBE_ROWS)])
     tolerance = MAX_PROBE_DIFFERENCE * max(1.0, float(np.abs(np.nan_to_num(alone)).max(initial=0.0)))
