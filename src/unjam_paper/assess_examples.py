@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -55,8 +55,7 @@ def write_grid(folder: Path) -> Path:
     nodes = [(f"n{x}{y}", BLOCK_LENGTH * x, BLOCK_LENGTH * y, kind) for (x, y), kind in kinds.items()]
     edges = [
         (f"{x}{y}to{to_x}{to_y}", f"n{x}{y}", f"n{to_x}{to_y}", 2, 13.89)
-        for x, y in kinds
-        for to_x, to_y in kinds
+        for (x, y), (to_x, to_y) in product(kinds, kinds)
         if abs(x - to_x) + abs(y - to_y) == 1 and ((x, y) in signals or (to_x, to_y) in signals)
     ]
     last, routes = SIGNALS + 1, dict[str, float]()

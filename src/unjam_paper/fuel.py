@@ -6,6 +6,7 @@ evidence of smoother driving.
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -47,11 +48,8 @@ def idle_rate(episode: Episode) -> float:
 def measure_fuel(road: str, emission_class: str, drivers: Sequence[str], workers: int) -> Table:
     """Return the fuel [ml/km], the idle rate [l/h] and the mean speed [m/s] of drivers, one row for each episode."""
     scenario = make_scenario(road, {"emission_class": emission_class, "actuator": NO_LATENCY})
-    tasks = [
-        EpisodeTask(scenario, make_driver(name, scenario.control_step), seed, record_details=True)
-        for name in drivers
-        for seed in held_out_seeds(FUEL_SEEDS)
-    ]
+    pairs = product([make_driver(name, scenario.control_step) for name in drivers], held_out_seeds(FUEL_SEEDS))
+    tasks = [EpisodeTask(scenario, driver, seed, record_details=True) for driver, seed in pairs]
 
     def episode_row(number: int, episode: Episode, row: dict[str, Any]) -> dict[str, Any]:
         metrics = {name: row[name] for name in ("seed", "mean_speed", FUEL_METRIC)}

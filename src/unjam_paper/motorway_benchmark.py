@@ -180,8 +180,7 @@ def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     settings = settings_with_breakdown(human)
     parts |= {
         f"{TUNING_PART}/{method} {number}": (measure_candidate, (method, number, settings))
-        for number in range(CANDIDATES_PER_METHOD)
-        for method in METHODS
+        for number, method in product(range(CANDIDATES_PER_METHOD), METHODS)
     }
     if not (folder / f"{TUNING_PART}.json").is_file():
         return parts
@@ -213,8 +212,7 @@ def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     sensing = {source: replace(own, settings={**own.settings, "roadside.source": source}) for source in OTHER_SOURCES}
     parts |= {
         f"{SENSING_PART}/{source} {number}": (measure_test, (source, each, BENCHMARK_RATES[0], number, SENSING_SEEDS))
-        for source, each in sensing.items()
-        for number in hard
+        for (source, each), number in product(sensing.items(), hard)
     }
     parts |= {f"{SENSITIVITY_PART}/{name}": (measure_change, (name, own)) for name in CHANGES}
     return parts | {f"{PACKAGED_PART}/{source}": (measure_packaged, (source,)) for source in PACKAGED_SOURCES}
@@ -268,10 +266,8 @@ def candidates_table(folder: Path) -> pd.DataFrame:
 def parameter_effects_table(folder: Path) -> pd.DataFrame:
     """Return the relative change of delay per standard deviation of each parameter, by regression over all episodes."""
     human = read_part(folder, HUMAN_PART)
-    times = {
-        number: float(np.mean([row[TIME_METRIC] for row in human if row["setting"] == number]))
-        for number in settings_with_breakdown(human)
-    }
+    numbers, of_setting = settings_with_breakdown(human), group_rows(human, "setting")
+    times = {number: float(np.mean([row[TIME_METRIC] for row in of_setting[number]])) for number in numbers}
     delays = {number: time - SETTINGS[number].free_flow_time for number, time in times.items()}
     rows = [row for part in (TUNING_PART, FINAL_PART) for row in read_part(folder, part) if row["candidate"]]
     table: Table = []

@@ -98,12 +98,9 @@ def search_parameters(
         scores = measure_candidates(scenarios, driver, parameters)
         fuel = 100.0 * (scores.fuel / human.fuel - 1.0).mean(1)
         mean_gap, max_gap, time_gap = scores.mean_gap.mean(1), scores.max_gap.max(1), scores.min_time_gap.min(1)
-        total = (
-            fuel
-            + MEAN_GAP_PRICE * np.maximum(mean_gap - limits.largest_mean_gap + MARGIN, 0.0)
-            + MAX_GAP_PRICE * np.maximum(max_gap - limits.largest_gap + MARGIN, 0.0)
-            + TIME_GAP_PRICE * np.maximum(limits.time_gap - time_gap, 0.0)
-        )
+        total = fuel + MEAN_GAP_PRICE * np.maximum(mean_gap - limits.largest_mean_gap + MARGIN, 0.0)
+        total += MAX_GAP_PRICE * np.maximum(max_gap - limits.largest_gap + MARGIN, 0.0)
+        total += TIME_GAP_PRICE * np.maximum(limits.time_gap - time_gap, 0.0)
         order = np.argsort(total)
         elite = points[order[: round(ELITE_SHARE * budget.size)]]
         kept = KEPT_SHARE if generation else 0.0

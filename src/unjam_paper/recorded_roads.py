@@ -218,12 +218,9 @@ def compared_driver(folder: Path, name: str) -> Driver:
 
 
 def _drive_rows(name: str, scenarios: Sequence[Recorded], rows: Table, metrics: Sequence[str]) -> Table:
-    drives = (Path(each.recordings).stem for each in scenarios)
+    pairs = zip((Path(each.recordings).stem for each in scenarios), rows, strict=True)
     label = _entry(name) if name.endswith(SUFFIX) else name
-    return [
-        {"driver": label, "drive": drive, **{metric: row[metric] for metric in metrics}}
-        for drive, row in zip(drives, rows, strict=True)
-    ]
+    return [{"driver": label, "drive": drive, **{metric: row[metric] for metric in metrics}} for drive, row in pairs]
 
 
 def plan_driver(scenarios: list[Recorded]) -> PlannedDriver:

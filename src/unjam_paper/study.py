@@ -48,10 +48,8 @@ UNFILTERED_ROADS = {road: f"{road}-unfiltered" for road in ("ring", "figure-eigh
 """roads as in the paper, without the safety filter, by the road with it; the merge never has one"""
 UNSCALED_NOISE_ROAD = "ring-unfiltered-unscaled-noise"
 """... and with the noise of Table B1 in each step, not times the square root of the step as in Flow"""
-STUDY_ROADS |= {
-    unfiltered: {**STUDY_ROADS[road], "scenario_options.safety.active": False}
-    for road, unfiltered in UNFILTERED_ROADS.items()
-}
+NO_FILTER = {"scenario_options.safety.active": False}
+STUDY_ROADS |= {name: STUDY_ROADS[road] | NO_FILTER for road, name in UNFILTERED_ROADS.items()}
 STUDY_ROADS[UNSCALED_NOISE_ROAD] = {**STUDY_ROADS[UNFILTERED_ROADS["ring"]], "scenario_options.noise_scaling": "none"}
 ORIGINAL_ROADS = {**{each: road for road, each in UNFILTERED_ROADS.items()}, UNSCALED_NOISE_ROAD: "ring"}
 """the road with the filter, by its version without"""
