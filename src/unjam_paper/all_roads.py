@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from unjam.benchmarks.result import EPISODES_PER_ROAD, FAMILY_TEST_SEEDS
+from unjam.benchmarks.result import FAMILY_TEST_SEEDS
 from unjam.benchmarks.run import Seeds, drive_by_label
 from unjam.controller import PACKAGED_PREFIX
 from unjam.measures import gain
@@ -42,7 +42,7 @@ from unjam_paper.results_file import StudyPart, read_parts
 from unjam_paper.study import PlannedRun, Study, StudyFolder
 from unjam_paper.variants import RINGS_EXPERT, SHARED_RINGS_EXPERT, VARIANTS
 
-EXPERT_SELECTION_SEEDS = tuning_seeds(EPISODES_PER_ROAD, 1000)
+EXPERT_SELECTION_SEEDS = tuning_seeds(len(FAMILY_TEST_SEEDS), 1000)
 PI_TUNED_ON_RINGS = "pi:window=23,catch_up_speed=0.5994,gap_lower=3,gap_upper=50,time_constant=0.9775,safe_gap=4"
 """result of `unjam tune rings --expert pi --max-string-gain 0`"""
 PI_TUNED_ON_ALL = (
@@ -82,19 +82,15 @@ SINGLE_CONTROLLERS: dict[str, str] = {
 CLOSED_ROAD_CONTROLLERS = ("unjam:ring-best-ideal", "unjam:ring-jammed-best-ideal", "unjam:figure-eight-best")
 MOTORWAY_CONTROLLERS = ("unjam:on-ramp-tuned",)
 """packaged controllers, each with the control step of its type of road"""
-FAMILY_DRIVERS: dict[str, str] = {
-    **SINGLE_CONTROLLERS,
-    **{"jam-ahead": "jam-ahead", "FollowerStopper": "follower-stopper"},
-    **{name: name for name in (*CLOSED_ROAD_CONTROLLERS, *MOTORWAY_CONTROLLERS)},
-}
+FAMILY_DRIVERS: dict[str, str] = {**SINGLE_CONTROLLERS}
+FAMILY_DRIVERS |= {"jam-ahead": "jam-ahead", "FollowerStopper": "follower-stopper"}
+FAMILY_DRIVERS |= {name: name for name in (*CLOSED_ROAD_CONTROLLERS, *MOTORWAY_CONTROLLERS)}
 """drivers that are evaluated on every road, by label"""
 TWO_LAWS_LABEL = "PI on rings and figure eights, jam-ahead on motorways (tuned on all roads)"
 """label of the combination of two controllers by the type of road; its results are taken from theirs"""
 RING_GROUP = "rings"
-RING_BASELINES = {
-    RINGS_EXPERT: RINGS_EXPERT,
-    **{label: FAMILY_DRIVERS[label] for label in (PI_ON_RINGS_LABEL, "unjam:ring-best-ideal")},
-}
+RING_BASELINES = {RINGS_EXPERT: RINGS_EXPERT}
+RING_BASELINES |= {label: FAMILY_DRIVERS[label] for label in (PI_ON_RINGS_LABEL, "unjam:ring-best-ideal")}
 SHARED_RING_BASELINES = {SHARED_RINGS_EXPERT: SHARED_RINGS_EXPERT, RINGS_EXPERT: RINGS_EXPERT}
 ALL_ROADS_BASELINES = {label: FAMILY_DRIVERS[label] for label in ("unjam:best", PI_ON_RINGS_LABEL, "jam-ahead")}
 """drivers that are evaluated together with the trained ones; the first is the expert for these roads"""
@@ -268,10 +264,7 @@ ALL_ROADS_STUDY = Study(
     title="gain of one controller on every road of the family, training roads and unseen roads",
     make_parts=lambda study_folder, seeds: road_parts(FAMILY, _family_drivers, FAMILY_TEST_SEEDS, in_batches=False),
     minutes=60.0,
-    tables={
-        **{name: partial(all_roads_table, parts) for name, parts in TABLE_PARTS.items()},
-        "drivers": all_drivers_table,
-    },
+    tables={**{name: partial(all_roads_table, own) for name, own in TABLE_PARTS.items()}, "drivers": all_drivers_table},
 )
 
 
@@ -315,10 +308,8 @@ def joint_training_table(
     roads = road_gains(folder, parts)
     drivers = next(iter(roads.values()))["gains"]
     expert = next(iter(baselines))
-    groups = {
-        label: [driver for driver in drivers if label in (driver, driver.rpartition(" ")[0])]
-        for label in (*baselines, *labels)
-    }
+    every = *baselines, *labels
+    groups = {label: [each for each in drivers if label in (each, each.rpartition(" ")[0])] for label in every}
 
     def values_by_label(name: str) -> dict[str, Floats]:
         """Return a quantity of the drivers of each label, shape (roads, drivers, seeds)."""

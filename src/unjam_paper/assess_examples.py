@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,9 +16,9 @@ from unjam.measures.recommendation import ControllerResult
 from unjam.measures.statistics import Estimate, format_difference
 from unjam.scenarios.motorway import ON_RAMP
 from unjam.scenarios.road import Connection
+from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
 from unjam.training.assess import Assessment, assess, make_request
 from unjam.worlds.sumo.backend import sumo_inputs
-from unjam.worlds.sumo.inputs import CAV_TYPE_TEMPLATE
 from unjam.worlds.sumo.networks import network_file, xml_element
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.open_test_roads import (
@@ -55,8 +55,7 @@ def write_grid(folder: Path) -> Path:
     nodes = [(f"n{x}{y}", BLOCK_LENGTH * x, BLOCK_LENGTH * y, kind) for (x, y), kind in kinds.items()]
     edges = [
         (f"{x}{y}to{to_x}{to_y}", f"n{x}{y}", f"n{to_x}{to_y}", 2, 13.89)
-        for x, y in kinds
-        for to_x, to_y in kinds
+        for (x, y), (to_x, to_y) in product(kinds, kinds)
         if abs(x - to_x) + abs(y - to_y) == 1 and ((x, y) in signals or (to_x, to_y) in signals)
     ]
     last, routes = SIGNALS + 1, dict[str, float]()
@@ -109,13 +108,11 @@ def write_on_ramp(folder: Path) -> Path:
     return write_configuration(folder, options)
 
 
+TRUCK_ROAD = OpenTestRoad((RoadSection(3000.0, 2, 33.0),), (0.75,), trucks=0.15)
 EXAMPLES: dict[str, Example] = {
     "a free road": (partial(write_road_files, OpenTestRoad((RoadSection(3000.0, 2, 25.0),), (0.15,))), 0.1),
     "a signalised grid": (write_grid, 0.1),
-    "a road with 15 % trucks": (
-        partial(write_road_files, OpenTestRoad((RoadSection(3000.0, 2, 33.0),), (0.75,), trucks=0.15)),
-        0.1,
-    ),
+    "a road with 15 % trucks": (partial(write_road_files, TRUCK_ROAD), 0.1),
     "an on-ramp with SUMO's default vehicles": (write_ramp, 0.05),
     "the scenario on-ramp as files": (write_on_ramp, 0.1),
 }

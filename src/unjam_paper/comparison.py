@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 
 from unjam.measures import statistics
 from unjam.measures.feasibility import feasibility_by_driver, overall_feasibility
-from unjam.measures.metric_table import estimate_cell
 from unjam.measures.metrics import METRICS
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
 from unjam.reports.results import PlotEpisode, read_results, validation_gains
@@ -37,6 +36,7 @@ from unjam_paper.study import (
     StudyFolder,
     Table,
     TrainedRun,
+    estimate_text,
     number_text,
     planned_runs,
     trainings_text,
@@ -133,9 +133,8 @@ def comparison_rows(study_folder: StudyFolder, road: str, variants: Sequence[str
         row |= {"best_expert": label == best, "feasibility": verdicts[label]}
         row |= estimate_metrics(found, COMPARISON_METRICS)
         row["gain_over_best_expert"] = asdict(statistics.paired_difference(found, references[best], metric))
-        values = {
-            key: [each[name] for each in found if np.isfinite(each[name])] for key, (name, _) in PAPER_COLUMNS.items()
-        }
+        columns = {key: [each[name] for each in found] for key, (name, _) in PAPER_COLUMNS.items()}
+        values = {key: [each for each in column if np.isfinite(each)] for key, column in columns.items()}
         rows.append({**row, "paper_convention": {key: _mean_and_std(each) for key, each in values.items()}})
     trained = study_folder.trained_runs(road, variants, seeds)
     return [*rows, *(_variant_row(road, variant, runs, references) for variant, runs in trained.items())]
@@ -212,7 +211,7 @@ def _checkpoint_table(road: str, folder: Path) -> pd.DataFrame:
             difference = statistics.estimate_over_trainings(last - best, bounds=(-inf, 0.0))
             cells = {"": VARIANTS[row["variant"]].label, "trainings": len(values)}
             cells |= {"best trained": number_text(best.mean(), 0), "last checkpoint": number_text(last.mean(), 0)}
-            cells |= {"last − best": str(estimate_cell(difference, 0, sign="+"))}
+            cells |= {"last − best": estimate_text(difference, 0, "+")}
             table.append({**cells, "kept the untrained network": f"{row['untrained_count']} of {len(values)}"})
     return pd.DataFrame(table)
 

@@ -112,7 +112,7 @@ def measure_harm(controller: str, road: OpenTestRoad, workers: int) -> dict[str,
         file = write_road_files(road, Path(folder))
         while rates := [rate for rate in PENETRATION_RATES if _needs_seeds(all_rows, rate)]:
             first = len(all_rows.get(HUMAN_LABEL, ()))
-            for label, rows in _run_seed_batch(file, road, first, rates, pool).items():
+            for label, rows in _run_batch(file, road, first, rates, pool).items():
                 all_rows.setdefault(label, []).extend(rows)
     return {"rows": all_rows}
 
@@ -122,9 +122,7 @@ def _needs_seeds(rows: Mapping[str, Table], rate: float) -> bool:
     return count < MAX_SEEDS and _evaluate_rate(rows, rate).verdict == HARM_UNDECIDED
 
 
-def _run_seed_batch(
-    file: Path, road: OpenTestRoad, first: int, rates: Sequence[float], pool: WorkerPool
-) -> dict[str, Table]:
+def _run_batch(file: Path, road: OpenTestRoad, first: int, rates: list[float], pool: WorkerPool) -> dict[str, Table]:
     """Return the rows of seeds from number `first` on by label: the human baseline, and at these rates both drivers."""
     seeds = held_out_seeds(SEED_BATCH, first)
     drivers = {HUMAN_LABEL: (HUMAN_LABEL, rates[0])}

@@ -34,11 +34,9 @@ CONTROLLER_ROADS: dict[str, str] = {
     **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned-ideal")},
 }
 """packaged controllers for closed roads that were tuned or trained for ideal cars, and the road of each"""
-USUAL_CAR_ROADS: dict[str, str] = {
-    **{"unjam:ring-best": "ring", "unjam:ring-gap-tuned": "ring"},
-    **{f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
-    "unjam:figure-eight-tuned": "figure-eight",
-}
+USUAL_CAR_ROADS: dict[str, str] = {"unjam:ring-best": "ring", "unjam:ring-gap-tuned": "ring"}
+USUAL_CAR_ROADS |= {f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")}
+USUAL_CAR_ROADS |= {"unjam:figure-eight-tuned": "figure-eight"}
 """those that are evaluated in usual cars"""
 LANE_CONTROLLERS = ("unjam:on-ramp-tuned",)
 USUAL_CAR_CONTROLLERS = tuple(name for name, road in USUAL_CAR_ROADS.items() if road != "figure-eight")
@@ -66,11 +64,8 @@ IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "delay 0.2 s, lag 0.5 s": {"actuator": Actuator(delay=0.2, lag=0.5)},
     "delay 0.5 s, lag 0.5 s": {"actuator": Actuator(delay=0.5, lag=0.5)},
     **{
-        label: {
-            "sensors": Sensors(**dict.fromkeys(SENSED, error)),
-            "safety": SafetyFilter(**dict.fromkeys(SENSED, error)),
-        }
-        for label, error in {"gap and speed off by up to 0.3": 0.3, "off by up to 1.0": 1.0}.items()
+        label: {"sensors": Sensors(**dict.fromkeys(SENSED, off)), "safety": SafetyFilter(**dict.fromkeys(SENSED, off))}
+        for label, off in {"gap and speed off by up to 0.3": 0.3, "off by up to 1.0": 1.0}.items()
     },
     "every tenth reading missing": {"sensors": Sensors(dropout=0.1)},
     "every third reading missing": {"sensors": Sensors(dropout=1.0 / 3.0)},

@@ -25,19 +25,9 @@ from unjam.scenarios.motorway import ON_RAMP
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
 from unjam.training.presets import preset_values
+from unjam_paper import study
 from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.string_stability import measure_string_gains
-from unjam_paper.study import (
-    NO_VALUE_TEXT,
-    DriverComparison,
-    DriverSource,
-    PlannedRun,
-    Study,
-    StudyFolder,
-    evaluate_in_batches,
-    evaluate_metrics,
-    planned_runs,
-)
 from unjam_paper.variants import ON_RAMP_JAM_AHEAD
 
 GAINS_SUFFIX = "-string-gains"
@@ -46,10 +36,8 @@ SEEDS_PER_SIZE = 10
 """test seeds for each length or radius"""
 PI_TUNED_LABEL, GAP_PI_LABEL, GAP_PI_JAMMED_LABEL = "PI, tuned", "gap PI, tuned", "gap PI, tuned on the jammed ring"
 GAP_PI_JAMMED_LONG_LABEL = f"{GAP_PI_JAMMED_LABEL}, double budget"
-GAP_PI_RETUNED_LABEL, GAP_PI_IDEAL_LABEL = (
-    "gap PI, tuned for usual cars",
-    "gap PI, tuned on the jammed ring for ideal cars",
-)
+GAP_PI_RETUNED_LABEL = "gap PI, tuned for usual cars"
+GAP_PI_IDEAL_LABEL = "gap PI, tuned on the jammed ring for ideal cars"
 IDEAL_RESIDUAL_LABEL = "residual trained for ideal cars"
 PI_LONG_TUNED = (
     "pi:window=13.31,catch_up_speed=1.193,gap_lower=5.997,gap_upper=58.76,"
@@ -80,8 +68,8 @@ the ranges of `unjam tune`. From an even standstill this is the limit speed"""
 PACER_LONG_TUNED = (
     "pacer:use_tuned=true,gathering_speed=1.96,gathering_gap=0.319,regathering_gap=0.1595,time_constant=0.0966"
 )
-"""result of `unjam tune figure-eight --expert pacer --max-string-gain 0 --reward eq16 --steps 4860000`, without
-parameters that have no effect; with 600,000 steps it is `unjam:figure-eight-tuned-ideal`"""
+"""result of `unjam tune figure-eight --expert pacer --max-string-gain 0 --reward eq16 --steps 4860000`; both gaps
+have no effect with `use_tuned`. With 600,000 steps it is `unjam:figure-eight-tuned-ideal`"""
 PACER_TUNED_LABEL, PACER_GENTLE_LABEL = "pacer, tuned", "pacer, tuned, gentle"
 PACER_LONG_LABEL = "pacer, tuned, training budget"
 FEASIBILITY_STUDY_METRICS = (
@@ -92,16 +80,12 @@ FEASIBILITY_STUDY_METRICS = (
 ON_RAMP_ROAD = replace(ON_RAMP, penetration_rate=0.05)
 ON_RAMP_SEEDS = 100
 ON_RAMP_TUNED_LABEL, LARGER_BUDGET_LABEL = "unjam:on-ramp-tuned", "tuned, larger budget"
-ON_RAMP_DRIVERS = {
-    **{HUMAN_LABEL: "human", "ACC baseline": "cruise"},
-    **{ON_RAMP_TUNED_LABEL: ON_RAMP_TUNED_LABEL, LARGER_BUDGET_LABEL: ON_RAMP_JAM_AHEAD},
-}
+ON_RAMP_DRIVERS = {HUMAN_LABEL: "human", "ACC baseline": "cruise"}
+ON_RAMP_DRIVERS |= {ON_RAMP_TUNED_LABEL: ON_RAMP_TUNED_LABEL, LARGER_BUDGET_LABEL: ON_RAMP_JAM_AHEAD}
 """drivers that do not learn; residuals are added to one of the last two"""
 ON_RAMP_TIME, ON_RAMP_FLOW = "travel_time", "outflow_veh_per_h"
-ON_RAMP_METRICS = (
-    *(ON_RAMP_TIME, ON_RAMP_FLOW, "human_braking_beyond_4_5", "mean_speed", "fuel_ml_per_km"),
-    *("feasibility", "min_time_gap", "cav_max_braking"),
-)
+ON_RAMP_METRICS = (ON_RAMP_TIME, ON_RAMP_FLOW, "human_braking_beyond_4_5", "mean_speed", "fuel_ml_per_km")
+ON_RAMP_METRICS += ("feasibility", "min_time_gap", "cav_max_braking")
 
 
 @dataclass(frozen=True)
@@ -111,12 +95,12 @@ class EvaluationRoad:
     sizes: tuple[int, ...]
     """lengths or radii [m]"""
     make_scenario: Callable[[int], Scenario]
-    drivers: dict[str, DriverSource]
+    drivers: dict[str, study.DriverSource]
     baselines: tuple[str, ...]
     """labels of the tuned experts to which drivers are compared"""
     metric: str = "return"
     """the return that the trainings maximize"""
-    evaluate: Callable[..., dict[str, Any]] = evaluate_metrics
+    evaluate: Callable[..., dict[str, Any]] = study.evaluate_metrics
     gain_road: str = ""
     """scenario on which string gains are measured; empty: they are not"""
 
@@ -125,14 +109,14 @@ def _limit_leader(ring: Ring) -> Driver:
     return FollowerStopper(desired_speed=ring.limit_speed(ring.length[0]), gaps=(0.5, 1.0, 1.5), time_constant=3.0)
 
 
-CEILING: dict[str, DriverSource] = {"speed-limit leader": _limit_leader}
+CEILING: dict[str, study.DriverSource] = {"speed-limit leader": _limit_leader}
 """a driver that leads all vehicles to the speed limit of the road; the first gap says it where all start evenly"""
 RING_LENGTHS = (220, 230, 240, 250, 260, 270)
-RING_DRIVERS: dict[str, DriverSource] = {
+RING_DRIVERS: dict[str, study.DriverSource] = {
     **{HUMAN_LABEL: "human", "PI": "pi", "PI (paper)": "pi:time_constant=0", PI_TUNED_LABEL: PI_LONG_TUNED},
     **{GAP_PI_LABEL: "unjam:ring-gap-tuned", GAP_PI_JAMMED_LABEL: "unjam:ring-jammed-tuned-ideal"},
 }
-USUAL_CAR_DRIVERS: dict[str, DriverSource] = {
+USUAL_CAR_DRIVERS: dict[str, study.DriverSource] = {
     **{HUMAN_LABEL: "human", "PI": "pi", "PI (paper)": "pi:time_constant=0"},
     **{GAP_PI_LABEL: "unjam:ring-gap-tuned", GAP_PI_JAMMED_LABEL: "unjam:ring-jammed-tuned"},
 }
@@ -157,7 +141,7 @@ FEASIBLE_ROADS = {
             **{IDEAL_RESIDUAL_LABEL: "unjam:ring-best-ideal", **CEILING},
         },
         baselines=(GAP_PI_LABEL, GAP_PI_RETUNED_LABEL, FIRST_GAP_LABEL),
-        evaluate=evaluate_in_batches,
+        evaluate=study.evaluate_in_batches,
         gain_road="ring",
     ),
     "ring-jammed-usual-car": EvaluationRoad(
@@ -168,7 +152,7 @@ FEASIBLE_ROADS = {
             **{IDEAL_RESIDUAL_LABEL: "unjam:ring-jammed-best-ideal", **CEILING},
         },
         baselines=(GAP_PI_JAMMED_LABEL, GAP_PI_IDEAL_LABEL),
-        evaluate=evaluate_in_batches,
+        evaluate=study.evaluate_in_batches,
         gain_road="ring-jammed",
     ),
     "figure-eight": EvaluationRoad(
@@ -185,13 +169,13 @@ FEASIBLE_ROADS = {
 }
 
 
-def _feasible_parts(variants: Mapping[str, str], study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+def _feasible_parts(variants: Mapping[str, str], study_folder: study.StudyFolder, seeds: int) -> dict[str, StudyPart]:
     parts: dict[str, StudyPart] = {}
     for name, variant in variants.items():
-        road, runs = FEASIBLE_ROADS[name], planned_runs([name], [variant], seeds)
+        road, runs = FEASIBLE_ROADS[name], study.planned_runs([name], [variant], seeds)
         trained = {f"training {run.seed}": run for run in runs}
         for other in variants.keys() - {name}:
-            trained["residual trained on the other road"] = PlannedRun(other, variants[other], 0)
+            trained["residual trained on the other road"] = study.PlannedRun(other, variants[other], 0)
         drivers = road.drivers | {label: study_folder.run_folder(run) for label, run in trained.items()}
         for size in road.sizes:
             arguments = road.make_scenario(size), drivers, SEEDS_PER_SIZE, FEASIBILITY_STUDY_METRICS
@@ -204,7 +188,7 @@ def _feasible_parts(variants: Mapping[str, str], study_folder: StudyFolder, seed
 
 def feasible_table(road: str, folder: Path) -> pd.DataFrame:
     """Return for each driver the metrics over all sizes, and the differences to the tuned experts."""
-    comparison, about = DriverComparison([*read_part(folder, road).values()]), FEASIBLE_ROADS[road]
+    comparison, about = study.DriverComparison([*read_part(folder, road).values()]), FEASIBLE_ROADS[road]
     gains: dict[str, float] = read_part(folder, f"{road}{GAINS_SUFFIX}") if about.gain_road else {}
     rows = []
     for label, group in comparison.groups({"training": "residual"}).items():
@@ -218,27 +202,24 @@ def feasible_table(road: str, folder: Path) -> pd.DataFrame:
         row["dissolved after [s]"] = _dissolution_text(comparison.values(group, "time_to_dissolve"))
         row["min time gap [s]"] = comparison.min_time_gap(group)
         own_gains = [gains[each] for each in group if each in gains]
-        row["string gain"] = (
-            " to ".join(f"{gain:.2f}" for gain in sorted({min(own_gains), max(own_gains)}))
-            if own_gains
-            else NO_VALUE_TEXT
-        )
+        ends = sorted({min(own_gains), max(own_gains)}) if own_gains else []
+        row["string gain"] = " to ".join(f"{gain:.2f}" for gain in ends) or study.NO_VALUE_TEXT
         rows.append({**row, "feasible": comparison.feasibility(group)})
     table = pd.DataFrame(rows)
-    return table.loc[:, (table != NO_VALUE_TEXT).any()]
+    return table.loc[:, (table != study.NO_VALUE_TEXT).any()]
 
 
 def _dissolution_text(times: Floats) -> str:
     share = np.isfinite(times).mean()
-    return NO_VALUE_TEXT if not share else f"{np.nanmean(times):.1f}" + (f" ({share:.0%})" if share < 1.0 else "")
+    return study.NO_VALUE_TEXT if not share else f"{np.nanmean(times):.1f}" + (f" ({share:.0%})" if share < 1.0 else "")
 
 
-def feasible_study(title: str, variants: Mapping[str, str], minutes: float) -> Study:
+def feasible_study(title: str, variants: Mapping[str, str], minutes: float) -> study.Study:
     """Return the study that compares trainings with tuned experts of closed roads; `variants`: one by road."""
-    return Study(
+    return study.Study(
         title=title,
         make_runs=lambda seeds: [
-            run for road, variant in variants.items() for run in planned_runs([road], [variant], seeds)
+            run for road, name in variants.items() for run in study.planned_runs([road], [name], seeds)
         ],
         make_parts=partial(_feasible_parts, variants),
         minutes=minutes,
@@ -246,27 +227,27 @@ def feasible_study(title: str, variants: Mapping[str, str], minutes: float) -> S
     )
 
 
-def on_ramp_study(variants: Mapping[str, str]) -> Study:
+def on_ramp_study(variants: Mapping[str, str]) -> study.Study:
     """Return the study of variants that are trained on the on-ramp, with their labels in the table."""
-    return Study(
+    return study.Study(
         title="residual compared with tuned experts on the on-ramp, 5 % CAVs",
-        make_runs=partial(planned_runs, ["on-ramp"], tuple(variants)),
+        make_runs=partial(study.planned_runs, ["on-ramp"], tuple(variants)),
         make_parts=partial(_on_ramp_parts, tuple(variants)),
         minutes=35.0,
         tables={"on-ramp": partial(_on_ramp_table, variants)},
     )
 
 
-def _on_ramp_parts(variants: Sequence[str], study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
-    drivers: dict[str, DriverSource] = {**ON_RAMP_DRIVERS}
+def _on_ramp_parts(variants: Sequence[str], study_folder: study.StudyFolder, seeds: int) -> dict[str, StudyPart]:
+    drivers: dict[str, study.DriverSource] = {**ON_RAMP_DRIVERS}
     for variant, seed in product(variants, range(seeds)):
-        drivers[f"{variant} {seed}"] = study_folder.controller_folder(PlannedRun("on-ramp", variant, seed))
-    return {"on-ramp": (evaluate_metrics, (ON_RAMP_ROAD, drivers, ON_RAMP_SEEDS, ON_RAMP_METRICS))}
+        drivers[f"{variant} {seed}"] = study_folder.controller_folder(study.PlannedRun("on-ramp", variant, seed))
+    return {"on-ramp": (study.evaluate_metrics, (ON_RAMP_ROAD, drivers, ON_RAMP_SEEDS, ON_RAMP_METRICS))}
 
 
 def _on_ramp_table(variants: Mapping[str, str], folder: Path) -> pd.DataFrame:
     """Return travel time and flow of each driver, and the differences to tuned experts and to the human baseline."""
-    comparison = DriverComparison([read_part(folder, "on-ramp")])
+    comparison = study.DriverComparison([read_part(folder, "on-ramp")])
     rows = []
     for label, group in comparison.groups(variants).items():
         row = {"driver": label, "travel time [s]": comparison.mean(group, ON_RAMP_TIME, 1)}
@@ -275,7 +256,7 @@ def _on_ramp_table(variants: Mapping[str, str], folder: Path) -> pd.DataFrame:
         row["difference to human baseline [s]"] = comparison.difference(group, HUMAN_LABEL, ON_RAMP_TIME, 1)
         flow = comparison.difference(group, HUMAN_LABEL, ON_RAMP_FLOW, 0)
         row["flow, difference to human baseline [veh/h]"] = flow
-        row["min time gap [s]"] = NO_VALUE_TEXT if label == HUMAN_LABEL else comparison.min_time_gap(group)
+        row["min time gap [s]"] = study.NO_VALUE_TEXT if label == HUMAN_LABEL else comparison.min_time_gap(group)
         several = f"{comparison.verdicts(group).count(FEASIBLE)} of {len(group)}"
         rows.append({**row, "feasible": comparison.feasibility(group) if len(group) == 1 else several})
     return pd.DataFrame(rows)

@@ -22,16 +22,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from unjam.following.four_regimes import MIN_REGIME_GAP, FourRegimesSettings, make_four_regimes
 from unjam.following.leader_replay import add_residual, as_driver_model, idm_function
 from unjam.following.networks import NetworkSettings, batched_network, fit_one_step
-from unjam.physics.arrays import clamp_min
+from unjam.physics.arrays import Floats, clamp_min
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
-from unjam.recordings.trajectories import (
-    SPLITS,
-    Floats,
-    FollowingSamples,
-    following_samples,
-    select_splits,
-    split_by_driver,
-)
+from unjam.recordings.trajectories import SPLITS, FollowingSamples, following_samples, select_splits, split_by_driver
 from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, TEXT_COLOR, new_figure
 from unjam_paper.results_file import read_part, write_part
 from unjam_paper.study import Study, StudyFolder, Table
@@ -232,9 +225,7 @@ def _set_log_axes(axes: Axes, title: str) -> None:
 
 FIGURE_6 = Study(
     title="networks that learn car following, with and without a car-following model",
-    make_parts=lambda study_folder, seeds: {
-        f"figure-6/{fit.name}": (measure_fit, (fit,)) for fit in four_regime_fits()
-    },
+    make_parts=lambda folder, seeds: {f"figure-6/{fit.name}": (measure_fit, (fit,)) for fit in four_regime_fits()},
     write=_write_figure_6,
     minutes=25.0,
     figures={"figure-6": lambda folder: figure_6(read_part(folder, "figure-6")["rows"])},

@@ -6,6 +6,7 @@ evidence of smoother driving.
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pandas as pd
 
 from unjam.controller import make_driver
 from unjam.measures.effect import FUEL_METRIC
-from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
+from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import GASOLINE_DENSITY
 from unjam.measures.statistics import metric_estimate, paired_difference
 from unjam.road_family import NO_LATENCY
@@ -23,7 +24,7 @@ from unjam.seeds import held_out_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.results_file import read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, Table, measure_tasks
+from unjam_paper.study import Study, Table, estimate_text, measure_tasks
 
 EMISSION_CLASSES = {"HBEFA4": "HBEFA4/PC_petrol_Euro-6ab", "PHEMlight": "PHEMlight/PC_G_EU4"}
 """emission classes of SUMO, by model"""
@@ -47,11 +48,8 @@ def idle_rate(episode: Episode) -> float:
 def measure_fuel(road: str, emission_class: str, drivers: Sequence[str], workers: int) -> Table:
     """Return the fuel [ml/km], the idle rate [l/h] and the mean speed [m/s] of drivers, one row for each episode."""
     scenario = make_scenario(road, {"emission_class": emission_class, "actuator": NO_LATENCY})
-    tasks = [
-        EpisodeTask(scenario, make_driver(name, scenario.control_step), seed, record_details=True)
-        for name in drivers
-        for seed in held_out_seeds(FUEL_SEEDS)
-    ]
+    pairs = product([make_driver(name, scenario.control_step) for name in drivers], held_out_seeds(FUEL_SEEDS))
+    tasks = [EpisodeTask(scenario, driver, seed, record_details=True) for driver, seed in pairs]
 
     def episode_row(number: int, episode: Episode, row: dict[str, Any]) -> dict[str, Any]:
         metrics = {name: row[name] for name in ("seed", "mean_speed", FUEL_METRIC)}
@@ -69,11 +67,11 @@ def fuel_table(road: str, folder: Path) -> pd.DataFrame:
         by_driver = {name: [row for row in rows if row["driver"] == name] for name in FUEL_DRIVERS[road]}
         for name, own in by_driver.items():
             speed = metric_estimate(own, "mean_speed").mean
-            difference = paired_difference(own, by_driver[HUMAN_LABEL], FUEL_METRIC)
+            human = by_driver[HUMAN_LABEL]
+            difference = None if own is human else paired_difference(own, human, FUEL_METRIC)
             cells = table.setdefault(name, {"": name, "mean speed [m/s]": f"{speed:.2f}"})
             cells[f"{model} [ml/km]"] = f"{metric_estimate(own, FUEL_METRIC).mean:.0f}"
-            is_human = name == HUMAN_LABEL
-            cells[f"{model}, difference"] = NO_VALUE_TEXT if is_human else str(estimate_cell(difference, 0, sign="+"))
+            cells[f"{model}, difference"] = estimate_text(difference, 0, "+")
             cells[f"{model}, idling at {rate:.1f} l/h"] = f"{rate * 1e6 / SECONDS_PER_HOUR / speed:.0f}"
     return pd.DataFrame(table.values())
 

@@ -14,15 +14,13 @@ import numpy as np
 import pandas as pd
 
 from unjam.drivers import Human
-from unjam.measures.metric_table import estimate_cell
-from unjam.measures.statistics import estimate
 from unjam.measures.traffic_facts import TrafficFacts, measure_traffic
 from unjam.scenarios import Motorway, make_scenario
 from unjam.seeds import held_out_seeds, tuning_seeds
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.results_file import read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, Table, measure_tasks
+from unjam_paper.study import NO_VALUE_TEXT, Study, Table, mean_text, measure_tasks
 
 CANDIDATES, CANDIDATE_SEEDS, FINAL_SEEDS = 60, 3, 20
 """number of candidates, of episodes of each, and of episodes with the best one and each simulation step"""
@@ -46,12 +44,13 @@ CAPACITY_ROAD: dict[str, Any] = {
 class Target:
     """A fact that simulated traffic should match: a value and an accepted range, from recordings of real motorways."""
 
-    measure: Callable[[TrafficFacts], float]
     name: str
     value: float
     accepted: tuple[float, float]
     digits: int
     source: str
+    factor: float = 1.0
+    """by which facts have the unit of the value"""
 
     def deviation(self, value: float) -> float:
         """Return the distance to the value, in half widths of the accepted range."""
@@ -61,59 +60,50 @@ class Target:
 
 TARGETS: dict[str, Target] = {
     "highest_flow": Target(
-        lambda facts: facts.highest_flow,
         "highest flow in 5 min before a breakdown [veh/h per lane]",
         *(1950.0, (1800.0, 2200.0), 0),
         "10 % trucks: 2,205 (ROA2017, table 4.3); mean capacity of 38 bottlenecks 1,800 to 2,100 (Geistefeldt and "
         "Shojaat 2019)",
     ),
     "discharge": Target(
-        lambda facts: facts.discharge,
         "discharge of the queue [veh/h per lane]",
         *(1780.0, (1650.0, 1950.0), 0),
         "2,016 passenger cars on average, 5 % below capacity (Zhang and Levinson 2004)",
     ),
     "capacity_drop": Target(
-        lambda facts: 100.0 * facts.capacity_drop,
         "capacity drop [%]",
         *(8.0, (4.0, 13.0), 1),
-        "2 to 11 % at 27 sites (Zhang and Levinson 2004); up to 10 % (Cassidy and Bertini 1999)",
+        factor=100.0,
+        source="2 to 11 % at 27 sites (Zhang and Levinson 2004); up to 10 % (Cassidy and Bertini 1999)",
     ),
     "wave_speed": Target(
-        lambda facts: -3.6 * facts.wave_speed,
         "speed of waves, upstream [km/h]",
         *(17.0, (14.0, 20.0), 1),
-        "14 to 20 (Zielke, Bertini and Treiber 2008)",
+        factor=-3.6,
+        source="14 to 20 (Zielke, Bertini and Treiber 2008)",
     ),
     "free_time_gap": Target(
-        lambda facts: facts.free_time_gap,
         "median net time gap in dense free traffic [s]",
         *(1.3, (1.0, 1.6), 2),
         "1.3 to 1.8 on average (Nishinari, Treiber and Helbing 2003)",
     ),
     "congested_time_gap": Target(
-        lambda facts: facts.congested_time_gap,
         "median net time gap in congestion [s]",
         *(1.65, (1.4, 2.0), 2),
         "1.65 at 6 to 9 m/s, 1.94 at 3 to 6 m/s (NGSIM I-80)",
     ),
     "lane_changes_per_km": Target(
-        lambda facts: facts.lane_changes_per_km,
         "lane changes per vehicle and km in dense free traffic",
         *(0.4, (0.2, 0.6), 2),
         "0.5, most just below the critical density (Knoop et al. 2012); at least 0.12 in light traffic (highD, 2018)",
     ),
     "merge_ratio": Target(
-        lambda facts: facts.merge_ratio,
         "ramp : right lane in congestion",
         *(0.9, (0.5, 1.3), 2),
         "nearly fixed, independent of the discharge (Cassidy and Ahn 2005); about 1 : 1",
     ),
     "hardest_braking": Target(
-        lambda facts: facts.hardest_braking,
-        "99.9 % quantile of decelerations near the merge [m/s²]",
-        *(3.0, (2.4, 4.0), 2),
-        "2.6 (NGSIM I-80)",
+        "99.9 % quantile of decelerations near the merge [m/s²]", *(3.0, (2.4, 4.0), 2), "2.6 (NGSIM I-80)"
     ),
 }
 
@@ -187,7 +177,7 @@ def fact_values(rows: Table, target: str) -> list[float]:
     """Return the values of a fact in its unit, without those of episodes that do not show it."""
     names = [each.name for each in fields(TrafficFacts)]
     facts = (TrafficFacts(**{name: nan if row[name] is None else row[name] for name in names}) for row in rows)
-    return [value for each in facts if isfinite(value := TARGETS[target].measure(each))]
+    return [value for each in facts if isfinite(value := TARGETS[target].factor * getattr(each, target))]
 
 
 def total_deviation(rows: Table) -> float:
@@ -203,10 +193,9 @@ def facts_table(folder: Path) -> pd.DataFrame:
     for name, target in TARGETS.items():
         row: dict[str, Any] = {"fact": target.name, "target": "{:g} to {:g}".format(*target.accepted)}
         for step, rows in steps.items():
-            row[f"step of {step:g} s"] = str(estimate_cell(estimate(fact_values(rows, name)), target.digits))
+            row[f"step of {step:g} s"] = mean_text(fact_values(rows, name), target.digits)
         table.append({**row, "source": target.source})
-    delays = {f"step of {step:g} s": estimate([each["delay"] for each in rows]) for step, rows in steps.items()}
-    cells = {step: str(estimate_cell(each, 0)) for step, each in delays.items()}
+    cells = {f"step of {step:g} s": mean_text([each["delay"] for each in rows], 0) for step, rows in steps.items()}
     same = "within 10 % of each other"
     table.append({"fact": "mean delay with that at the entrance [s]", "target": same, **cells, "source": NO_VALUE_TEXT})
     return pd.DataFrame(table)

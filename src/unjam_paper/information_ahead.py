@@ -6,7 +6,6 @@ speed of the first vehicle before its waves arrive. Fuel counts from the CAV on.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import cast
@@ -15,12 +14,10 @@ import numpy as np
 import pandas as pd
 from optuna.distributions import FloatDistribution
 
-from unjam.controller import make_driver
+from unjam.drivers import Human
 from unjam.drivers.driver import Memory
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.smooth_acc import SmoothACC, update_mean
-from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
-from unjam.measures.statistics import estimate
 from unjam.physics.arrays import Array, Floats
 from unjam.scenarios import Recorded
 from unjam.scenarios.road import RecordedRoad
@@ -32,7 +29,6 @@ from unjam_paper.parameter_search import RowScores, SearchBudget, measure_candid
 from unjam_paper.recorded_roads import (
     IDEAL_CAR,
     PLAN_LABEL,
-    SEARCH_SEED,
     SEARCH_SPACES,
     TEST_DRIVES_PART,
     TEST_MONTH,
@@ -41,7 +37,7 @@ from unjam_paper.recorded_roads import (
     recorded_drives,
 )
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, mean_text
 
 VEHICLES_BETWEEN = (10, 20, 40)
 """human drivers between the connected vehicle and the CAV"""
@@ -50,14 +46,9 @@ LATENCIES: tuple[float | None, ...] = (None, 0.0, 5.0, 15.0)
 FOLLOWERS = 5
 VALUE_BUDGET = SearchBudget(generations=10, size=24)
 SHARED_SPACE = {name: SEARCH_SPACES["smooth-acc"][name] for name in ("time_gap", "averaging_time", "leader_weight")}
-SPACE_AHEAD = {
-    "ahead_weight": FloatDistribution(0.0, 1.0),
-    "ahead_averaging_time": FloatDistribution(1.0, 60.0, log=True),
-}
-FIXED_PARAMETERS = {
-    **{"gap_gain": 0.05, "catch_up_speed": 2.7, "time_constant": 0.3},
-    **{"acceleration_limit": 0.53, "braking_limit": 0.36, "largest_gap": 91.0},
-}
+SPACE_AHEAD = {"ahead_weight": FloatDistribution(0, 1), "ahead_averaging_time": FloatDistribution(1, 60, log=True)}
+FIXED_PARAMETERS = {"gap_gain": 0.05, "catch_up_speed": 2.7, "time_constant": 0.3}
+FIXED_PARAMETERS |= {"acceleration_limit": 0.53, "braking_limit": 0.36, "largest_gap": 91.0}
 """of the search without information, see `unjam_paper.recorded_roads`"""
 INFORMATION_STUDY, PART = "information-ahead", "value"
 
@@ -109,19 +100,15 @@ def informed_driver(scenarios: list[Recorded], latency: float | None, parameters
 def measure_value(folder: str, count: int, latency: float | None, workers: int) -> Table:
     """Return the best parameters with a latency on the training drives, as a list of one row."""
     scenarios = roads_with_vehicles_between(Path(folder), count)
-    human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
     space = SHARED_SPACE if latency is None else SHARED_SPACE | SPACE_AHEAD
-    driver = informed_driver(scenarios, latency, {})
-    best = search_parameters(scenarios, driver, space, human, SEARCH_SEED, VALUE_BUDGET)[-1]
+    best = search_parameters(scenarios, informed_driver(scenarios, latency, {}), space, VALUE_BUDGET)[-1]
     return [{"between": count, "latency": latency, **best}]
 
 
-def measure_test_value(
-    folder: str, count: int, found: Mapping[float | None, Mapping[str, float]], workers: int
-) -> Table:
+def measure_test_value(folder: str, count: int, found: dict[float | None, dict[str, float]], workers: int) -> Table:
     """Return the fuel on each test drive by latency with the parameters that were found, and that of the plan."""
     scenarios = roads_with_vehicles_between(Path(folder), count, TEST_MONTH)
-    human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
+    human = measure_candidates(scenarios, Human())
     scores: dict[float | str | None, RowScores] = {
         latency: measure_candidates(scenarios, informed_driver(scenarios, latency, parameters))
         for latency, parameters in found.items()
@@ -139,9 +126,8 @@ def measure_test_value(
 
 def plan_behind_humans(scenarios: list[Recorded]) -> PlannedDriver:
     """Return the plan of a CAV that knows the future of the vehicle ahead, which does not react to it."""
-    human = make_driver(HUMAN_LABEL, TIME_STEP)
     speeds, gaps = list[Floats](), list[float]()
-    for episode in run_batches([EpisodeTask(each, human, (0,)) for each in scenarios]):
+    for episode in run_batches([EpisodeTask(each, Human(), (0,)) for each in scenarios]):
         speeds.append(episode.speeds[:, FOLLOWERS + 1])
         start = episode.positions[0]
         gaps.append(float(start[FOLLOWERS + 1] - start[FOLLOWERS]) - VEHICLE_LENGTH)
@@ -167,12 +153,12 @@ def value_table(folder: Path) -> pd.DataFrame:
     """Return what the CAV saves on the test drives by distance and latency, and the difference to no information."""
     rows, table = read_part(folder, TEST_DRIVES_PART), list[dict[str, str]]()
     by_case = {(row["between"], row["latency"]): np.array(row["by_drive"]) for row in rows}
-    names, cell = {None: "nothing received", PLAN_LABEL: PLAN_LABEL}, partial(estimate_cell, digits=2, sign="+")
+    names = {None: "nothing received", PLAN_LABEL: PLAN_LABEL}
     for (between, latency), changes in by_case.items():
         cells = {"vehicles between": str(between), "latency [s]": names.get(latency) or f"{latency:g}"}
-        cells["fuel [%]"] = str(cell(estimate(changes.tolist())))
-        difference = cell(estimate((changes - by_case[between, None]).tolist()))
-        cells["difference to nothing received"] = NO_VALUE_TEXT if latency is None else str(difference)
+        cells["fuel [%]"] = mean_text(changes, 2, "+")
+        difference = mean_text(changes - by_case[between, None], 2, "+")
+        cells["difference to nothing received"] = NO_VALUE_TEXT if latency is None else difference
         cells["share of the plan's saving"] = f"{changes.mean() / by_case[between, PLAN_LABEL].mean():.2f}"
         table.append(cells)
     gaps = [f"{row['mean_gap']:.0f} / {row['max_gap']:.0f}" for row in rows]

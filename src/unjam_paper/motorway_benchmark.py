@@ -28,7 +28,7 @@ from unjam_paper.do_no_harm import HARM_METRICS
 from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF, EnsembleSetting
 from unjam_paper.motorway_methods import CANDIDATE_SEED, CANDIDATES_PER_METHOD, METHODS, Candidate
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, measure_tasks
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, mean_text, measure_tasks
 
 HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
 SENSING_PART, SENSITIVITY_PART, PACKAGED_PART = "sensing", "sensitivity", "packaged"
@@ -46,7 +46,7 @@ BENCHMARK_RATES = (0.05, 0.1)
 """penetration rates with which methods are tuned and compared"""
 STUDY_NAME = "motorway-benchmark"
 CONTROLLER_METHOD = "jam-ahead"
-TEST_SETTINGS = range(SETTINGS_PER_HALF, len(SETTINGS))
+TUNING_SETTINGS, TEST_SETTINGS = SETTINGS[:SETTINGS_PER_HALF], range(SETTINGS_PER_HALF, len(SETTINGS))
 TEST_SEEDS, HARM_SEEDS, HUMAN_SEEDS = 20, 10, 5
 """episodes on a setting of the test half with and without a breakdown; of human traffic on one of the tuning half"""
 FIRST_EPISODES, FINALISTS = 4, 4
@@ -132,10 +132,7 @@ def measure_candidate(method: str, number: int, settings: Sequence[int], workers
 def measure_finalist(method: str, number: int, workers: int) -> list[dict[str, Any]]:
     """Return one episode of a candidate on each setting of the tuning half, as a list of one row."""
     candidate, (seed, *_) = METHODS[method].candidate(number), tuning_seeds(1)
-    jobs = [
-        (setting, candidate, BENCHMARK_RATES[(setting.number + number) % 2], seed)
-        for setting in SETTINGS[:SETTINGS_PER_HALF]
-    ]
+    jobs = [(each, candidate, BENCHMARK_RATES[(each.number + number) % 2], seed) for each in TUNING_SETTINGS]
     return [{"method": method, "candidate": number, "episodes": run_jobs(jobs, workers)}]
 
 
@@ -148,7 +145,7 @@ def measure_test(label: str, candidate: Candidate, rate: float, number: int, cou
 def measure_packaged(source: str, workers: int) -> Table:
     """Return one episode of the packaged law for motorways on each setting of the tuning half and penetration rate."""
     candidate, (seed, *_) = Candidate(PACKAGED_LAW, {"roadside.source": source}), tuning_seeds(1)
-    pairs = product(SETTINGS[:SETTINGS_PER_HALF], BENCHMARK_RATES)
+    pairs = product(TUNING_SETTINGS, BENCHMARK_RATES)
     rows = run_jobs([(setting, candidate, rate, seed) for setting, rate in pairs], workers)
     return [{"driver": source, **row} for row in rows]
 
@@ -183,8 +180,7 @@ def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     settings = settings_with_breakdown(human)
     parts |= {
         f"{TUNING_PART}/{method} {number}": (measure_candidate, (method, number, settings))
-        for number in range(CANDIDATES_PER_METHOD)
-        for method in METHODS
+        for number, method in product(range(CANDIDATES_PER_METHOD), METHODS)
     }
     if not (folder / f"{TUNING_PART}.json").is_file():
         return parts
@@ -216,8 +212,7 @@ def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     sensing = {source: replace(own, settings={**own.settings, "roadside.source": source}) for source in OTHER_SOURCES}
     parts |= {
         f"{SENSING_PART}/{source} {number}": (measure_test, (source, each, BENCHMARK_RATES[0], number, SENSING_SEEDS))
-        for source, each in sensing.items()
-        for number in hard
+        for (source, each), number in product(sensing.items(), hard)
     }
     parts |= {f"{SENSITIVITY_PART}/{name}": (measure_change, (name, own)) for name in CHANGES}
     return parts | {f"{PACKAGED_PART}/{source}": (measure_packaged, (source,)) for source in PACKAGED_SOURCES}
@@ -271,10 +266,8 @@ def candidates_table(folder: Path) -> pd.DataFrame:
 def parameter_effects_table(folder: Path) -> pd.DataFrame:
     """Return the relative change of delay per standard deviation of each parameter, by regression over all episodes."""
     human = read_part(folder, HUMAN_PART)
-    times = {
-        number: float(np.mean([row[TIME_METRIC] for row in human if row["setting"] == number]))
-        for number in settings_with_breakdown(human)
-    }
+    numbers, of_setting = settings_with_breakdown(human), group_rows(human, "setting")
+    times = {number: float(np.mean([row[TIME_METRIC] for row in of_setting[number]])) for number in numbers}
     delays = {number: time - SETTINGS[number].free_flow_time for number, time in times.items()}
     rows = [row for part in (TUNING_PART, FINAL_PART) for row in read_part(folder, part) if row["candidate"]]
     table: Table = []
@@ -301,14 +294,14 @@ def comparison_table(folder: Path) -> pd.DataFrame:
         if OPPONENT not in rows:
             continue
         setting, human, own = SETTINGS[number], rows[HUMAN_LABEL], rows[CONTROLLER]
-        delay = estimate([row[TIME_METRIC] - setting.free_flow_time for row in human])
+        delay = mean_text([row[TIME_METRIC] - setting.free_flow_time for row in human], 0)
         table.append(
             {
                 "motorway": number,
                 "road": setting.road,
                 "demand": setting.demand,
                 "CAVs": f"{100 * rate:g} %",
-                "delay of human traffic [s]": str(estimate_cell(delay, 0)),
+                "delay of human traffic [s]": delay,
                 "of which unavoidable [s]": f"{setting.unavoidable_delay:.0f}",
                 "waiting at entrances [s]": f"{np.mean([row['waiting_at_entrances'] for row in human]):.0f}",
                 **{name: _percent(_delay_change(rows, *pair, number)) for name, pair in COMPARISONS.items()},
@@ -326,10 +319,8 @@ def summary_table(folder: Path) -> pd.DataFrame:
     table: Table = []
     for rate in BENCHMARK_RATES if comparisons else ():
         own = [(number, rows) for number, each, rows in comparisons if each == rate]
-        changes = {
-            name: [_delay_change(rows, *pair, number).mean for number, rows in own]
-            for name, pair in COMPARISONS.items()
-        }
+        pairs = COMPARISONS.items()
+        changes = {name: [_delay_change(rows, *pair, number).mean for number, rows in own] for name, pair in pairs}
         flows = [relative_difference(rows[CONTROLLER], rows[HUMAN_LABEL], FLOW_METRIC).mean for _, rows in own]
         table.append(
             {
@@ -379,10 +370,9 @@ def sensitivity_table(folder: Path) -> pd.DataFrame:
     table: Table = []
     for name, rows in _read_measured(folder, SENSITIVITY_PART).items():
         pairs = pair_rows(rows[CONTROLLER], rows[HUMAN_LABEL])
-        gains = estimate([own[TIME_METRIC] - each[TIME_METRIC] for own, each in pairs])
-        human = estimate([each[TIME_METRIC] for _, each in pairs])
-        row = {"changed": name, "human traffic [s]": str(estimate_cell(human, 0))}
-        table.append(row | {"change [s]": str(estimate_cell(gains, 1, sign="+"))})
+        gains = [own[TIME_METRIC] - each[TIME_METRIC] for own, each in pairs]
+        row = {"changed": name, "human traffic [s]": mean_text([each[TIME_METRIC] for _, each in pairs], 0)}
+        table.append(row | {"change [s]": mean_text(gains, 1, "+")})
     return pd.DataFrame(table)
 
 

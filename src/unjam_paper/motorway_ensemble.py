@@ -15,15 +15,13 @@ import pandas as pd
 
 from unjam.drivers import Human
 from unjam.measures.effect import TIME_METRIC
-from unjam.measures.metric_table import estimate_cell
 from unjam.measures.metrics import measure
-from unjam.measures.statistics import estimate
 from unjam.scenarios import Motorway, make_scenario
 from unjam.seeds import tuning_seeds
 from unjam.worlds.episode import run_episode
 from unjam_paper.human_traffic import POPULATIONS, TARGETS, fact_values, measure_scenario
 from unjam_paper.results_file import read_part
-from unjam_paper.study import Study, Table
+from unjam_paper.study import Study, Table, mean_text
 
 SETTINGS_PER_HALF, DESIGN_SEED = 12, 20261128
 CAPACITY_SEEDS = 5
@@ -142,10 +140,8 @@ def _draw_settings() -> list[EnsembleSetting]:
     return settings
 
 
-CAPACITIES: tuple[float, ...] = (
-    *(1926, 1806, 1627, 1694, 1836, 1758, 1757, 1644, 1766, 1721, 1670, 1579),
-    *(1710, 1657, 1717, 1655, 1742, 1744, 1781, 1736, 1787, 1612, 1507, 1877),
-)
+CAPACITIES: tuple[float, ...] = (1926, 1806, 1627, 1694, 1836, 1758, 1757, 1644, 1766, 1721, 1670, 1579)
+CAPACITIES += (1710, 1657, 1717, 1655, 1742, 1744, 1781, 1736, 1787, 1612, 1507, 1877)
 """flow before a breakdown of each setting: means of the part `capacity` [veh/h per lane]"""
 SETTING_FREE_FLOW_TIMES: tuple[float, ...] = (
     *(132.2, 140.7, 133.9, 134.0, 184.4, 136.3, 141.2, 134.1, 136.5, 135.7, 183.9, 134.9),
@@ -177,10 +173,8 @@ def settings_table(folder: Path) -> pd.DataFrame:
     capacities, table = read_part(folder, CAPACITY_PART), list[dict[str, Any]]()
     for setting in SETTINGS:
         rows = capacities[str(setting.number)]["episodes"]
-        facts = {
-            TARGETS[name].name: str(estimate_cell(estimate(fact_values(rows, name)), TARGETS[name].digits))
-            for name in ("highest_flow", "discharge", "capacity_drop")
-        }
+        targets = {name: TARGETS[name] for name in ("highest_flow", "discharge", "capacity_drop")}
+        facts = {each.name: mean_text(fact_values(rows, name), each.digits) for name, each in targets.items()}
         # The median, because the estimate of a single episode may be many times any real speed.
         wave, speeds = TARGETS["wave_speed"], fact_values(rows, "wave_speed")
         facts[f"{wave.name}: median (episodes)"] = f"{np.median(speeds):.{wave.digits}f} ({len(speeds)})"

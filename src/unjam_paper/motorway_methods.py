@@ -29,11 +29,8 @@ class Candidate:
         """All parameters as numbers: a way to change lanes is 1 if it is set, a choice 1 if it is true."""
         _, parameters = split_parameters(self.driver)
         values = {**parameters, **self.settings}
-        return {
-            name: float(value is not None) if name in LANE_CHANGING else float(value)
-            for name, value in values.items()
-            if not name.endswith(".active")
-        }
+        kept = {name: each for name, each in values.items() if not name.endswith(".active")}
+        return {name: float(each is not None if name in LANE_CHANGING else each) for name, each in kept.items()}
 
 
 @dataclass(frozen=True)

@@ -209,11 +209,8 @@ def write_network(
         ("connection", "con", ("from", "to", "fromLane", "toLane"), connections),
     )
     tables = {(tag, suffix): [dict(zip(names, row, strict=True)) for row in rows] for tag, suffix, names, rows in parts}
-    inputs = {
-        (f"--{tag}-files", f"road.{suffix}.xml"): xml_document(f"{tag}s", tag, rows)
-        for (tag, suffix), rows in tables.items()
-        if rows
-    }
+    used = [(f"--{tag}-files", f"road.{suffix}.xml", tag, rows) for (tag, suffix), rows in tables.items() if rows]
+    inputs = {(option, name): xml_document(f"{tag}s", tag, rows) for option, name, tag, rows in used}
     run_netconvert(inputs, ["--no-turnarounds=true", *options], folder)
     routes = f"<routes>{''.join(traffic)}</routes>"
     (folder / "road.rou.xml").write_text(routes)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from optuna.distributions import FloatDistribution
 
+from unjam.drivers import Human
 from unjam.drivers.driver import Driver
 from unjam.physics.arrays import Floats
 from unjam.physics.fuel import fuel_rate
@@ -18,6 +19,7 @@ from unjam_paper.fuel_optimal_plan import PlanLimits
 ELITE_SHARE, KEPT_SHARE, SMALLEST_SPREAD = 0.2, 0.3, 0.03
 """share of candidates that define the next generation; share of the last distribution that stays; smallest standard
 deviation of a parameter, relative to its range"""
+SEARCH_SEED = 0
 LIMITS = PlanLimits()
 """limits of a candidate"""
 MEAN_GAP_PRICE, MAX_GAP_PRICE, TIME_GAP_PRICE = 0.3, 0.2, 20.0
@@ -79,13 +81,11 @@ def search_parameters(
     scenarios: Sequence[Recorded],
     driver: Driver,
     space: Mapping[str, FloatDistribution],
-    human: RowScores,
-    seed: int,
     budget: SearchBudget,
     limits: PlanLimits = LIMITS,
 ) -> list[dict[str, Any]]:
     """Return the best candidate after each generation: its parameters, fuel relative to human drivers [%], gaps."""
-    generator = np.random.default_rng(seed)
+    human, generator = measure_candidates(scenarios, Human()), np.random.default_rng(SEARCH_SEED)
     mean, spread = np.full(len(space), 0.5), np.full(len(space), 0.35)
     best: dict[str, Any] = {"score": np.inf}
     history = list[dict[str, Any]]()
@@ -98,12 +98,9 @@ def search_parameters(
         scores = measure_candidates(scenarios, driver, parameters)
         fuel = 100.0 * (scores.fuel / human.fuel - 1.0).mean(1)
         mean_gap, max_gap, time_gap = scores.mean_gap.mean(1), scores.max_gap.max(1), scores.min_time_gap.min(1)
-        total = (
-            fuel
-            + MEAN_GAP_PRICE * np.maximum(mean_gap - limits.largest_mean_gap + MARGIN, 0.0)
-            + MAX_GAP_PRICE * np.maximum(max_gap - limits.largest_gap + MARGIN, 0.0)
-            + TIME_GAP_PRICE * np.maximum(limits.time_gap - time_gap, 0.0)
-        )
+        total = fuel + MEAN_GAP_PRICE * np.maximum(mean_gap - limits.largest_mean_gap + MARGIN, 0.0)
+        total += MAX_GAP_PRICE * np.maximum(max_gap - limits.largest_gap + MARGIN, 0.0)
+        total += TIME_GAP_PRICE * np.maximum(limits.time_gap - time_gap, 0.0)
         order = np.argsort(total)
         elite = points[order[: round(ELITE_SHARE * budget.size)]]
         kept = KEPT_SHARE if generation else 0.0

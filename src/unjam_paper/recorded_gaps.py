@@ -11,16 +11,14 @@ from typing import Any
 import pandas as pd
 from optuna.distributions import FloatDistribution
 
-from unjam.controller import make_driver
 from unjam.drivers.smooth_acc import SmoothACC
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import METRICS
 from unjam_paper.fuel_optimal_plan import PlanLimits
-from unjam_paper.parameter_search import SearchBudget, measure_candidates, search_parameters
+from unjam_paper.parameter_search import SearchBudget, search_parameters
 from unjam_paper.recorded_roads import (
     PUBLISHED_FILES,
     SEARCH_PART,
-    SEARCH_SEED,
     SEARCH_SPACES,
     STANDARD_SETTING,
     TEST_DRIVES_PART,
@@ -57,11 +55,9 @@ def search_space(law: str, limits: PlanLimits) -> dict[str, FloatDistribution]:
 
 def tune_law(folder: str, law: str, mean_gap: float, workers: int) -> Table:
     """Return the best parameters of a law with a mean gap [m] on the training drives, as a list of one row."""
-    scenarios, limits = recorded_drives(Path(folder)), gap_limits(mean_gap)
-    human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
-    driver = replace(SmoothACC(time_step=TIME_STEP), **FIXED_BY_LAW[law])
-    space = search_space(law, limits)
-    best = search_parameters(scenarios, driver, space, human, SEARCH_SEED, GAPS_BUDGET, limits)[-1]
+    driver, limits = replace(SmoothACC(time_step=TIME_STEP), **FIXED_BY_LAW[law]), gap_limits(mean_gap)
+    space, scenarios = search_space(law, limits), recorded_drives(Path(folder))
+    best = search_parameters(scenarios, driver, space, GAPS_BUDGET, limits)[-1]
     return [{"law": law, "mean gap": mean_gap, **best}]
 
 

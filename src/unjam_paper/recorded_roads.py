@@ -27,7 +27,7 @@ from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.smooth_acc import SmoothACC
 from unjam.errors import InputError
 from unjam.measures.feasibility import FEASIBLE
-from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
+from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import METRICS, measure
 from unjam.measures.statistics import estimate_on_shared_seeds
 from unjam.onnx_models import parse_model
@@ -40,10 +40,10 @@ from unjam.worlds.batch.run import run_batches
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.fuel_optimal_plan import PlanLimits, PlannedDriver, plan_speeds
-from unjam_paper.parameter_search import SearchBudget, measure_candidates, search_parameters
+from unjam_paper.parameter_search import SearchBudget, search_parameters
 from unjam_paper.recorded_residuals import RESIDUALS_PART, planned_residuals, residuals_table, train_residual
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, estimate_text
 
 TUNED_METHOD = "smooth-acc"
 """the law that residuals are added to"""
@@ -104,7 +104,7 @@ DRIVE_METRICS = (
 )
 IDEAL_CAR: dict[str, Any] = {"actuator": Actuator(), "safety": SafetyFilter(active=False), "actuation": "raw"}
 """the car of a plan"""
-SEARCH_SEED, SEARCH_BUDGET = 0, SearchBudget()
+SEARCH_BUDGET = SearchBudget()
 PLAN_LABEL = "plan that knows the recording"
 DRIVES_PARTS = {TRAINING_DRIVES_PART: TRAINING_MONTH, TEST_DRIVES_PART: TEST_MONTH}
 SETTING_METRICS = "fuel_by_power", "cav_mean_gap", "min_time_gap", "feasibility"
@@ -160,10 +160,8 @@ def untuned_driver(method: str) -> Driver:
 
 def tune_driver(folder: str, method: str, workers: int) -> Table:
     """Return the best candidates of a method after each generation, on the training drives."""
-    scenarios = recorded_drives(Path(folder))
-    human = measure_candidates(scenarios, make_driver(HUMAN_LABEL, TIME_STEP))
-    driver, space = untuned_driver(method), SEARCH_SPACES[method]
-    return search_parameters(scenarios, driver, space, human, SEARCH_SEED, SEARCH_BUDGET)
+    drives = recorded_drives(Path(folder))
+    return search_parameters(drives, untuned_driver(method), SEARCH_SPACES[method], SEARCH_BUDGET)
 
 
 def tuned_name(rows: Table, method: str) -> str:
@@ -202,12 +200,9 @@ def compared_driver(folder: Path, name: str) -> Driver:
 
 
 def _drive_rows(name: str, scenarios: Sequence[Recorded], rows: Table, metrics: Sequence[str]) -> Table:
-    drives = (Path(each.recordings).stem for each in scenarios)
+    pairs = zip((Path(each.recordings).stem for each in scenarios), rows, strict=True)
     label = _entry(name) if name.endswith(SUFFIX) else name
-    return [
-        {"driver": label, "drive": drive, **{metric: row[metric] for metric in metrics}}
-        for drive, row in zip(drives, rows, strict=True)
-    ]
+    return [{"driver": label, "drive": drive, **{metric: row[metric] for metric in metrics}} for drive, row in pairs]
 
 
 def plan_driver(scenarios: list[Recorded]) -> PlannedDriver:
@@ -278,7 +273,7 @@ class DriveResults:
         if label in (HUMAN_LABEL, baseline):
             return NO_VALUE_TEXT
         values = self.change(label, metric, is_relative, baseline)
-        return str(estimate_cell(estimate_on_shared_seeds(values), 2, sign="+"))
+        return estimate_text(estimate_on_shared_seeds(values), 2, "+")
 
 
 def _short_name(label: str) -> str:
@@ -323,7 +318,6 @@ def assumptions_table(folder: Path) -> pd.DataFrame:
     """Return the change of fuel by each driver under other assumptions, and by SUMO's emission model."""
     in_sumo = DriveResults(read_part(folder, SUMO_FUEL_PART))
     labels = [label for label in in_sumo.groups() if label != HUMAN_LABEL]
-
     parts = {setting: TEST_DRIVES_PART if setting == STANDARD_SETTING else setting for setting in DRIVE_SETTINGS}
     rows = [(name, DriveResults(read_part(folder, part)), "fuel_by_power") for name, part in parts.items()]
     rows.append(("fuel by SUMO's emission model", in_sumo, "fuel_ml_per_km"))

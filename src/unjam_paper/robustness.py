@@ -20,29 +20,16 @@ from unjam.road_family import NGSIM_IDM
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import load_config
 from unjam.training.evaluate import TRAINED_LABEL
+from unjam_paper import study
 from unjam_paper.comparison import COMPARISON_METRICS, comparison_rows, estimate_metrics, training_curves
 from unjam_paper.results_file import StudyPart, read_part, write_part
-from unjam_paper.study import (
-    STUDY_ROADS,
-    UNFILTERED_ROADS,
-    PlannedRun,
-    Study,
-    StudyFolder,
-    Table,
-    evaluate_drivers,
-    interval_text,
-    number_text,
-    planned_runs,
-)
 from unjam_paper.variants import VARIANTS
 
 CONDITION_EPISODES = 10
 """number of episodes of each driver under each condition"""
 TUNED_EXPERT = "tuned expert"
-ROBUSTNESS_METRICS = (
-    *("mean_speed", "mean_speed_steady", "speed_std_fleet", "min_time_gap", "collisions"),
-    "insertion_backlog_veh",
-)
+ROBUSTNESS_METRICS = ("mean_speed", "mean_speed_steady", "speed_std_fleet", "min_time_gap", "collisions")
+ROBUSTNESS_METRICS += ("insertion_backlog_veh",)
 COMMON_CONDITIONS: dict[str, dict[str, Any]] = {
     "as in training": {},
     "twice the noise": {"noise": 0.4},
@@ -52,12 +39,9 @@ COMMON_CONDITIONS: dict[str, dict[str, Any]] = {
     "two CAVs": {"cavs": 2},
 }
 """differences from training: changes to the scenario, and `impairments`, the arguments of `ImpairedDriver`"""
-RING_CONDITIONS: dict[str, dict[str, Any]] = {
-    **COMMON_CONDITIONS,
-    "one CAV in 44, 520 m": {"vehicles": 44, "length": [520, 520]},
-    "200 to 219 m": {"length": [200, 219]},
-    "271 to 300 m": {"length": [271, 300]},
-}
+RING_CONDITIONS: dict[str, dict[str, Any]] = {**COMMON_CONDITIONS}
+RING_CONDITIONS |= {"one CAV in 44, 520 m": {"vehicles": 44, "length": [520, 520]}}
+RING_CONDITIONS |= {"200 to 219 m": {"length": [200, 219]}, "271 to 300 m": {"length": [271, 300]}}
 ROAD_CONDITIONS: dict[str, dict[str, dict[str, Any]]] = {
     "ring": {**RING_CONDITIONS, "after ten minutes of jam": {"warmup": 6000}},
     "ring-jammed": {**RING_CONDITIONS, "before there is a jam": {"warmup": 0}},
@@ -78,26 +62,23 @@ VOLUME_ROADS = ("ring-5", "ring-11", "ring")
 """roads of Figure 10; controllers of the last are transferred to `TRANSFER_ROADS`"""
 VOLUME_VARIANTS = ("trpo", "ppo", "sac", "without-model", "proposed", "ours")
 TRANSFER_VARIANTS, TRANSFER_SOURCE, TRANSFER_EPISODES = ("proposed", "ours"), "ring", 20
+LONG_RING = {"scenario_options.vehicles": 44, "scenario_options.length": [520, 520]}
 TRANSFER_ROADS: dict[str, dict[str, Any]] = {
-    **{f"{count} vehicles": STUDY_ROADS[road] for count, road in ((5, "ring-5"), (11, "ring-11"), (22, "ring"))},
-    "44 vehicles on 520 m": {
-        **STUDY_ROADS["ring"],
-        "scenario_options.vehicles": 44,
-        "scenario_options.length": [520, 520],
-    },
+    **{f"{count} vehicles": study.STUDY_ROADS[road] for count, road in ((5, "ring-5"), (11, "ring-11"), (22, "ring"))},
+    "44 vehicles on 520 m": study.STUDY_ROADS["ring"] | LONG_RING,
 }
 
 
 def condition_rows(
     road: str, condition: str, changes: Mapping[str, Any], controllers: tuple[str, str], episodes: int, workers: int
-) -> Table:
+) -> study.Table:
     """Return a row for the human baseline and for both `controllers`, the trained one and the tuned expert."""
     trained, tuned = controllers
     names = {HUMAN_LABEL: HUMAN_LABEL, TUNED_EXPERT: tuned, TRAINED_LABEL: trained}
     options = {f"scenario_options.{key}": value for key, value in changes.items() if key != "impairments"}
-    scenario = load_config(changes={**STUDY_ROADS[road], **options}).make_scenario()
+    scenario = load_config(changes={**study.STUDY_ROADS[road], **options}).make_scenario()
     drivers = {label: partial(_impaired_driver, name, changes.get("impairments", {})) for label, name in names.items()}
-    found = evaluate_drivers(scenario, drivers, episodes, workers)
+    found = study.evaluate_drivers(scenario, drivers, episodes, workers)
     return [
         {
             **{"road": road, "condition": condition, "driver": label},
@@ -122,43 +103,45 @@ def _robustness_table(road: str, folder: Path) -> pd.DataFrame:
         if row["road"] == road:
             cells = table.setdefault(row["condition"], {"": row["condition"]})
             label = "human baseline" if row["driver"] == HUMAN_LABEL else row["driver"]
-            cells[f"{label} [m/s]"] = number_text(row["mean_speed"]["mean"], 2)
+            cells[f"{label} [m/s]"] = study.number_text(row["mean_speed"]["mean"], 2)
             if row["driver"] == TRAINED_LABEL:
-                cells["difference to expert [m/s]"] = interval_text(row["speed_gain_over_expert"], 2, "+")
-                cells["min time gap [s]"] = number_text(row["min_time_gap"]["smallest"], 2)
+                cells["difference to expert [m/s]"] = study.interval_text(row["speed_gain_over_expert"], 2, "+")
+                cells["min time gap [s]"] = study.number_text(row["min_time_gap"]["smallest"], 2)
                 cells["feasible"] = row["feasibility"]
     return pd.DataFrame(table.values())
 
 
-def transfer_rows(road: str, drivers: Mapping[str, str], workers: int) -> Table:
+def transfer_rows(road: str, drivers: Mapping[str, str], workers: int) -> study.Table:
     """Return the metrics of drivers on a road with another number of vehicles than in training."""
     scenario = load_config(changes=TRANSFER_ROADS[road]).make_scenario()
-    found = evaluate_drivers(scenario, drivers, TRANSFER_EPISODES, workers)
+    found = study.evaluate_drivers(scenario, drivers, TRANSFER_EPISODES, workers)
     return [{"road": road, "driver": name, **estimate_metrics(own, COMPARISON_METRICS)} for name, own in found.items()]
 
 
-def _transfer_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
+def _transfer_parts(study_folder: study.StudyFolder, seeds: int) -> dict[str, StudyPart]:
     drivers = {"human": "human", "pi": "pi"}
     for variant, seed in product(TRANSFER_VARIANTS, range(seeds)):
-        drivers[f"{variant} {seed}"] = str(study_folder.run_folder(PlannedRun(TRANSFER_SOURCE, variant, seed)))
+        drivers[f"{variant} {seed}"] = str(study_folder.run_folder(study.PlannedRun(TRANSFER_SOURCE, variant, seed)))
     return {f"transfer/{road}": (transfer_rows, (road, drivers)) for road in TRANSFER_ROADS}
 
 
-def _figure_10_study(title: str, roads: tuple[str, ...]) -> Study:
-    def write(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
+def _figure_10_study(title: str, roads: tuple[str, ...]) -> study.Study:
+    def write(study_folder: study.StudyFolder, seeds: int, folder: Path) -> None:
         tables = (comparison_rows(study_folder, road, VOLUME_VARIANTS, seeds) for road in roads)
         write_part(folder, "table", [row for rows in tables for row in rows])
         curves = {road: training_curves(study_folder, road, VOLUME_VARIANTS, seeds) for road in roads}
         write_part(folder, "curves", curves)
 
-    return Study(title, lambda seeds: planned_runs(roads, VOLUME_VARIANTS, seeds), write=write, roads=roads)
+    return study.Study(title, lambda seeds: study.planned_runs(roads, VOLUME_VARIANTS, seeds), write=write, roads=roads)
 
 
 def _transfer_table(folder: Path) -> pd.DataFrame:
     """Return the mean speed by driver and traffic: the mean and the range over trainings."""
 
     def mean_and_range(values: pd.Series) -> str:
-        return interval_text(asdict(Estimate(values.mean(), nan, nan, len(values), values.min(), values.max())), 2)
+        return study.interval_text(
+            asdict(Estimate(values.mean(), nan, nan, len(values), values.min(), values.max())), 2
+        )
 
     rows = pd.json_normalize(read_part(folder, "transfer"))
     rows["trained as"] = rows["driver"].str.rstrip(" 0123456789")
@@ -167,22 +150,19 @@ def _transfer_table(folder: Path) -> pd.DataFrame:
     return speeds.rename_axis(index="", columns=None).rename(columns=labels).reset_index()
 
 
-ROBUSTNESS = Study(
+ROBUSTNESS = study.Study(
     title="packaged controllers with roads, human drivers and sensors that differ from training",
     make_parts=lambda study_folder, seeds: {
-        f"robustness/{road}, {name}": (
-            condition_rows,
-            (road, name, changes, ROAD_CONTROLLERS[road], CONDITION_EPISODES),
-        )
+        f"robustness/{road}, {key}": (condition_rows, (road, key, changes, ROAD_CONTROLLERS[road], CONDITION_EPISODES))
         for road, conditions in ROAD_CONDITIONS.items()
-        for name, changes in conditions.items()
+        for key, changes in conditions.items()
     },
     minutes=20.0,
     tables={road: partial(_robustness_table, road) for road in ROAD_CONDITIONS},
 )
 FIGURE_10_UNFILTERED = _figure_10_study(
     "5, 11 and 22 vehicles, trained for each, without the safety filter",
-    tuple(UNFILTERED_ROADS[road] for road in VOLUME_ROADS),
+    tuple(study.UNFILTERED_ROADS[road] for road in VOLUME_ROADS),
 )
 FIGURE_10 = replace(
     _figure_10_study("5, 11 and 22 vehicles, trained for each, and transfer between them", VOLUME_ROADS),

@@ -20,7 +20,7 @@ from unjam.controller import PACKAGED_PREFIX, make_driver
 from unjam.drivers.registry import driver_from_name
 from unjam.drivers.safety import INSTANT_ACTUATOR, STANDARD_ACTUATOR
 from unjam.measures.feasibility import FEASIBLE
-from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell
+from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.statistics import metric_estimate, paired_difference
 from unjam.reports.figures import LINE_COLORS, new_figure
 from unjam.scenarios import make_scenario
@@ -30,7 +30,16 @@ from unjam.training.string_limit import MAX_STRING_GAIN, find_operating_points
 from unjam.training.tune import tune
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import read_part
-from unjam_paper.study import NO_VALUE_TEXT, DriverSource, Study, Table, evaluate_drivers, make_drivers
+from unjam_paper.study import (
+    NO_VALUE_TEXT,
+    DriverSource,
+    Study,
+    Table,
+    estimate_text,
+    evaluate_drivers,
+    make_drivers,
+    number_text,
+)
 
 OTHER_EXPERT = {"ring": "pi-from-gap", "ring-jammed": "pi-from-gap", "figure-eight": "pacer"}
 """expert that is tuned without a limit, by road"""
@@ -124,7 +133,7 @@ def car_table(road: str, folder: Path) -> pd.DataFrame:
     ideal = {row["driver"]: row["episodes"] for row in measured if row["car"] == "ideal"}
     rows: Table = []
     for row in [{"driver": HUMAN_LABEL, "car": NO_VALUE_TEXT, "gain": None, "episodes": human}, *measured]:
-        cells = {"driver": row["driver"], "car": row["car"], "string gain": _gain_text(row["gain"])}
+        cells = {"driver": row["driver"], "car": row["car"], "string gain": number_text(row["gain"], 3)}
         baselines = {"ideal car": ideal[row["driver"]] if row["car"] == "usual" else None, "human": human}
         rows.append(cells | _mean_cells(row["episodes"], baselines))
     return pd.DataFrame(rows).drop(columns="return, difference to human")
@@ -140,20 +149,14 @@ def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
 def string_table(road: str, folder: Path) -> pd.DataFrame:
     """Return gain, set time gap, return and mean speed with differences to the human baseline, by expert and limit."""
     rows, human = tuned_rows(road, folder)
-    table = [
-        {"expert": HUMAN_LABEL, **dict.fromkeys(EXPERT_COLUMNS, NO_VALUE_TEXT), **_mean_cells(human, {"human": human})}
-    ]
+    cells = dict.fromkeys(EXPERT_COLUMNS, NO_VALUE_TEXT)
+    table = [{"expert": HUMAN_LABEL, **cells, **_mean_cells(human, {"human": human})}]
     for row in rows:
         time_gap = getattr(driver_from_name(row["driver"], 0.1), "time_gap", None)
-        limit = f"{row['limit']:g}" if row["limit"] else "any"
-        own = limit, _gain_text(row["gain"]), NO_VALUE_TEXT if time_gap is None else f"{time_gap:.1f}"
+        own = f"{row['limit']:g}" if row["limit"] else "any", number_text(row["gain"], 3), number_text(time_gap, 1)
         cells = dict(zip(EXPERT_COLUMNS, own, strict=True))
         table.append({"expert": row["expert"], **cells, **_mean_cells(row["episodes"], {"human": human})})
     return pd.DataFrame(table)
-
-
-def _gain_text(gain: float | None) -> str:
-    return NO_VALUE_TEXT if gain is None else f"{gain:.3f}"
 
 
 def _mean_cells(episodes: Table, baselines: Mapping[str, Table | None]) -> dict[str, str]:
@@ -162,10 +165,8 @@ def _mean_cells(episodes: Table, baselines: Mapping[str, Table | None]) -> dict[
     for metric, heading, digits in SHOWN_METRICS:
         cells[heading] = f"{metric_estimate(episodes, metric).mean:.{digits}f}"
         for name, others in baselines.items():
-            text = NO_VALUE_TEXT
-            if others is not None and others is not episodes:
-                text = str(estimate_cell(paired_difference(episodes, others, metric), digits, sign="+"))
-            cells[f"{heading}, difference to {name}"] = text
+            difference = None if others in (None, episodes) else paired_difference(episodes, others, metric)
+            cells[f"{heading}, difference to {name}"] = estimate_text(difference, digits, "+")
     feasible = sum(row["feasibility"] == FEASIBLE for row in episodes)
     cells["min time gap [s]"] = f"{min(row['min_time_gap'] for row in episodes):.2f}"
     is_human = baselines["human"] is episodes

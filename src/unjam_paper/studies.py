@@ -1,16 +1,8 @@
 """All studies by name, and the names of the paper's tables and figures."""
 
 from unjam.road_family import ALL_ROADS_GROUP, SHARED_RINGS_GROUP
+from unjam_paper import all_roads
 from unjam_paper.adaptation import ADAPTATION
-from unjam_paper.all_roads import (
-    ALL_ROADS_BASELINES,
-    ALL_ROADS_STUDY,
-    FAMILY_TEST_SEEDS,
-    FRESH_TEST_SEEDS,
-    SHARED_RING_BASELINES,
-    SHARED_RING_ROADS,
-    joint_training_study,
-)
 from unjam_paper.assess_examples import ASSESS_EXAMPLES
 from unjam_paper.comparison import FIGURE_5, comparison_study, paper_exact_study, road_model_study
 from unjam_paper.do_no_harm import DO_NO_HARM
@@ -115,23 +107,24 @@ STUDIES: dict[str, Study] = {
     "information-ahead": INFORMATION_AHEAD,
     "do-no-harm": DO_NO_HARM,
     "assess-examples": ASSESS_EXAMPLES,
-    "all-roads": ALL_ROADS_STUDY,
+    "all-roads": all_roads.ALL_ROADS_STUDY,
     "adaptation": ADAPTATION,
-    "rings": joint_training_study(
+    "rings": all_roads.joint_training_study(
         "gain of one residual, trained on all rings of the family, on each ring", {"rings": 10}
     ),
-    "shared-rings": joint_training_study(
+    "shared-rings": all_roads.joint_training_study(
         "tuned and learned controllers where several CAVs share a ring, training rings and unseen rings",
         {"shared-rings": 10},
-        *(SHARED_RINGS_GROUP, SHARED_RING_BASELINES, SHARED_RING_ROADS, FRESH_TEST_SEEDS),
+        *(SHARED_RINGS_GROUP, all_roads.SHARED_RING_BASELINES, all_roads.SHARED_RING_ROADS, all_roads.FRESH_TEST_SEEDS),
     ),
-    "rings-single": joint_training_study(
+    "rings-single": all_roads.joint_training_study(
         "gain of TRPO and PPO without an expert on the rings of the family", {"rings-trpo": 5, "rings-ppo": 5}
     ),
-    "all-roads-trained": joint_training_study(
+    "all-roads-trained": all_roads.joint_training_study(
         "gain of one residual, and of TRPO and PPO without an expert, on all roads of the family",
         {"all-roads": 10, "all-roads-trpo": 5, "all-roads-ppo": 5},
-        *(ALL_ROADS_GROUP, ALL_ROADS_BASELINES, None, FAMILY_TEST_SEEDS[:5]),  # for each of twenty trainings
+        # five seeds for each of twenty trainings
+        *(ALL_ROADS_GROUP, all_roads.ALL_ROADS_BASELINES, None, all_roads.FAMILY_TEST_SEEDS[:5]),
     ),
 }
 STUDY_GROUPS: dict[str, tuple[str, ...]] = {

@@ -48,10 +48,8 @@ UNFILTERED_ROADS = {road: f"{road}-unfiltered" for road in ("ring", "figure-eigh
 """roads as in the paper, without the safety filter, by the road with it; the merge never has one"""
 UNSCALED_NOISE_ROAD = "ring-unfiltered-unscaled-noise"
 """... and with the noise of Table B1 in each step, not times the square root of the step as in Flow"""
-STUDY_ROADS |= {
-    unfiltered: {**STUDY_ROADS[road], "scenario_options.safety.active": False}
-    for road, unfiltered in UNFILTERED_ROADS.items()
-}
+NO_FILTER = {"scenario_options.safety.active": False}
+STUDY_ROADS |= {name: STUDY_ROADS[road] | NO_FILTER for road, name in UNFILTERED_ROADS.items()}
 STUDY_ROADS[UNSCALED_NOISE_ROAD] = {**STUDY_ROADS[UNFILTERED_ROADS["ring"]], "scenario_options.noise_scaling": "none"}
 ORIGINAL_ROADS = {**{each: road for road, each in UNFILTERED_ROADS.items()}, UNSCALED_NOISE_ROAD: "ring"}
 """the road with the filter, by its version without"""
@@ -294,7 +292,7 @@ class DriverComparison:
         if list(labels) == [baseline]:
             return NO_VALUE_TEXT
         values = (self.values(labels, metric) - self.values([baseline], metric)).mean(0)
-        return str(estimate_cell(estimate_on_shared_seeds(values), digits, sign="+"))
+        return estimate_text(estimate_on_shared_seeds(values), digits, "+")
 
     def min_time_gap(self, labels: Sequence[str]) -> str:
         """Return the minimum time gap of all episodes; a dash if no vehicle was faster than 1 m/s."""
@@ -319,14 +317,19 @@ def group_rows(rows: Table, name: str) -> dict[Any, Table]:
     return groups
 
 
-def mean_text(values: Floats, digits: int) -> str:
+def estimate_text(found: Estimate | None, digits: int, sign: str = "") -> str:
+    """Return a mean with its 95 % CI or range; a dash without values."""
+    return NO_VALUE_TEXT if found is None else str(estimate_cell(found, digits, sign=sign))
+
+
+def mean_text(values: Sequence[float] | Floats, digits: int, sign: str = "") -> str:
     """Return the mean of independent values with its 95 % CI."""
-    return str(estimate_cell(estimate(values.ravel().tolist()), digits))
+    return estimate_text(estimate(np.ravel(values).tolist()), digits, sign)
 
 
 def trainings_text(values: Sequence[float] | Floats, digits: int, sign: str = "") -> str:
     """Return the mean of one number per training with its 95 % CI or range; a dash without values."""
-    return str(estimate_cell(estimate_over_trainings(list(values)), digits, sign=sign))
+    return estimate_text(estimate_over_trainings(list(values)), digits, sign)
 
 
 def number_text(value: float | None, digits: int, sign: str = "") -> str:
@@ -336,8 +339,7 @@ def number_text(value: float | None, digits: int, sign: str = "") -> str:
 
 def interval_text(entries: Mapping[str, Any], digits: int, sign: str = "") -> str:
     """Return an estimate of a results file as pages show it: with its 95 % CI, else with the range if it is known."""
-    older: dict[str, Any] = {"count": 0, "smallest": nan, "largest": nan}  # older tables do not have these entries
-    values: dict[str, Any] = older | {name: nan if value is None else value for name, value in entries.items()}
-    known = Estimate(**{each.name: values[each.name] for each in fields(Estimate)})
+    values: dict[str, Any] = {name: nan if value is None else value for name, value in entries.items()}
+    known = Estimate(**{each.name: values[each.name] for each in fields(Estimate) if each.name in values})
     ci = format_ci(known, f"{sign}.{digits}f")
     return with_no_break_spaces(f"{number_text(known.mean, digits, sign)} {ci}".strip())

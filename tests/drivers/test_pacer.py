@@ -1,10 +1,11 @@
+from dataclasses import replace
 from math import pi
 
 import numpy as np
 import pytest
 
 from unjam.drivers import LocalState, Pacer
-from unjam.drivers.road_experts import TUNED_PACERS
+from unjam.drivers.road_experts import BROKEN_LAP_FRACTION, GATHERED_LAP_FRACTION, TUNED_PACES
 
 
 def state(gap: float, lap_fraction: float = 0.0, loop: float = 450.0, speed: float = 0.0) -> LocalState:
@@ -65,16 +66,28 @@ def test_waits_anew_when_the_queue_is_broken() -> None:
     assert commanded_speed(pacer, together, broken, together) == pytest.approx(450 / 70)
 
 
-@pytest.mark.parametrize("lap", TUNED_PACERS)
+def pacer_of(lap: float) -> Pacer:
+    harmonics, gain, gap = TUNED_PACES[lap]
+    ready, broken = GATHERED_LAP_FRACTION, BROKEN_LAP_FRACTION
+    return Pacer(harmonics=harmonics, gap_gain=gain, target_gap=gap, gathering_gap=ready, regathering_gap=broken)
+
+
+@pytest.mark.parametrize("lap", TUNED_PACES)
 def test_varying_is_the_pacer_that_was_tuned_for_the_nearest_lap(lap: float) -> None:
     here = state(gap=0.52 * lap, lap_fraction=0.3, loop=lap + 2.0)
-    assert commanded_speed(Pacer(use_tuned=True), here) == pytest.approx(
-        commanded_speed(Pacer(**TUNED_PACERS[lap]), here)
-    )
+    assert commanded_speed(Pacer(use_tuned=True), here) == pytest.approx(commanded_speed(pacer_of(lap), here))
+
+
+@pytest.mark.parametrize("share", [0.3, 0.47, 0.6])
+def test_varying_pacer_has_no_use_for_the_parameters_that_its_description_names(share: float) -> None:
+    states = [state(gap=each * 450, lap_fraction=0.4) for each in (0.7, share)]
+    pace = Pacer(use_tuned=True, lap_time=90.0, harmonics=(5.0,), gap_gain=0.3, target_gap=0.2)
+    other = replace(pace, gathering_gap=0.2, regathering_gap=0.55)
+    assert commanded_speed(other, *states) == commanded_speed(Pacer(use_tuned=True), *states)
 
 
 def test_varying_rows_are_each_led_at_the_pace_of_their_own_lap() -> None:
-    laps = list(TUNED_PACERS)
+    laps = list(TUNED_PACES)
     one_by_one = [
         commanded_speed(Pacer(use_tuned=True), state(gap=0.55 * lap, lap_fraction=0.2, loop=lap)) for lap in laps
     ]

@@ -14,33 +14,34 @@ from unjam.scenarios import make_scenario
 from unjam.training.assess import assess, make_request
 from unjam.training.calibrate import FACTOR_RANGES, calibrate, load_corridor
 from unjam.training.evaluate import drive
+from unjam.training.search_space import SearchSpace
 from unjam.training.train import train
 from unjam.training.tune import tune
 from unjam.worlds.sumo.detectors import DetectorPool
 from unjam.worlds.worker_pool import WorkerPool
 
 DETECTORS = "edge,position,begin,end,flow_veh_per_h,speed\nroad,100,0,30,1800,10\n"
-CommandRunner = Callable[[str, Path, Callable[[], object]], object]
+CommandRunner = Callable[[str, Path, Callable[[], None]], object]
 """runs a command on a network with results in a folder, and calls the function while it runs"""
 
 
-def run_drive(file: str, out: Path, change: Callable[[], object]) -> None:
+def run_drive(file: str, out: Path, change: Callable[[], None]) -> None:
     drive(file, "acc", 2, scenario_options={**HELD, "penetration_rate": 0.5}, out=out, progress=lambda *_: change())
 
 
-def run_assess(file: str, out: Path, change: Callable[[], object]) -> None:
+def run_assess(file: str, out: Path, change: Callable[[], None]) -> None:
     with WorkerPool(1) as workers:
         assess(make_request(file, [0.5], 40, 0.02, None, ["acc"], HELD), out, workers, on_stage=lambda *_: change())
 
 
-def run_tune(file: str, out: Path, change: Callable[[], object]) -> None:
+def run_tune(file: str, out: Path, change: Callable[[], None]) -> None:
     roads = {"mine": make_scenario(file, {**HELD, "penetration_rate": 1.0, "horizon": 40})}
     with WorkerPool(1) as workers:
-        space = {"time_gap": FloatDistribution(1.0, 2.0)}
+        space: SearchSpace = {"time_gap": FloatDistribution(1.0, 2.0)}
         tune(roads, "acc", space, 9000, out, workers, on_message=lambda _: change())
 
 
-def run_calibrate(file: str, out: Path, change: Callable[[], object]) -> None:
+def run_calibrate(file: str, out: Path, change: Callable[[], None]) -> None:
     detectors = Path(file).with_name("detectors.csv")
     detectors.write_text(DETECTORS)
     space = {"tau": FACTOR_RANGES["tau"]}
@@ -48,7 +49,7 @@ def run_calibrate(file: str, out: Path, change: Callable[[], object]) -> None:
         calibrate(load_corridor(file, detectors), out, pool, space, 3, 1, on_message=lambda _: change())
 
 
-def run_training(file: str, out: Path, change: Callable[[], object]) -> None:
+def run_training(file: str, out: Path, change: Callable[[], None]) -> None:
     options = {**HELD, "penetration_rate": 1.0, "horizon": 100}
     config = small_config(scenario=file, scenario_options=options, model__model_ratio=0.0)
     train(config, out, on_iteration=lambda _: change() is None)

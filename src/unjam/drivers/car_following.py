@@ -1,6 +1,6 @@
 """Car-following drivers of a CAV: human-like models and cruise controls."""
 
-from math import exp, pi
+from math import pi
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -9,6 +9,7 @@ from pydantic import model_validator
 from unjam.drivers.driver import FormulaDriver, Memory
 from unjam.drivers.local_state import MAX_OBSERVED_GAP, SPEED_SCALE, LocalState, ScaledInput
 from unjam.drivers.requirements import Requirements
+from unjam.drivers.smooth_acc import update_mean
 from unjam.drivers.speed_history import empty_window, fill_window, slide_window, window_mean_speed
 from unjam.parameters import STRICT, NonNegative, Positive, parameter_dataclass
 from unjam.physics.arrays import Array, clamp_min, clip, namespace, stack_columns
@@ -285,9 +286,7 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
     """
 
     name: ClassVar[str] = "adaptive-acc"
-    own_requirements: ClassVar[Requirements] = Requirements(
-        used_fields=frozenset({"allowed_speed", "distance_to_merge"})
-    )
+    own_requirements: ClassVar = Requirements(used_fields=frozenset({"allowed_speed", "distance_to_merge"}))
     own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
         ScaledInput("mean own speed", SPEED_SCALE, "m/s"),
         ScaledInput("leaves a jam", 1.0, ""),
@@ -320,10 +319,8 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration of the model with the parameters for the traffic state, and the new memory."""
-        speed, last = state.speed, memory["mean_speed"]
-        xp = namespace(speed)
-        last = xp.where(xp.isnan(last), speed, last)
-        mean = last + (1.0 - exp(-self.time_step / self.averaging_time)) * (speed - last)
+        xp, speed = namespace(state.speed), state.speed
+        mean = update_mean(memory["mean_speed"], speed, self.averaging_time, self.time_step)
         approaches, faster = speed - mean < -self.jam_front_speed_change, speed - mean > self.jam_front_speed_change
         ends = approaches | (mean > self.free_speed) | (mean < self.jam_speed)
         leaves = xp.where(faster, speed * 0.0 + 1.0, xp.where(ends, speed * 0.0, memory["leaves_jam"]))

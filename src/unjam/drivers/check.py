@@ -7,7 +7,7 @@ import numpy as np
 
 from unjam.drivers.command import answer_as_array
 from unjam.drivers.driver import Driver, Memory, check_memory
-from unjam.drivers.local_state import ADJACENT_POSITIONS, COMMON_FIELDS, SECTIONS_AHEAD, LocalState, state_of_ones
+from unjam.drivers.local_state import COMMON_FIELDS, FIELD_SIZES, SECTIONS_AHEAD, LocalState, state_of_ones
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError
 from unjam.tree import leaves, map_leaves
@@ -38,11 +38,9 @@ def check_driver(
         memory_copy, state_copy = map_leaves(np.array, memory), state.map(np.array)
         acceleration, after = _call_act(driver, state, memory, step)
         acceleration = check_acceleration(acceleration, rows, f"step {step}")
-        if not _is_same_memory(memory, memory_copy):
-            raise InputError(f"driver: step {step}: act() changed the memory that it was given")
-        pairs = zip(state, state_copy, strict=True)
-        if not all(np.array_equal(values, copy) for values, copy in pairs if values is not None):
-            raise InputError(f"driver: step {step}: act() changed the state that it was given")
+        for name, given, copy in (("memory", memory, memory_copy), ("state", state._asdict(), state_copy._asdict())):
+            if not _is_same_tree(given, copy):
+                raise InputError(f"driver: step {step}: act() changed the {name} that it was given")
         repeated, _ = _call_act(driver, state, memory_copy, step)
         if not np.array_equal(acceleration, repeated):
             raise InputError(f"driver: step {step}: the same state and memory gave another acceleration")
@@ -59,12 +57,10 @@ def check_driver(
         memory = after
 
 
-def check_row_independence(
-    compute: Callable[[slice], Any], label: str, unit: str = "CAVs", rows: int = PROBE_ROWS
-) -> None:
-    """Raise `InputError` if the first axis of what `compute` returns for `rows` rows is not the rows by themselves."""
-    together = np.asarray(compute(slice(rows)))
-    alone = np.concatenate([compute(slice(row, row + 1)) for row in range(rows)])
+def check_row_independence(compute: Callable[[slice], Any], label: str, unit: str = "CAVs") -> None:
+    """Raise `InputError` if the first axis of what `compute` returns is not the rows by themselves."""
+    together = np.asarray(compute(slice(PROBE_ROWS)))
+    alone = np.concatenate([compute(slice(row, row + 1)) for row in range(PROBE_ROWS)])
     tolerance = MAX_PROBE_DIFFERENCE * max(1.0, float(np.abs(np.nan_to_num(alone)).max(initial=0.0)))
     if together.shape != alone.shape or not np.allclose(together, alone, rtol=0.0, atol=tolerance, equal_nan=True):
         raise InputError(f"{label}: {unit} influence each other; allowed: rows that are computed independently")
@@ -103,18 +99,15 @@ def random_state(generator: np.random.Generator, rows: int, optional_fields: boo
     near = LocalState(speeds[0], speeds[1], gaps[0], speeds[2], gaps[1], position, np.full(rows, 230.0))
     if not optional_fields:
         return near
-    lane_speeds, road_speeds = generator.uniform(0.0, 30.0, (2, rows, SECTIONS_AHEAD))
-    fields = {"lane_speeds": lane_speeds, "road_speeds": road_speeds}
-    fields["allowed_speed"] = generator.uniform(20.0, 30.0, rows)
-    fields["distance_to_merge"] = generator.uniform(-500.0, 2000.0, rows)
-    fields["adjacent_gaps"] = generator.uniform(-5.0, 60.0, (rows, len(ADJACENT_POSITIONS)))
-    fields["adjacent_speeds"] = generator.uniform(0.0, 30.0, (rows, len(ADJACENT_POSITIONS)))
-    fields["penetration_rate"] = generator.uniform(0.0, 0.3, rows)
+    ranges = {"lane_speeds": (0.0, 30.0), "road_speeds": (0.0, 30.0), "allowed_speed": (20.0, 30.0)}
+    ranges |= {"distance_to_merge": (-500.0, 2000.0), "adjacent_gaps": (-5.0, 60.0), "adjacent_speeds": (0.0, 30.0)}
+    fields = dict[str, np.ndarray]()
+    for name, ends in {**ranges, "penetration_rate": (0.0, 0.3)}.items():
+        fields[name] = generator.uniform(*ends, (rows, FIELD_SIZES[name]) if name in FIELD_SIZES else rows)
     return near._replace(**fields, congestion=(generator.random((rows, SECTIONS_AHEAD)) < 0.3).astype(float))
 
 
-def _is_same_memory(memory: Memory, other: Memory) -> bool:
-    found, before = dict(leaves(memory)), dict(leaves(other))
-    return found.keys() == before.keys() and all(
-        np.array_equal(np.asarray(found[path]), before[path], equal_nan=True) for path in found
-    )
+def _is_same_tree(tree: Any, other: Any) -> bool:
+    found, before = ({path: values for path, values in leaves(each) if values is not None} for each in (tree, other))
+    is_same = (np.array_equal(np.asarray(found[path]), before[path], equal_nan=True) for path in found)
+    return found.keys() == before.keys() and all(is_same)

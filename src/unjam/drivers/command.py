@@ -5,10 +5,9 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unjam.errors import InputError
-from unjam.physics.arrays import Array, clip, namespace
+from unjam.physics.arrays import Array, Floats, clip, namespace
 from unjam.text import one_line
 
 
@@ -36,16 +35,14 @@ class Limits(NamedTuple):
         return cls(-limit, limit)
 
 
-def _as_doubles(answer: Any) -> NDArray[np.float64]:
+def _as_doubles(answer: Any) -> Floats:
     array = np.asarray(answer)
     if array.dtype.kind in "cSUmM" or isinstance(answer, np.ma.MaskedArray):  # part of it would be dropped
         raise TypeError(f"{array.dtype} is no real number")
     return array.astype(np.float64, copy=False)
 
 
-def as_numbers(
-    answer: Any, label: str, allowed: str = "", to_array: Callable[[Any], Array] = _as_doubles
-) -> NDArray[np.float64]:
+def as_numbers(answer: Any, label: str, allowed: str = "", to_array: Callable[[Any], Array] = _as_doubles) -> Floats:
     """Return the answer of a user's code as an array, made by `to_array`; raise `InputError` unless it is numbers."""
     try:
         return to_array(answer)
@@ -56,7 +53,7 @@ def as_numbers(
 
 def answer_as_array(
     answer: Any, rows: int, context: str, quantity: str = "acceleration", row_name: str = "CAV"
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the answer of a driver or a reward as an array; raise `InputError` unless its shape is (rows,)."""
     array = as_numbers(answer, f"{context}: {quantity}")
     if array.shape != (rows,):
@@ -104,6 +101,6 @@ def commanded_time_gaps(command: Command | None, min_time_gap: float, names: Seq
     return found.tolist()
 
 
-def _raise_not_finite(values: NDArray[np.float64], names: Sequence[str], quantity: str, allowed: str) -> None:
+def _raise_not_finite(values: Floats, names: Sequence[str], quantity: str, allowed: str) -> None:
     row = int(np.isfinite(values).argmin())
     raise InputError(f"{quantity} of {names[row]} is {values[row]}; allowed: {allowed}")

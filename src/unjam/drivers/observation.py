@@ -310,9 +310,8 @@ def _feature_columns(function: UserFunction, state: LocalState, size: int | None
     columns = found[:, None] if found.ndim == 1 else found
     if columns.ndim != 2 or columns.shape != (rows, columns.shape[1] if size is None else size):
         allowed = f"({rows},) or ({rows}, m)" if size is None else f"({rows}, {size})" + f" or ({rows},)" * (size == 1)
-        raise InputError(
-            f"{function.label}: feature has shape {found.shape} for {format_count(rows, 'CAV')}; allowed: {allowed}"
-        )
+        shape = f"{found.shape} for {format_count(rows, 'CAV')}"
+        raise InputError(f"{function.label}: feature has shape {shape}; allowed: {allowed}")
     return columns
 
 

@@ -65,13 +65,9 @@ class PISaturation(FormulaDriver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the commanded speed of Eq. 10, and the new memory."""
-        window = slide_window(memory, state.speed)
-        acceleration, command = self._acceleration_and_command(window_mean_speed(window), state, memory["command"])
-        return acceleration, {**window, "command": command}
-
-    def _acceleration_and_command(self, mean: Array, state: LocalState, last_command: Array) -> tuple[Array, Array]:
-        xp = namespace(state.speed)
-        command = xp.where(xp.isnan(last_command), state.speed, last_command)
+        xp, window = namespace(state.speed), slide_window(memory, state.speed)
+        mean, own = self._followed_mean(window_mean_speed(window), state, memory)
+        command = xp.where(xp.isnan(memory["command"]), state.speed, memory["command"])
         gap_share = (state.leader_gap - self.gap_lower) / (self.gap_upper - self.gap_lower)
         target = mean + self.catch_up_speed * clip(gap_share, 0.0, 1.0)
         safe_gap = self.safe_gap
@@ -80,7 +76,12 @@ class PISaturation(FormulaDriver):
         alpha = clip((state.leader_gap - safe_gap) / 2.0, 0.0, 1.0)
         beta = 1.0 - 0.5 * alpha
         command = beta * (alpha * target + (1.0 - alpha) * state.leader_speed) + (1.0 - beta) * command
-        return (command - state.speed) / max(self.time_constant, self.time_step), command
+        acceleration = (command - state.speed) / max(self.time_constant, self.time_step)
+        return acceleration, {**window, "command": command, **own}
+
+    def _followed_mean(self, mean: Array, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the mean speed that the command follows, given that of the window, and other entries of the memory."""
+        return mean, {}
 
     def memory_features(self, memory: Memory) -> Array:
         """Return the mean own speed and the commanded speed, scaled, shape (n, 2)."""
@@ -117,14 +118,10 @@ class PIFromGap(PISaturation):
         recalled = super().recall(memory, history)
         return {**recalled, "initial_speed": self.history_factor * window_mean_speed(recalled)}
 
-    def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the acceleration towards the commanded speed of Eq. 10, and the new memory."""
+    def _followed_mean(self, mean: Array, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
+        """Return the mean of the window while the initial speed fades from it."""
         xp = namespace(state.speed)
         allowed = clamp_min((state.leader_gap - self.human_standstill_gap) / self.human_time_headway, 0.0)
         initial = xp.where(xp.isnan(memory["initial_speed"]), allowed, memory["initial_speed"])
-        window = slide_window(memory, state.speed)
         weight = clip(1.0 - memory["steps"] * (self.time_step / self.fade_time), 0.0, 1.0)
-        mean = window_mean_speed(window)
-        mean = mean + weight * (initial - mean)
-        acceleration, command = self._acceleration_and_command(mean, state, memory["command"])
-        return acceleration, {**window, "command": command, "initial_speed": initial, "steps": memory["steps"] + 1.0}
+        return mean + weight * (initial - mean), {"initial_speed": initial, "steps": memory["steps"] + 1.0}

@@ -156,10 +156,8 @@ class PolicyDriver(ExpertWrapper):
         answer, after = self.policy(observation, memory)
         numbers = np.asarray(answer) if xp is np else xp.as_tensor(answer)
         if numbers.shape not in ((rows,), (rows, 1)):
-            allowed = f"allowed: ({rows},) or ({rows}, 1)"
-            raise InputError(
-                f"driver {self.label}: returns shape {numbers.shape} for {format_count(rows, 'CAV')}; {allowed}"
-            )
+            found = f"returns shape {numbers.shape} for {format_count(rows, 'CAV')}"
+            raise InputError(f"driver {self.label}: {found}; allowed: ({rows},) or ({rows}, 1)")
         if not (is_finite := xp.isfinite(numbers)).all():
             raise InputError(f"driver {self.label}: returns {numbers[~is_finite][0]}; allowed: finite")
         return numbers.reshape(rows), after

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from unjam.drivers import wrappers
 from unjam.drivers.car_following import ACC, BCM, IDM, LACC, OVM, AdaptiveACC, Constant, FollowerStopper, Human
 from unjam.drivers.driver import Driver, Recipe
 from unjam.drivers.observation import FEATURES, observation_size
@@ -15,36 +16,26 @@ from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.road_experts import AdvisorySpeed, Cruise, GapMaker, JamAbsorber, JamAhead, Pacer
 from unjam.drivers.smooth_acc import SmoothACC
 from unjam.drivers.user_driver import FileDriver, FileReference, is_file_reference
-from unjam.drivers.wrappers import (
-    FilteredDriver,
-    HistoryDriver,
-    ImpairedDriver,
-    MixedDriver,
-    QueueFallback,
-    RoadTypeSwitch,
-)
 from unjam.errors import InputError, invalid_value
 from unjam.files import to_json
 from unjam.parameters import build_dataclass, check_part, check_values, is_packaged, split_parameters
 from unjam.text import spelling_hint
 from unjam.tree import Arrays, named_parts, pack, unpack
 
-_DRIVER_CLASSES = (
-    *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, SmoothACC, LACC, BCM, OVM),
-    *(Pacer, JamAbsorber, Cruise, AdvisorySpeed, JamAhead, GapMaker, AdaptiveACC, Constant),
-)
+_DRIVER_CLASSES = (Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, SmoothACC, LACC, BCM, OVM)
+_DRIVER_CLASSES += (Pacer, JamAbsorber, Cruise, AdvisorySpeed, JamAhead, GapMaker, AdaptiveACC, Constant)
 DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _DRIVER_CLASSES}
 DRIVER_CLASSES: dict[str, type[Driver]] = {
     **DRIVERS,
     "file": FileDriver,
     "residual": ResidualDriver,
     "onnx": OnnxDriver,
-    "mixed": MixedDriver,
-    "impaired": ImpairedDriver,
-    "filtered": FilteredDriver,
-    "history": HistoryDriver,
-    "queue-fallback": QueueFallback,
-    "road-type-switch": RoadTypeSwitch,
+    "mixed": wrappers.MixedDriver,
+    "impaired": wrappers.ImpairedDriver,
+    "filtered": wrappers.FilteredDriver,
+    "history": wrappers.HistoryDriver,
+    "queue-fallback": wrappers.QueueFallback,
+    "road-type-switch": wrappers.RoadTypeSwitch,
 }
 """dataclasses of drivers by their names in recipes, which files and messages to workers contain"""
 

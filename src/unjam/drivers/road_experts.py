@@ -1,10 +1,7 @@
 """Experts for the figure eight, the merge and motorways, which use positions and roadside information."""
 
-from collections.abc import Iterable
-from dataclasses import replace
-from functools import cached_property
-from math import nan
-from typing import Annotated, Any, ClassVar
+from math import inf, nan
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -32,20 +29,15 @@ MIN_REPORTED_CONGESTION = 0.5
 SectionIndex = Annotated[int, Field(ge=0, lt=SECTIONS_AHEAD)]
 
 
-def _tuned_pacer(harmonics: Harmonics, gap_gain: float, target_gap: float) -> dict[str, Any]:
-    gathering = {"gathering_gap": GATHERED_LAP_FRACTION, "regathering_gap": BROKEN_LAP_FRACTION}
-    return {"harmonics": harmonics, "gap_gain": gap_gain, "target_gap": target_gap, **gathering}
-
-
-TUNED_PACERS: dict[float, dict[str, Any]] = {
-    422.2: _tuned_pacer((6.729, -2.092, 1.602, -0.929, 0.851, -0.096, 0.105), 0.051, 0.483),
-    449.0: _tuned_pacer((7.449, -2.059, 1.966, -0.94, 0.791, -0.028, 0.01), 0.047, 0.509),
-    462.5: _tuned_pacer((7.973, -1.865, 2.48, -0.422, 0.173, 0.027, 0.063), 0.038, 0.545),
-    475.9: _tuned_pacer((8.35, -2.057, 3.128, 0.477, 0.086, -0.086, 0.075), 0.04, 0.552),
-    489.3: _tuned_pacer((9.039, -1.791, 3.513, 1.051, 0.015, 0.024, 0.216), 0.044, 0.581),
+TUNED_PACES: dict[float, tuple[Harmonics, float, float]] = {
+    422.2: ((6.729, -2.092, 1.602, -0.929, 0.851, -0.096, 0.105), 0.051, 0.483),
+    449.0: ((7.449, -2.059, 1.966, -0.94, 0.791, -0.028, 0.01), 0.047, 0.509),
+    462.5: ((7.973, -1.865, 2.48, -0.422, 0.173, 0.027, 0.063), 0.038, 0.545),
+    475.9: ((8.35, -2.057, 3.128, 0.477, 0.086, -0.086, 0.075), 0.04, 0.552),
+    489.3: ((9.039, -1.791, 3.513, 1.051, 0.015, 0.024, 0.216), 0.044, 0.581),
 }
-"""parameters for `use_tuned` by the length of the lap [m], found by a search over the pace: of radii of 30, 32, 33, 34
-(0.1 m/s lower than found, as the queue broke on one of ten seeds) and 35 m"""
+"""`harmonics`, `gap_gain` and `target_gap` for `use_tuned` by the length of the lap [m], found by a search over the
+pace: of radii of 30, 32, 33, 34 (0.1 m/s lower than found, as the queue broke on one of ten seeds) and 35 m"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -71,7 +63,8 @@ class Pacer(FormulaDriver):
     target_gap: LapFraction = 0.5
     """free share of the lap ahead at which the pace is unchanged"""
     use_tuned: bool = False
-    """whether to use `TUNED_PACERS` for the nearest radius of a figure eight instead of these parameters"""
+    """whether to use `TUNED_PACES` for the nearest radius of a figure eight, and shares of the lap of 0.5 and 0.45 from
+    which the queue has gathered and below which it is broken: the parameters for these have no effect then"""
     gathering_speed: NonNegative = 2.0
     """speed while the others gather behind it [m/s]"""
     gathering_gap: LapFraction = 0.4
@@ -93,55 +86,41 @@ class Pacer(FormulaDriver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the pace, and whether the queue has gathered."""
-        if not self.use_tuned:
-            return self._lead_queue(state, memory)
-        loop = state.loop_length
-        xp = namespace(loop)
-        acceleration, gathered, nearest = loop * 0.0, loop * 0.0, loop * 0.0 + float("inf")
-        for lap in self._nearest_laps(loop):
-            found, after = self._tuned_pacers[lap].act(state, memory)
-            closer = abs(loop - lap) < nearest
-            acceleration = xp.where(closer, found, acceleration)
-            gathered = xp.where(closer, after["has_gathered"], gathered)
-            nearest = xp.where(closer, abs(loop - lap), nearest)
-        return acceleration, {"has_gathered": gathered}
-
-    def _nearest_laps(self, loop_length: Array) -> Iterable[float]:
-        """Return the laps that are nearest for any row; for tensors, which may be traced, all laps."""
-        if isinstance(loop_length, float):
-            return [min(self._tuned_pacers, key=lambda lap: abs(loop_length - lap))]
-        if not isinstance(loop_length, np.ndarray):
-            return self._tuned_pacers
-        laps = np.array([*self._tuned_pacers])
-        return laps[sorted(set(abs(laps[:, None] - loop_length).argmin(0).tolist()))].tolist()
-
-    @cached_property
-    def _tuned_pacers(self) -> dict[float, "Pacer"]:
-        return {lap: replace(self, use_tuned=False, **values) for lap, values in TUNED_PACERS.items()}
-
-    def _lead_queue(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         loop, free = state.loop_length, state.leader_gap
-        xp = namespace(state.speed)
-        ready, broken = free >= self.gathering_gap * loop, free < self.regathering_gap * loop
+        xp, gaps = namespace(state.speed), (self.gathering_gap, self.regathering_gap)
+        from_gap, below_gap = (GATHERED_LAP_FRACTION, BROKEN_LAP_FRACTION) if self.use_tuned else gaps
+        ready, broken = free >= from_gap * loop, free < below_gap * loop
         gathered = xp.where(ready, free * 0.0 + 1.0, xp.where(broken, free * 0.0, memory["has_gathered"]))
-        pace = clamp_min(self._pace(state) + self.gap_gain * (free - self.target_gap * loop), MIN_PACE)
-        target = xp.where(gathered > 0.0, pace, free * 0.0 + self.gathering_speed)
+        target = xp.where(gathered > 0.0, self._pace(state), free * 0.0 + self.gathering_speed)
         return (target - state.speed) / self.time_constant, {"has_gathered": gathered}
 
     def _pace(self, state: LocalState) -> Array:
-        if not self.harmonics:
-            return state.loop_length / self.lap_time
-        xp = namespace(state.speed)
-        mean, *rest = self.harmonics
-        angle = lap_angle(state)
-        pace = angle * 0.0 + mean
-        for number, (cosine, sine) in enumerate(zip(rest[::2], rest[1::2], strict=True), start=1):
-            pace = pace + cosine * xp.cos(number * angle) + sine * xp.sin(number * angle)
+        """Return the pace by the free road ahead; with `use_tuned` of the nearest lap, for tensors, by all laps."""
+        if not self.use_tuned:
+            return _pace_of(state, self.harmonics, self.gap_gain, self.target_gap, self.lap_time)
+        loop, laps = state.loop_length, [*TUNED_PACES]
+        if isinstance(loop, float):
+            laps = [min(laps, key=lambda lap: abs(loop - lap))]
+        elif isinstance(loop, np.ndarray):  # tensors may be traced
+            laps = [laps[row] for row in np.unique(abs(np.array(laps)[:, None] - loop).argmin(0))]
+        pace, nearest, xp = loop * 0.0, loop * 0.0 + inf, namespace(loop)
+        for lap in laps:
+            closer = abs(loop - lap) < nearest
+            pace = xp.where(closer, _pace_of(state, *TUNED_PACES[lap]), pace)
+            nearest = xp.where(closer, abs(loop - lap), nearest)
         return pace
 
     def memory_features(self, memory: Memory) -> Array:
         """Return whether the queue has gathered, shape (n, 1)."""
         return as_column(memory["has_gathered"])
+
+
+def _pace_of(state: LocalState, harmonics: Harmonics, gain: float, target_gap: float, lap_time: float = nan) -> Array:
+    xp, loop, angle = namespace(state.speed), state.loop_length, lap_angle(state)
+    pace = angle * 0.0 + harmonics[0] if harmonics else loop / lap_time
+    for number, (cosine, sine) in enumerate(zip(harmonics[1::2], harmonics[2::2], strict=True), start=1):
+        pace = pace + cosine * xp.cos(number * angle) + sine * xp.sin(number * angle)
+    return clamp_min(pace + gain * (state.leader_gap - target_gap * loop), MIN_PACE)
 
 
 @parameter_dataclass(frozen=True, config=STRICT)

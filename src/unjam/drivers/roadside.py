@@ -133,13 +133,9 @@ class RoadSections:
 
     def __init__(self, lane_count: int, length: float, road_count: int = 1) -> None:
         """Divide equal roads of a length [m] into sections; lane 0 is that of the ramp."""
-        self._shape = road_count, lane_count, int(np.ceil(length / ROAD_SECTION_LENGTH))
-
-    @property
-    def means_shape(self) -> tuple[int, int, int]:
-        """Shape of mean speeds: roads, lanes and all lanes of the main road, sections."""
-        roads, lanes, sections = self._shape
-        return roads, lanes + 1, sections
+        sections = int(np.ceil(length / ROAD_SECTION_LENGTH))
+        self._shape, self.means_shape = (road_count, lane_count, sections), (road_count, lane_count + 1, sections)
+        """`means_shape`: the shape of mean speeds: roads, lanes and all lanes of the main road, sections"""
 
     def totals(self, vehicles: MeasuredVehicles) -> Floats:
         """Return the number of vehicles and the sum of their speeds [m/s], shape (2, roads, lanes + 1, sections).
@@ -154,14 +150,12 @@ class RoadSections:
         # The main road has the lanes from 1 on.
         return np.concatenate([totals, totals[:, :, 1:].sum(2, keepdims=True)], 2)
 
-    def speeds_ahead(
-        self, mean_speeds: Floats, lanes: NDArray[np.intp], positions: Floats, roads: Any = 0
-    ) -> tuple[Floats, Floats]:
+    def speeds_ahead(self, means: Floats, lanes: NDArray[np.intp], positions: Floats, roads: Any = 0) -> list[Floats]:
         """Return the means of the sections ahead, on the own lane and on the whole main road: (n, ahead)."""
         first = (positions // ROAD_SECTION_LENGTH).astype(np.intp).clip(0, self._shape[-1] - 1)
         columns = first[:, None] + np.arange(SECTIONS_AHEAD)
         road = np.broadcast_to(roads, lanes.shape)[:, None]
-        return mean_speeds[road, lanes[:, None], columns], mean_speeds[road, -1, columns]
+        return [means[road, each, columns] for each in (lanes[:, None], -1)]
 
 
 class SpeedMeasurement:

@@ -336,11 +336,9 @@ class CAVActuation:
 
     def apply(self, name: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
         """Return the filtered command for a desired acceleration, and the acceleration in this simulation step."""
-        if not self._has_lag:
-            command = self._safety.limit(acceleration, state, self._step)
-            return command, command
-        actuator_state = self._states.get(name) or self._actuator.initial_state(state.speed, self._step)
-        command, self._states[name] = actuate(
-            self._safety, self._actuator, acceleration, state, actuator_state, self._step
-        )
-        return command, self._states[name].acceleration
+        actuator, step = self._actuator, self._step
+        before = self._states.get(name) or actuator.initial_state(state.speed, step)
+        command, after = actuate(self._safety, actuator, acceleration, state, before, step)
+        if self._has_lag:
+            self._states[name] = after
+        return command, after.acceleration

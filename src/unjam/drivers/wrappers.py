@@ -213,9 +213,7 @@ class FilteredDriver(DriverWrapper):
         acceleration, after = self.driver.act(state, memory[INNER_KEY])
         acceleration = clip(acceleration, -self.action_limit, self.action_limit)
         following, actuator, step = FollowingState(*state[:3]), self.actuator, self.time_step
-        if actuator.is_instant:
-            return self.safety.limit(acceleration, following, step), {INNER_KEY: after}
-        before = ActuatorState(memory["acceleration"], tuple(memory[key] for key in self._pending_keys))
+        before = ActuatorState(memory.get("acceleration"), tuple(memory[key] for key in self._pending_keys))
         command, responding = actuate(self.safety, actuator, acceleration, following, before, step)
         return command, {INNER_KEY: after, **self._actuator_memory(responding)}
 

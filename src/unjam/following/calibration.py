@@ -116,7 +116,7 @@ class CalibratedIDM:
 
 def calibrate_idm(
     trajectories: Sequence[FollowingTrajectory],
-    settings: CalibrationSettings | None = None,
+    settings: CalibrationSettings,
     headway_factors: Sequence[float] | None = None,
 ) -> CalibratedIDM:
     """Return the IDM parameters with the smallest error of the simulated gaps of all `trajectories`.
@@ -126,7 +126,6 @@ def calibrate_idm(
     """
     from scipy.optimize import differential_evolution  # takes half a second, which --help need not wait for
 
-    settings = settings or CalibrationSettings()
     segments = make_segments(trajectories, settings.segment_seconds)
     factors = 1.0 if headway_factors is None else np.array(headway_factors)[segments.trajectory_index]
     result = differential_evolution(
@@ -181,10 +180,8 @@ def gap_mean_squares(segments: Segments, model: DriverModel, candidate_count: in
 
 def _trajectory_weights(segments: Segments) -> tuple[NDArray[np.intp], Floats]:
     """Return the index of each trajectory's first segment, and each segment's share of its trajectory's samples."""
-    trajectory_index, counts = segments.trajectory_index, segments.sample_counts
-    return np.flatnonzero(np.diff(trajectory_index, prepend=-1)), counts / np.bincount(trajectory_index, counts)[
-        trajectory_index
-    ]
+    index, counts = segments.trajectory_index, segments.sample_counts
+    return np.flatnonzero(np.diff(index, prepend=-1)), counts / np.bincount(index, counts)[index]
 
 
 def is_at_bound(value: float, bounds: ParameterRange) -> bool:
@@ -206,11 +203,11 @@ def calibrate_groups(
     minute of driving determines a driver's distance, but not the desired speed. `on_progress` gets the finished groups.
     """
     settings = settings or CalibrationSettings()
-    calibrated: list[CalibratedIDM] = []
     if len(individual) == 1:
         calibrated = _calibrate_one_parameter(groups, typical, individual[0], settings)
         on_progress(len(calibrated))
         return calibrated
+    calibrated = list[CalibratedIDM]()
     fixed = {name: (getattr(typical, name),) * 2 for name in CALIBRATED_PARAMETERS if name not in individual}
     for trajectories in groups:
         calibrated.append(calibrate_idm(trajectories, replace(settings, **fixed)))
@@ -234,13 +231,11 @@ def _calibrate_one_parameter(
     bounds = getattr(settings, name)
     values = _minimize_on_grid(errors, np.linspace(bounds[0], bounds[1], CALIBRATION_GRID_SIZE), len(groups))
     simulated = simulate_followers(model(values), segments)
-    gap_errors = _group_errors(simulated.gap_mse, segments, group, "sample").tolist()
-    speed_errors = _group_errors(simulated.speed_mse, segments, group, "sample").tolist()
-    collisions = np.bincount(group, simulated.has_collided, len(groups)).astype(int).tolist()
-    calibrated = []
-    for value, trajectories, gap_error, speed_error, crashes in zip(
-        values.tolist(), groups, gap_errors, speed_errors, collisions, strict=True
-    ):
+    mean_squares = simulated.gap_mse, simulated.speed_mse
+    errors_by_group = (_group_errors(each, segments, group, "sample").tolist() for each in mean_squares)
+    collisions, calibrated = np.bincount(group, simulated.has_collided, len(groups)).astype(int).tolist(), []
+    rows = zip(values.tolist(), groups, *errors_by_group, collisions, strict=True)
+    for value, trajectories, gap_error, speed_error, crashes in rows:
         parameters, at_bounds = replace(typical, **{name: value}), (name,) if is_at_bound(value, bounds) else ()
         seconds = sum(each.seconds for each in trajectories)
         calibrated.append(CalibratedIDM(parameters, gap_error, speed_error, crashes, seconds, at_bounds))

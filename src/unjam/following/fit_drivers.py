@@ -110,14 +110,10 @@ def fit_drivers_from_files(
     settings = build_dataclass(FitDriversSettings, nest_keys(overrides), "")
     trajectories: list[FollowingTrajectory] = []
     notes = []
-    for file, prefix in zip(files, _name_prefixes(files), strict=True):
-        result = read_trajectories(
-            file, format, ReadOptions(drop_bad_rows=drop_bad_rows, driver_columns=driver_columns)
-        )
-        notes += [f"{file.name}: {line}" for line in result.summary_lines()]
-        trajectories += [
-            replace(each, name=prefix + each.name, driver=prefix + each.driver) for each in result.trajectories
-        ]
+    for file, stem in zip(files, _name_prefixes(files), strict=True):
+        read = read_trajectories(file, format, ReadOptions(drop_bad_rows=drop_bad_rows, driver_columns=driver_columns))
+        notes += [f"{file.name}: {line}" for line in read.summary_lines()]
+        trajectories += [replace(each, name=stem + each.name, driver=stem + each.driver) for each in read.trajectories]
     for name, value in (filters or {}).items():
         if name not in FILTER_FIELDS:
             raise unknown_name("select", name, FILTER_FIELDS)
@@ -150,7 +146,7 @@ def _name_prefixes(files: Sequence[Path]) -> list[str]:
 
 def fit_drivers(
     trajectories: Sequence[FollowingTrajectory],
-    settings: FitDriversSettings | None = None,
+    settings: FitDriversSettings,
     on_progress: DriverProgress = lambda *done: None,
 ) -> Population:
     """Calibrate a population with a driver for each driver of `trajectories`.
@@ -158,28 +154,24 @@ def fit_drivers(
     A residual is used only if it reduces the error of simulated gaps for validation drivers. Raise `InputError` if
     there are too few drivers for it, the time steps differ, or a simulated gap is not finite.
     """
-    settings = settings or FitDriversSettings()
     for name in settings.individual:
         if name not in CALIBRATED_PARAMETERS:
             raise unknown_name("individual", name, CALIBRATED_PARAMETERS)
     names = list(dict.fromkeys(each.driver for each in trajectories))
     if settings.residual and len(names) < MIN_RESIDUAL_DRIVERS:
         raise invalid_value("drivers", len(names), f">= {MIN_RESIDUAL_DRIVERS} for a residual")
-    calibration = replace(settings.calibration, initial_headway_weight=(0.0, 0.0))  # drivers have their own headways
-    common = calibrate_idm(trajectories, calibration)
-    typical, calibrated = _calibrate_in_rounds(
-        trajectories, names, replace(settings, calibration=calibration), on_progress
-    )
+    fixed = replace(settings.calibration, initial_headway_weight=(0.0, 0.0))  # drivers have their own headways
+    common = calibrate_idm(trajectories, fixed)
+    typical, calibrated = _calibrate_in_rounds(trajectories, names, replace(settings, calibration=fixed), on_progress)
     for name, each in {"one IDM for all": common, **calibrated}.items():
         if not np.isfinite(each.gap_error):
-            raise invalid_value(
-                f"gap error of {name}", each.gap_error, "a finite number; are the data in m, m/s and s?"
-            )
+            allowed = "a finite number; are the data in m, m/s and s?"
+            raise invalid_value(f"gap error of {name}", each.gap_error, allowed)
     residual, facts = _fit_residual(trajectories, calibrated, settings) if settings.residual else (None, {})
     return Population(
         typical=typical,
         drivers=tuple(each.parameters for each in calibrated.values()),
-        limits=calibration.limits,
+        limits=fixed.limits,
         residual=residual,
         details=tuple({"name": name, **_calibration_details(each)} for name, each in calibrated.items()),
         metadata={"fit": {"settings": asdict(settings), "common": _calibration_details(common), **facts}},

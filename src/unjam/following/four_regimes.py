@@ -90,9 +90,8 @@ def make_four_regimes(settings: FourRegimesSettings) -> list[FollowingTrajectory
     leader_speeds = np.repeat(leader_speed[:, None], length + 1, axis=1)
     trajectories = []
     for number, columns in enumerate(zip(speeds, leader_speeds, gaps, strict=True)):
-        trajectory = FollowingTrajectory(
-            f"{number}", f"{number}", settings.time_step, *columns, kind=REGIMES[regime[number]]
-        )
+        name, kind = str(number), REGIMES[regime[number]]
+        trajectory = FollowingTrajectory(name, name, settings.time_step, *columns, kind=kind)
         trajectories.append(trajectory.part(0, min(length, settings.samples - number * length) + 1))
     return trajectories
 
@@ -111,12 +110,7 @@ def _draw_starts(
     differences = [uniform(s.acceleration_speed_surplus), -uniform(s.deceleration_speed_deficit)]
     differences += [uniform(s.cruising_speed_difference), -uniform(s.emergency_speed_deficit)]
     leader_speed = (speed + np.choose(regime, differences)).clip(0.0, None)
-    accelerations = [
-        uniform(s.acceleration_share) * free,
-        uniform(s.initial_deceleration),
-        0.0,
-        s.emergency_acceleration,
-    ]
+    initial = [uniform(s.acceleration_share) * free, uniform(s.initial_deceleration), 0.0, s.emergency_acceleration]
     # Eq. 5 solved for the gap.
-    interaction = (free - np.choose(regime, accelerations)) / p.max_acceleration
+    interaction = (free - np.choose(regime, initial)) / p.max_acceleration
     return speed, leader_speed, desired_gap(speed, speed - leader_speed, p) / np.sqrt(interaction)

@@ -53,9 +53,7 @@ def idm_function(parameters: AnyIDM, limits: AccelerationBounds | None = None) -
     return follow
 
 
-def individual_idm(
-    parameters: AnyIDM, initial_headway_weight: Array, limits: AccelerationBounds | None = None
-) -> DriverModel:
+def individual_idm(parameters: AnyIDM, headway_weight: Array, limits: AccelerationBounds | None = None) -> DriverModel:
     """Return an IDM whose time headway depends on its initial gap and speed: drivers differ most in their distance.
 
     The headway is T^(1 - w) T0^w with T of `parameters`, T0 = (gap - s0) / v of the first state, and the weight w.
@@ -64,7 +62,7 @@ def individual_idm(
 
     def start(speed: Array, gap: Array) -> AccelerationFunction:
         initial = clip((gap - p.minimum_gap) / clamp_min(speed, MIN_HEADWAY_SPEED), *HEADWAY_LIMITS)
-        own = p.time_headway ** (1.0 - initial_headway_weight) * initial**initial_headway_weight
+        own = p.time_headway ** (1.0 - headway_weight) * initial**headway_weight
         return idm_function(replace_parameters(p, time_headway=own), limits)
 
     return start
@@ -89,9 +87,7 @@ def add_residual(
     return start
 
 
-def follow_leader(
-    follow: AccelerationFunction, start: tuple[Array, Array], leader: Any, time_step: float
-) -> Iterator[Any]:
+def follow_leader(follow: AccelerationFunction, start: tuple[Array, Array], leader: Any, step: float) -> Iterator[Any]:
     """Yield the speed [m/s] and the gap [m] of a follower after each step behind a recorded leader.
 
     A follower that uses up its gap stays in contact with the leader, and is not faster, until it brakes. `start` is its
@@ -100,8 +96,8 @@ def follow_leader(
     (speed, gap), (leader_speeds, paths) = start, leader
     position = gap * 0.0
     for leader_speed, next_leader_speed, path in zip(leader_speeds[:-1], leader_speeds[1:], paths[1:], strict=True):
-        speed = next_speed(speed, follow(speed, leader_speed, gap), time_step)
-        gap = path - next_position(position, speed, time_step)
+        speed = next_speed(speed, follow(speed, leader_speed, gap), step)
+        gap = path - next_position(position, speed, step)
         is_in_contact, xp = gap <= 0.0, namespace(gap)
         gap = clamp_min(gap, 0.0)
         position = path - gap

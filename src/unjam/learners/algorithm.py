@@ -65,7 +65,23 @@ class Collector:
         return found
 
 
-class Algorithm(Protocol):
+class Agent(Protocol):
+    """What a training learns with: a policy, and all that is needed to resume."""
+
+    def network(self) -> Network:
+        """Return the present policy: a NumPy network, which workers and exported controllers drive without torch."""
+        ...
+
+    def state(self) -> tuple[dict[str, Any], Tensors]:
+        """Return all that is needed to resume exactly: values for JSON, and tensors."""
+        ...
+
+    def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
+        """Resume, made with the same configuration, from what `state` returned."""
+        ...
+
+
+class Algorithm(Agent, Protocol):
     """What a training runs: it learns in iterations from the episodes that it collects.
 
     A class of the user's own, `--agent path.py:Class`, is made with an `AgentSpec`, and with `user.options` as keyword
@@ -73,20 +89,8 @@ class Algorithm(Protocol):
     Before each iteration, the global generators of NumPy and torch are seeded by run and iteration.
     """
 
-    def network(self) -> Network:
-        """Return the present policy: a NumPy network, which workers and exported controllers drive without torch."""
-        ...
-
     def iterate(self, collect: Collector) -> IterationLog:
         """Collect episodes, at least once, and learn from them."""
-        ...
-
-    def state(self) -> tuple[dict[str, Any], Tensors]:
-        """Return all that is needed to resume after an iteration: values for JSON, and tensors."""
-        ...
-
-    def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
-        """Resume, made with the same configuration, from what `state` returned."""
         ...
 
 
@@ -108,9 +112,8 @@ def run_iterations(
         if not isinstance(log, IterationLog):
             raise UnjamError(f"algorithm: iterate() returns {type(log).__name__}; allowed: an IterationLog")
         if not collect.episodes:
-            raise UnjamError(
-                f"algorithm: iteration {collect.iteration} runs no episodes; allowed: at least one collect()"
-            )
+            allowed = "allowed: at least one collect()"
+            raise UnjamError(f"algorithm: iteration {collect.iteration} runs no episodes; {allowed}")
         _check_numbers({**log.values, **log.seconds})
         if on_iteration(log):
             return

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from unjam.errors import InputError, UnjamError
 from unjam.learners.agent import AgentSpec
+from unjam.physics.arrays import Floats
 from unjam.text import format_count
 from unjam.worlds.record import Episode, Trajectory
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Experience:
     """inputs of the actor, then those of the critic alone, shape (rows, inputs + critic inputs)"""
     actions: Float32
     """residuals [m/s2], shape (rows,)"""
-    rewards: Float64
+    rewards: Floats
     """sums while each residual was held, shape (rows,)"""
     starts: NDArray[np.intp]
     """index of the first row of each trajectory, of one CAV in one episode, shape (trajectories,)"""
@@ -48,7 +48,7 @@ class Experience:
 
 def make_experience(
     trajectories: Sequence[Trajectory],
-    critic_inputs: Sequence[Sequence[float]] | Float64,
+    critic_inputs: Sequence[Sequence[float]] | Floats,
     returns_after_exit: Sequence[float | None] | None = None,
 ) -> Experience:
     """Return trajectories, with `critic_inputs`, as experience; those with a return after their exit are terminated."""
@@ -80,7 +80,7 @@ def join_experience(parts: Sequence[Experience]) -> Experience:
     return Experience(**joined)
 
 
-def discounted_returns(rows: Experience, gamma: float) -> Float64:
+def discounted_returns(rows: Experience, gamma: float) -> Floats:
     """Return discounted rewards from each row on, (rows,); truncated trajectories continue with their mean reward."""
     returns = np.empty(len(rows.rewards))
     for first, last, terminated in zip(rows.starts, rows.last_rows, rows.terminated, strict=True):
@@ -104,9 +104,8 @@ def task_experience(spec: AgentSpec, task_index: int, episodes: Sequence[Episode
     policy, scenario = spec.policy, spec.tasks[task_index].scenario
     pairs = [(episode, trajectory) for episode in episodes for trajectory in episode.trajectories]
     if not pairs:
-        raise InputError(
-            f"no CAV was on the road in {format_count(len(episodes), 'episode')}: increase the share of CAVs"
-        )
+        count = format_count(len(episodes), "episode")
+        raise InputError(f"no CAV was on the road in {count}: increase the share of CAVs")
     drawn_values = np.array([scenario.scale_drawn_values(episode.drawn_values) for episode, _ in pairs])
     critic_inputs, later = spec.privileged_inputs(task_index, drawn_values), None
     if policy.reward_after_exit:

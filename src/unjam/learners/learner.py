@@ -1,7 +1,7 @@
 """Learners: what updates the policy in Algorithm 1, from environment and model experience."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from torch.distributions import Normal
 
 from unjam.drivers.network import Network
 from unjam.errors import UnjamError
-from unjam.learners.algorithm import Tensors
+from unjam.learners.algorithm import Agent
 from unjam.learners.experience import Experience, join_experience
 from unjam.physics.arrays import square_root
 
@@ -37,28 +37,16 @@ class Update(NamedTuple):
         return join_experience([part for part in (self.environment_rows, self.model_rows) if part is not None])
 
 
-class Learner(Protocol):
+class Learner(Agent, Protocol):
     """What updates the policy in Algorithm 1; it may come from any library.
 
-    A class of the user's own, `--agent path.py:Class`, inherits from this one, and has the first four methods. It is
-    made with an `AgentSpec`, and with `user.options` as keyword arguments. Before each update, the global generators
-    of NumPy and torch are seeded by run, iteration and update.
+    A class of the user's own, `--agent path.py:Class`, inherits from this one, and has `network`, `learn`, `state` and
+    `restore`. It is made with an `AgentSpec`, and with `user.options` as keyword arguments. Before each update, the
+    global generators of NumPy and torch are seeded by run, iteration and update.
     """
-
-    def network(self) -> Network:
-        """Return the policy: a NumPy network, which workers and exported controllers drive without torch."""
-        ...
 
     def learn(self, update: Update) -> None:
         """Update the policy, and whatever else learns."""
-        ...
-
-    def state(self) -> tuple[dict[str, Any], Tensors]:
-        """Return all that is needed to resume exactly: values for JSON, and tensors."""
-        ...
-
-    def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
-        """Resume from what `state` of a learner with the same configuration returned."""
         ...
 
     def exploring_network(self, environment_steps: int) -> Network:

@@ -59,9 +59,8 @@ class OffPolicyResidualMixin(BasePolicy):
 
     def __init__(self, *args: Any, settings: PolicySettings, inputs: int, action_limit: float, **kwargs: Any) -> None:
         self.settings, self.inputs, self.authority = settings, inputs, settings.authority * action_limit
-        super().__init__(
-            *args, net_arch=list(settings.hidden), optimizer_class=Adam, optimizer_kwargs={"fused": True}, **kwargs
-        )
+        kwargs |= {"optimizer_class": Adam, "optimizer_kwargs": {"fused": True}}
+        super().__init__(*args, net_arch=list(settings.hidden), **kwargs)
         self.register_buffer("reward_offset", torch.zeros((), dtype=torch.float64))
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
@@ -215,11 +214,8 @@ class TD3(OffPolicyLearner):
     """Twin delayed deep deterministic policy gradient (Fujimoto, van Hoof and Meger 2018) on whole episodes."""
 
     def __init__(self, spec: AgentSpec, settings: TD3Settings) -> None:
-        kwargs = {
-            "policy_delay": settings.policy_delay,
-            "target_policy_noise": settings.target_noise,
-            "target_noise_clip": settings.target_noise_clip,
-        }
+        noise = {"target_policy_noise": settings.target_noise, "target_noise_clip": settings.target_noise_clip}
+        kwargs = {"policy_delay": settings.policy_delay, **noise}
         super().__init__(spec, settings, stable_baselines3.TD3, DeterministicResidualPolicy, **kwargs)
 
     @torch.no_grad()

@@ -18,8 +18,9 @@ from unjam.drivers.network import Network
 from unjam.errors import UnjamError
 from unjam.learners.agent import AgentSpec
 from unjam.learners.algorithm import Tensors, tensors_with_prefix
-from unjam.learners.experience import Experience, Float64
+from unjam.learners.experience import Experience
 from unjam.learners.learner import Learner
+from unjam.physics.arrays import Floats
 
 ADAM_STATE = {"step", "exp_avg", "exp_avg_sq"}
 """what Adam stores for each parameter"""
@@ -32,15 +33,13 @@ class SB3Learner(Learner):
     sb3: Any
     """SB3's algorithm: its `train()` needs a filled buffer, a logger, and the spaces of an environment"""
 
-    def __init__(
-        self, spec: AgentSpec, algorithm: type[BaseAlgorithm], policy: type[BasePolicy], **kwargs: Any
-    ) -> None:
+    def __init__(self, spec: AgentSpec, algorithm: type[BaseAlgorithm], policy: type[BasePolicy], **extra: Any) -> None:
         env = gymnasium.Env[np.ndarray, np.ndarray]()  # SB3 reads its spaces; it is never stepped
         env.observation_space, env.action_space = policy_spaces(spec.inputs, spec.critic_inputs, spec.authority)
-        self.spec, self.gamma = spec, kwargs["gamma"]
+        self.spec, self.gamma = spec, extra["gamma"]
         residual = {"settings": spec.policy, "inputs": spec.inputs, "action_limit": spec.action_limit}
-        kwargs["policy_kwargs"] = residual | kwargs.get("policy_kwargs", {})
-        self.sb3 = algorithm(policy=policy, env=env, seed=spec.seed, device="cpu", **kwargs)
+        extra["policy_kwargs"] = residual | extra.get("policy_kwargs", {})
+        self.sb3 = algorithm(policy=policy, env=env, seed=spec.seed, device="cpu", **extra)
         self.sb3.set_logger(Logger(None, []))
 
     def network(self) -> Network:
@@ -139,7 +138,7 @@ def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: 
     buffer.compute_returns_and_advantage(torch.zeros(1), np.ones(1, bool))
 
 
-def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: float, rewards: Float64) -> None:
+def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: float, rewards: Floats) -> None:
     """Add rows to the buffer, actions as shares of the `authority` [m/s2]; only collisions set `dones`."""
     done = np.zeros(len(rewards), np.float32)
     done[rows.last_rows] = rows.terminated
@@ -178,7 +177,7 @@ class MixedReplayBuffer(ReplayBuffer):
         return ReplayBufferSamples(*(torch.cat(part) for part in zip(*(each[:5] for each in parts), strict=True)))
 
 
-def shift_rewards(rows: Experience, offset: float, gamma: float) -> Float64:
+def shift_rewards(rows: Experience, offset: float, gamma: float) -> Floats:
     """Return the rewards minus `offset`, shape (rows,), so that all values decrease by offset / (1 - gamma).
 
     At a collision, which no reward follows, the last reward decreases by the missing part.

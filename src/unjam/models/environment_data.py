@@ -116,11 +116,8 @@ class EnvironmentData:
 
     def start_indices(self, min_control_steps: int = 1, first_episode: int = 0) -> StartIndices:
         """Return the steps with a new residual and enough steps after them, of episodes from the first on."""
-        due = {
-            index: np.arange(0, len(recording.reward) - min_control_steps + 1, recording.action_repeat)
-            for index, recording in enumerate(self.recordings)
-            if recording.episode >= first_episode
-        }
+        new = [(index, each) for index, each in enumerate(self.recordings) if each.episode >= first_episode]
+        due = {index: np.arange(0, len(each.reward) - min_control_steps + 1, each.action_repeat) for index, each in new}
         indices = np.repeat(np.array(list(due), np.int64), [len(steps) for steps in due.values()])
         return np.column_stack([indices, np.concatenate([[], *due.values()]).astype(np.int64)])
 

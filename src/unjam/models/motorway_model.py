@@ -20,13 +20,7 @@ from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Floats
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_road import MotorwayRoad
-from unjam.worlds.batch.motorway.traffic import (
-    BatchMotorways,
-    LearnedCorrection,
-    driver_columns,
-    enable_acc,
-    make_vehicles,
-)
+from unjam.worlds.batch.motorway import traffic
 from unjam.worlds.batch.motorway.vehicles import MotorwayVehicles, find_rows, vehicle_numbers
 from unjam.worlds.lane_neighbors import find_road_neighbors, neighbors_on_lane
 from unjam.worlds.record import Episode
@@ -106,16 +100,16 @@ def _batch_vehicles(
     numbers = {entry.name: number for number, entry in enumerate(road.entries)}
     entries = np.array([numbers[name] for name in episode.vehicle_ids])
     types = [road.vehicle_types[road.entries[number].vehicle_type] for number in entries.tolist()]
-    *parameters, speed_factor, is_eidm = np.array([driver_columns(each) for each in types])[vehicle].T
+    *parameters, speed_factor, is_eidm = np.array([traffic.driver_columns(each) for each in types])[vehicle].T
     geometry = road.geometry
     lane = (geometry.lane_count - episode.lane_indices[at]).astype(np.intp)
     position, speed = episode.positions[at] + geometry.origin, episode.speeds[at]
     acceleration = np.nan_to_num(speed - episode.speeds[at[0] - 1, at[1]]) / episode.control_step
     limit = geometry.speed_limits(lane, geometry.sections(lane, position))
     moving = sample, entries[vehicle], lane, position, speed, acceleration
-    vehicles = make_vehicles(*moving, *parameters, speed_factor, is_eidm, limit * speed_factor)
+    vehicles = traffic.make_vehicles(*moving, *parameters, speed_factor, is_eidm, limit * speed_factor)
     is_cav = np.isin(np.array(episode.vehicle_ids), episode.cav_ids)
-    return enable_acc(vehicles, is_cav[vehicle], scenario.cruise)
+    return traffic.enable_acc(vehicles, is_cav[vehicle], scenario.cruise)
 
 
 def _speeds_after_step(
@@ -127,11 +121,11 @@ def _speeds_after_step(
 ) -> Floats:
     """Return the speeds after a control step [m/s]; NaN for vehicles that changed lanes or left."""
     empty = [replace(road, entries=())] * road_count
-    traffic = BatchMotorways(empty, scenario.simulation_step, draw_noise)
-    traffic.vehicles = vehicles.map(np.copy)
+    batch = traffic.BatchMotorways(empty, scenario.simulation_step, draw_noise)
+    batch.vehicles = vehicles.map(np.copy)
     for _ in range(scenario.steps_per_control_step):
-        traffic.step()
-    after = traffic.vehicles
+        batch.step()
+    after = batch.vehicles
     row = find_rows(vehicle_numbers(vehicles), after)
     keeps_lane = (row >= 0) & (after.lane[row] == vehicles.lane)
     return np.where(keeps_lane, after.speed[row], np.nan)
@@ -139,7 +133,7 @@ def _speeds_after_step(
 
 def learned_correction(
     model: RoadModel, generator: torch.Generator, steps: int, has_noise: bool = True
-) -> LearnedCorrection | None:
+) -> traffic.LearnedCorrection | None:
     """Return what the model adds to human drivers' speeds in a control step; base `none` replaces all but noise."""
     residual = residual_function(model, generator)
     if model.base != "none":

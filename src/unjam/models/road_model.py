@@ -25,12 +25,7 @@ from unjam.physics.kinematics import gap_on_loop, next_speed
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
-from unjam.worlds.batch.figure_eight.crossing import (
-    CrossingMemory,
-    commanded_speed,
-    crossing_memories,
-    may_follow_commands,
-)
+from unjam.worlds.batch.figure_eight import crossing
 from unjam.worlds.batch.human_idm import HumanSpeedModel, human_idm_speed
 from unjam.worlds.batch.motorway.traffic import LearnedCorrection
 from unjam.worlds.record import Episode, Floats
@@ -61,7 +56,7 @@ class RoadSamples:
     intended_speeds: Floats
     """distance divided by time in the next control step: the speed before noise"""
     next_speeds: Floats
-    crossing_memory: CrossingMemory | None
+    crossing_memory: crossing.CrossingMemory | None
     """waiting times and entry steps on a road that crosses itself"""
 
 
@@ -79,8 +74,8 @@ def road_samples(episode: Episode, number: int, scenario: LoopScenario) -> RoadS
     interval, size = episode.trajectories[0].action_repeat, round(episode.drawn_values[scenario.size_parameter])
     at, sampled_memory = np.arange(0, episode.control_steps, interval), None
     if episode.crossings:
-        memory = crossing_memories(scenario, _road_of_size(scenario, size), episode.speeds, episode.positions)
-        sampled_memory = CrossingMemory(memory.waiting_time[at], memory.entry_step[at])
+        memory = crossing.crossing_memories(scenario, _road_of_size(scenario, size), episode.speeds, episode.positions)
+        sampled_memory = crossing.CrossingMemory(memory.waiting_time[at], memory.entry_step[at])
     return RoadSamples(
         episode=number,
         interval=interval,
@@ -125,7 +120,7 @@ def base_human_model(base: str, scenario: Scenario) -> HumanSpeedModel:
     """Return the human drivers of a base in `BASE_DRIVERS`."""
     make_driver, step = BASE_DRIVERS[base], scenario.simulation_step
     if base == "idm":
-        follow = commanded_speed if scenario.human_control == "commanded" else human_idm_speed
+        follow = crossing.commanded_speed if scenario.human_control == "commanded" else human_idm_speed
         return partial(follow, parameters=scenario.humans, step=step)
     if make_driver is None:
         return lambda speed, leader_speed, gap: speed + 0.0  # a copy: the caller writes into it
@@ -173,10 +168,10 @@ def learned_human_model(model: RoadModel, scenario: Scenario, generator: torch.G
 def _has_right_of_way(samples: RoadSamples, scenario: Scenario, desired_speeds: Floats) -> NDArray[np.bool_]:
     """Return whether the right of way allows human drivers these speeds [m/s], shape (M, N)."""
     road = _road_of_size(cast(LoopScenario, scenario), samples.size)
-    is_human, memory = samples.is_human > 0.0, cast(CrossingMemory, samples.crossing_memory)
+    is_human, memory = samples.is_human > 0.0, cast(crossing.CrossingMemory, samples.crossing_memory)
     desired_speeds = np.where(is_human, desired_speeds, samples.next_speeds).clip(0.0)
     cav_columns, moving = np.flatnonzero(~is_human).tolist(), (samples.speeds, samples.positions)
-    return may_follow_commands(scenario, road, cav_columns, memory, moving, desired_speeds)
+    return crossing.may_follow_commands(scenario, road, cav_columns, memory, moving, desired_speeds)
 
 
 def human_rows(samples: Sequence[RoadSamples], base: str, scenario: Scenario) -> HumanRows:
@@ -230,10 +225,8 @@ def fit_human_model(
     model.noise.fill_(sigma)
     targets = torch.from_numpy((rows.intended_speed - rows.base_speed)[:, None])
     fit = ensemble.fit_ensemble(model, _inputs(*rows[:ROAD_MODEL_INPUTS]), targets, is_holdout, settings, generator)
-    base_error, model_error = (
-        ensemble.root_mean_square(fit.targets),
-        ensemble.root_mean_square(fit.targets - fit.predictions),
-    )
+    base_error = ensemble.root_mean_square(fit.targets)
+    model_error = ensemble.root_mean_square(fit.targets - fit.predictions)
     is_base_enough = base_error < ensemble.MIN_CHANGE or model_error**2 > (1.0 - min_error_reduction) * base_error**2
     if settings.fallback_to_base and is_base_enough:
         model.output_mask.zero_()

@@ -165,9 +165,8 @@ class ModelDynamics:
             penetration_rate=state.penetration_rate,
         )
         reward = row_model.base_reward(self._model.base, self._reward, next_state, acceleration, crashed)
-        clipped = torch.stack(
-            [(speeds != predicted_speeds).any(0), (gaps != predicted_gaps).any(0), residual_reward != residual[-1]]
-        )
+        is_clipped = (speeds != predicted_speeds).any(0), (gaps != predicted_gaps).any(0)
+        clipped = torch.stack([*is_clipped, residual_reward != residual[-1]])
         return ModelTransition(next_state, reward + residual_reward * ~crashed, crashed, clipped, actuators)
 
     def _residual(self, state: LocalState, acceleration: Tensor, drawn_values: Tensor, expected_gaps: Tensor) -> Tensor:

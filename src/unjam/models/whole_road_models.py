@@ -123,6 +123,7 @@ class ClosedRoadModel(WholeRoadModel[road_model.RoadSamples]):
         by_episode = {each.episode: each for each in self.samples}
         samples = [by_episode[self.data.recordings[index].episode] for index, _ in start_indices]
         pairs = [(each, at // each.interval) for each, (_, at) in zip(samples, start_indices, strict=True)]
+        memories = [(each.crossing_memory, row) for each, row in pairs]
         noise = float(self.ensemble.noise) / road.simulation_step / replace(road, noise=1.0).noise_per_step
         common = replace(road, horizon=control_steps, noise=noise if self.settings.add_noise else 0.0, population="")
         world = RingBatch(
@@ -134,10 +135,7 @@ class ClosedRoadModel(WholeRoadModel[road_model.RoadSamples]):
         world.place_vehicles(
             np.stack([each.speeds[row] for each, row in pairs], 1),
             np.stack([each.positions[row] for each, row in pairs], 1),
-            [
-                each.crossing_memory and CrossingMemory(*(values[row] for values in each.crossing_memory))
-                for each, row in pairs
-            ],
+            [memory and CrossingMemory(*(values[row] for values in memory)) for memory, row in memories],
         )
         if road.steps_per_control_step == 1 and not road.actuator.is_instant:
             world.set_actuators(self.data.actuator_states_at(np.concatenate(self._starts_by_cav(start_indices))))
@@ -182,13 +180,10 @@ class MotorwayModel(WholeRoadModel[MotorwaySamples]):
     def check(cls, scenario: Scenario, settings: ModelSettings) -> None:
         """Raise `InputError` if the scenario or a setting is not supported."""
         super().check(scenario, settings)
+        base, starts = settings.base, settings.rollout_starts
         for setting, is_allowed, allowed in (
-            (f"rollout_starts: {settings.rollout_starts}", settings.rollout_starts == "first", "first"),
-            (
-                f"base: {settings.base}",
-                settings.base in ("idm", "none"),
-                "idm, each vehicle's own driver model, or none",
-            ),
+            (f"rollout_starts: {starts}", starts == "first", "first"),
+            (f"base: {base}", base in ("idm", "none"), "idm, each vehicle's own driver model, or none"),
             ("calibrate_base: true", not settings.calibrate_base, "false"),
             (f"humans: {settings.humans}", not settings.humans, "none"),
         ):

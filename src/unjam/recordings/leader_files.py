@@ -8,16 +8,8 @@ import numpy as np
 import pandas as pd
 
 from unjam.errors import InputError
+from unjam.recordings import loaders
 from unjam.recordings.leaders import LeaderRecording
-from unjam.recordings.loaders import (
-    ReadOptions,
-    alphanumeric,
-    detect_format,
-    join_row_values,
-    split_trajectories,
-    to_numeric,
-    trajectories_of_table,
-)
 from unjam.recordings.tables import check_unique, read_table
 from unjam.sumo_files import file_stamp
 from unjam.text import shorten_list
@@ -48,15 +40,15 @@ def read_leaders(path: Path) -> list[LeaderRecording]:
 
 @lru_cache(64)
 def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, ...]:
-    frame, options = read_table(path), ReadOptions(min_seconds=MIN_SECONDS, bad_row_hint="")
+    frame, options = read_table(path), loaders.ReadOptions(min_seconds=MIN_SECONDS, bad_row_hint="")
     names = set(map(str, frame.columns))
     if names.issuperset(I24_COLUMNS):
         frame = pd.DataFrame({"line": frame["line"], "time": frame["Time"], "speed_kmh": frame["Velocity"]})
         names = set(frame.columns)
     frame = frame.rename(columns={name: "time" for name in ("t", "Time") if "time" not in names and name in names})
     check_unique(path, (name for name in map(str, frame.columns) if name == "time"))
-    columns = [name for name in map(str, frame.columns) if SPEED_COLUMN.fullmatch(alphanumeric(name))]
-    has_leaders = detect_format(frame) != "table" or names & {"leader_speed", "v_lead"}
+    columns = [name for name in map(str, frame.columns) if SPEED_COLUMN.fullmatch(loaders.alphanumeric(name))]
+    has_leaders = loaders.detect_format(frame) != "table" or names & {"leader_speed", "v_lead"}
     if not has_leaders and (len(columns) != 1 or "time" not in frame):
         shown = shorten_list(sorted(names - {"line"}))
         raise InputError(
@@ -64,14 +56,14 @@ def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, 
             "format of unjam fit-drivers"
         )
     if has_leaders:
-        read = trajectories_of_table(frame, path, options)
+        read = loaders.trajectories_of_table(frame, path, options)
     else:
         table = _follower_table(frame, columns[0], path.stem)
         fastest = float(np.nanmax(table["speed"].to_numpy(np.float64)))
-        if alphanumeric(columns[0]) == "speed" and fastest > MAX_SPEED_WITHOUT_UNIT:
+        if loaders.alphanumeric(columns[0]) == "speed" and fastest > MAX_SPEED_WITHOUT_UNIT:
             allowed = f"<= {MAX_SPEED_WITHOUT_UNIT:g} m/s without a unit; {UNIT_HINT}"
             raise InputError(f"{path.name}: {columns[0]}: {fastest:g} is not allowed; allowed: {allowed}")
-        read = split_trajectories(table, path, options)
+        read = loaders.split_trajectories(table, path, options)
     found = tuple(LeaderRecording(each.name, each.time_step, each.leader_speed) for each in read.trajectories)
     for each in found:
         changes = np.abs(np.diff(each.speed)) / each.time_step
@@ -85,11 +77,11 @@ def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, 
 
 def _follower_table(frame: pd.DataFrame, column: str, stem: str) -> pd.DataFrame:
     """Return a table of speeds as one of trajectories with each recorded vehicle as the leader."""
-    names = [str(name) for name in frame.columns if alphanumeric(name) in VEHICLE_NAMES]
+    names = [str(name) for name in frame.columns if loaders.alphanumeric(name) in VEHICLE_NAMES]
     # A column without equal values has the numbers of the rows.
     names = [name for name in names if 1 < len(frame[[name]].drop_duplicates()) < len(frame)]
-    vehicles = stem + "-" + join_row_values(frame, tuple(names)) if names else stem
-    table = to_numeric(frame.loc[:, ["line", "time", column]], ["time", column])
-    match = SPEED_COLUMN.fullmatch(alphanumeric(column))
+    vehicles = stem + "-" + loaders.join_row_values(frame, tuple(names)) if names else stem
+    table = loaders.to_numeric(frame.loc[:, ["line", "time", column]], ["time", column])
+    match = SPEED_COLUMN.fullmatch(loaders.alphanumeric(column))
     speed = table[column] * METERS_PER_SECOND.get(match[1] if match else "", 1.0)
     return table.assign(pair=vehicles, speed=speed, leader_speed=speed, gap=0.0)

@@ -44,11 +44,8 @@ def recording_files(path: Path) -> list[Path]:
     if not folder.is_dir() or not WILDCARDS & {*pattern}:
         allowed = "a file with speeds, a folder of them, or a pattern like 'drives/2021-03*'"
         raise invalid_value("recordings", str(path), allowed)
-    found = sorted(
-        each
-        for each in folder.iterdir()
-        if fnmatchcase(each.name, pattern) and each.suffix.lower() in FILE_SUFFIXES and each.is_file()
-    )
+    files = (each for each in folder.iterdir() if fnmatchcase(each.name, pattern) and each.is_file())
+    found = sorted(each for each in files if each.suffix.lower() in FILE_SUFFIXES)
     if not found:
         endings, others = ", ".join(FILE_SUFFIXES), sorted(each.name for each in folder.iterdir())
         allowed = f"a folder or a pattern with at least one file that ends in {endings}"

@@ -91,22 +91,16 @@ class ReadResult:
     def summary_lines(self) -> list[str]:
         """Return the lines of a summary: rows that are used, skipped and dropped."""
         used = sum(len(each.speed) for each in self.trajectories)
-        lines = [
-            f"{format_count(len(self.trajectories), 'trajectory', 'trajectories')} with {used:,} of {self.rows:,} rows"
-        ]
-        lines += [
-            f"skipped: {format_count(count, 'row')}: {reason}" for reason, count in self.skipped_rows.items() if count
-        ]
+        own = format_count(len(self.trajectories), "trajectory", "trajectories")
+        skipped = [(reason, format_count(count, "row")) for reason, count in self.skipped_rows.items() if count]
+        lines = [f"{own} with {used:,} of {self.rows:,} rows", *(f"skipped: {rows}: {why}" for why, rows in skipped)]
         if self.jump_count:
             jumps = f"split at {format_count(self.jump_count, 'jump')} of the gap by more than {MAX_PAIR_JUMP:g} m"
             lines.append(f"{jumps} beyond the speeds: does a pair have several vehicles?")
         dropped = [f"dropped: line {line}: {reason}" for line, reason in self.bad_rows.items()]
         more = len(dropped) - MAX_LISTED_ROWS
-        return [
-            *lines,
-            *dropped[:MAX_LISTED_ROWS],
-            *([f"dropped: {format_count(more, 'more bad row')}"] if more > 0 else []),
-        ]
+        last = [f"dropped: {format_count(more, 'more bad row')}"] if more > 0 else []
+        return [*lines, *dropped[:MAX_LISTED_ROWS], *last]
 
 
 def read_trajectories(path: Path, format: str = "", options: ReadOptions | None = None) -> ReadResult:
@@ -317,10 +311,9 @@ def split_trajectories(
         raise InputError(f"{path.name}: time: there are no two rows of one vehicle")
     intervals = [np.diff(rows["time"].to_numpy(np.float64)) for rows in groups]
     has_missing = [each > MISSING_ROW_INTERVAL * np.median(each) for each in intervals]
-    has_jump = [
-        _find_jumps(rows, each) & ~missing for rows, each, missing in zip(groups, intervals, has_missing, strict=True)
-    ]
-    regular = [each[~missing] for each, missing in zip(intervals, has_missing, strict=True)]
+    parts = [*zip(groups, intervals, has_missing, strict=True)]
+    has_jump = [_find_jumps(rows, each) & ~missing for rows, each, missing in parts]
+    regular = [each[~missing] for _, each, missing in parts]
     steps = _common_time_steps([float(each.mean()) for each in regular], [float(each.sum()) for each in regular])
     trajectories, part_counts, short_count, longest = list[FollowingTrajectory](), Counter[str](), len(good), 0.0
     for rows, missing, jumps, step in zip(groups, has_missing, has_jump, steps, strict=True):

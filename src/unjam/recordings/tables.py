@@ -26,10 +26,8 @@ MAX_BINARY_LENGTH = 16
 """longest value of a column of equally long binary values in Parquet that is read [bytes], as decimal numbers have"""
 MAX_PARQUET_MEMORY = 8 << 30
 """maximum memory that a Parquet file takes while it is read [bytes]"""
-RECONSTRUCTED_COLUMN_ORDER = (
-    *("vehicleid", "frameid", "laneid", "localy", "meanspeed"),
-    *("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid"),
-)
+RECONSTRUCTED_COLUMN_ORDER = ("vehicleid", "frameid", "laneid", "localy", "meanspeed")
+RECONSTRUCTED_COLUMN_ORDER += ("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid")
 """columns of the reconstructed NGSIM files, which have no header, in their order"""
 NGSIM_COLUMN_ORDER = (
     *("vehicle_id", "frame_id", "total_frames", "global_time", "local_x", "local_y", "global_x", "global_y"),
@@ -190,10 +188,8 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     rows = "\n".join(lines[header + 1 :])
     if separator != "," and re.search(r"\d,\d", rows) and not re.search(r"\d\.\d", rows):
         options["decimal"] = ","
-    widest = (
-        0 if separator == r"\s+" else max(map(len, csv.reader(lines[header + 1 :], delimiter=separator)), default=0)
-    )
-    surplus = [f"surplus {number}" for number in range(widest - len(cells))]
+    width = 0 if separator == r"\s+" else max(map(len, csv.reader(lines[header + 1 :], delimiter=separator)), default=0)
+    surplus = [f"surplus {number}" for number in range(width - len(cells))]
     if surplus:  # pandas would take the first columns for an index, and shift all others
         names = options.get("names") or next(csv.reader([lines[header]], delimiter=separator))
         options = {"header": 0, **options, "names": [*names, *surplus]}

@@ -11,10 +11,8 @@ def family_roads(group: str) -> dict[str, road_family.FamilyRoad]:
     if group == road_family.SHARED_RINGS_GROUP:
         rings, limit = family_roads(road_family.GROUP_BY_SCENARIO["ring"]), MIN_SHARED_PENETRATION_RATE
         return {name: ring for name, ring in rings.items() if ring.options["cavs"] >= limit * ring.options["vehicles"]}
-    groups = {
-        name: (road_family.GROUP_BY_SCENARIO[road.scenario], road_family.ALL_ROADS_GROUP)
-        for name, road in road_family.FAMILY.items()
-    }
+    roads, every = road_family.FAMILY.items(), road_family.ALL_ROADS_GROUP
+    groups = {name: (road_family.GROUP_BY_SCENARIO[road.scenario], every) for name, road in roads}
     return {name: road for name, road in road_family.FAMILY.items() if group in groups[name]}
 
 

@@ -4,11 +4,10 @@ from math import pi
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from unjam.parameters import STRICT, NonNegative, NumberOrRange, PositiveInt, parameter_dataclass
-from unjam.physics.arrays import Array
+from unjam.physics.arrays import Array, Floats
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.ring import EdgeSpan, LoopScenario
 from unjam.scenarios.road import ClosedRoad, Connection, Edge, Node, Polyline, RoadNetwork, as_polyline
@@ -62,9 +61,7 @@ class FigureEight(LoopScenario):
     size_parameter: ClassVar[str] = "radius"
     is_first_leading: ClassVar[bool] = True
     description: ClassVar[str] = "figure eight with radius {} m"
-    limit_description: ClassVar[str] = (
-        "the speed at which the queue of all vehicles just clears the crossing in half a lap"
-    )
+    limit_description: ClassVar = "the speed at which the queue of all vehicles just clears the crossing in half a lap"
 
     radius: Annotated[tuple[Radius, Radius], NumberOrRange] = (32, 35)
     """range of the radius, drawn uniformly among its integers; or a single radius [m]"""
@@ -139,7 +136,7 @@ def _edge_spans(radius: float) -> list[EdgeSpan]:
     return spans
 
 
-def _arc_points(radius: float, center: float, first: float, last: float) -> NDArray[np.float64]:
+def _arc_points(radius: float, center: float, first: float, last: float) -> Floats:
     angles = np.linspace(first, last, ARC_POINTS)
     return radius * np.column_stack([np.cos(angles) + center, np.sin(angles) + center])
 

@@ -138,9 +138,8 @@ class Motorway(Scenario):
         if not 0 <= begin <= end:
             raise ValueError(f"peak: ({begin:g}, {end:g}) is not allowed; allowed: 0 <= begin <= end")
         if self.peak_rise > self.peak[0]:
-            raise ValueError(
-                f"peak_rise: {self.peak_rise:g} is not allowed; allowed: <= {self.peak[0]:g}, before the peak"
-            )
+            allowed = f"<= {self.peak[0]:g}, before the peak"
+            raise ValueError(f"peak_rise: {self.peak_rise:g} is not allowed; allowed: {allowed}")
         capacity = 3600.0 * self.lanes / max(self.min_entry_headway, 1e-9)
         sources = (
             ("", self, capacity, ", by min_entry_headway"),
@@ -189,6 +188,7 @@ class Motorway(Scenario):
             name, human = f"vehicle_{number}", f"human_type_{generator.integers(HUMAN_TYPE_COUNT)}"
             draws[name] = generator.random()
             entries.append(Entry(name, route, 0.0, speed, time, lane, select_type(human)))
+        cars = {each.name: draws[each.name] for each in entries if types[each.vehicle_type].vehicle_class is None}
         geometry = self.geometry
         return MotorwayRoad(
             geometry=geometry,
@@ -198,9 +198,7 @@ class Motorway(Scenario):
             limit_speed=self.speed_limit,
             merge_positions=tuple(ramp.merge_start - geometry.origin for ramp in geometry.ramps),
             vehicle_types=types,
-            cav_ids=self._select_cavs(
-                {each.name: draws[each.name] for each in entries if types[each.vehicle_type].vehicle_class is None}
-            ),
+            cav_ids=self._select_cavs(cars),
             peak=self.peak,
             free_flow_time=self.free_flow_time,
             roadside=self.roadside,
@@ -243,9 +241,8 @@ class Motorway(Scenario):
         humans = {f"human_type_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
         lane_changing, trucks, acc = self.lane_changing, self.trucks, self.ordinary_acc
         types = {name: one._replace(parameters=lane_changing.draw(others)) for name, one in humans.items()}
-        truck_types = [
-            f"truck_type_{number}" for number in range(motorway_vehicles.TRUCK_TYPE_COUNT if trucks.share else 0)
-        ]
+        truck_numbers = range(motorway_vehicles.TRUCK_TYPE_COUNT if trucks.share else 0)
+        truck_types = [f"truck_type_{number}" for number in truck_numbers]
         if acc.share:
             types |= {_with_acc(name): acc.replace_driver(types[name]) for name in humans}
         types |= {name: trucks.draw(others, self.car_following, lane_changing) for name in truck_types}
@@ -272,13 +269,8 @@ class Motorway(Scenario):
             return human
         (one,) = self.driver_population.draw(1, generator)
         # Only following is calibrated: recordings of jams say nothing about desired speeds.
-        return human._replace(
-            model="IDM",
-            time_headway=one.time_headway,
-            acceleration=one.max_acceleration,
-            deceleration=one.comfortable_deceleration,
-            minimum_gap=one.minimum_gap,
-        )
+        human = human._replace(model="IDM", time_headway=one.time_headway, minimum_gap=one.minimum_gap)
+        return human._replace(acceleration=one.max_acceleration, deceleration=one.comfortable_deceleration)
 
     def _arrivals(self, generator: np.random.Generator) -> Iterator[Arrival]:
         """Yield time, route, lane and speed of vehicles that want to enter."""

@@ -114,12 +114,8 @@ class MotorwayGeometry(NamedTuple):
         """The network; its x axis has its zero at `origin`."""
         lanes, origin = self.lane_count, self.origin
         borders = [_numbered(name, number) for number in range(len(self.ramps)) for name in ("joins", "closes")]
-        main = [
-            Edge(name, *ends, end - start, lanes=lanes + index % 2)
-            for index, ((name, start, end), ends) in enumerate(
-                zip(self._main_edges(), pairwise(["entrance", *borders, "exit"]), strict=True)
-            )
-        ]
+        parts = enumerate(zip(self._main_edges(), pairwise(["entrance", *borders, "exit"]), strict=True))
+        main = [Edge(name, *ends, end - start, lanes=lanes + at % 2) for at, ((name, start, end), ends) in parts]
         nodes, edges, connections = [Node("entrance", 0.0 - origin, 0.0)], main[:1], list[Connection]()
         for number, (name, ramp) in enumerate(zip(self.route_names[1:], self.ramps, strict=True)):
             before, merging, after = main[2 * number : 2 * number + 3]
@@ -136,9 +132,8 @@ class MotorwayGeometry(NamedTuple):
                 *(Connection(merging.name, after.name, lane + 1, lane) for lane in range(lanes)),
             ]
         nodes.append(Node("exit", self.length - origin, 0.0))
-        return RoadNetwork(
-            tuple(nodes), tuple(edges), self.speed_limit, has_internal_links=False, connections=tuple(connections)
-        )
+        links = tuple(connections)
+        return RoadNetwork(tuple(nodes), tuple(edges), self.speed_limit, has_internal_links=False, connections=links)
 
     @property
     def routes(self) -> tuple[Route, ...]:

@@ -6,11 +6,11 @@ from functools import lru_cache
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from unjam.drivers.safety import STANDARD_ACTUATOR, Actuator
 from unjam.parameters import STRICT, NumberOrRange, PositiveInt, is_packaged, parameter_dataclass
+from unjam.physics.arrays import Floats
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.road import ClosedRoad, Edge, Entry, Node, RoadNetwork, Route, as_polyline
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
@@ -90,9 +90,7 @@ class LoopScenario(Scenario):
         road = _packaged_road(self, size) if is_packaged(type(self)) else self.build(size)
         return replace(road, human_parameters=self.draw_humans(road.vehicle_ids, generator))
 
-    def _closed_road(
-        self, size: float, edges: Sequence[EdgeSpan], positions: NDArray[np.float64], **fields: Any
-    ) -> ClosedRoad:
+    def _closed_road(self, size: float, edges: Sequence[EdgeSpan], positions: Floats, **fields: Any) -> ClosedRoad:
         """Return a road of edges in driving order with vehicles at positions from the last to the first [m]."""
         ids, names = self._vehicle_ids(), [edge.name for edge in edges]
         laps = int(self.max_duration * self.top_speed / sum(edge.length for edge in edges)) + 2  # enough for an episode
@@ -204,7 +202,7 @@ class Ring(LoopScenario):
         return equilibrium_speed(size / self.vehicles - VEHICLE_LENGTH, self.humans)
 
 
-def _circle_points(angles: NDArray[np.float64], length: float) -> NDArray[np.float64]:
+def _circle_points(angles: Floats, length: float) -> Floats:
     return length / (2 * np.pi) * np.column_stack([np.cos(angles), np.sin(angles)])
 
 

@@ -6,9 +6,9 @@ from math import inf
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unjam.drivers.roadside import RoadsideSettings
+from unjam.physics.arrays import Floats
 from unjam.physics.idm import IDMParameters
 from unjam.sumo_files import SumoFiles
 
@@ -16,7 +16,7 @@ Polyline = tuple[tuple[float, float], ...]
 """points (x, y) [m]"""
 
 
-def as_polyline(points: NDArray[np.float64]) -> Polyline:
+def as_polyline(points: Floats) -> Polyline:
     """Return points of shape (n, 2) as a line."""
     return tuple((x, y) for x, y in points.tolist())
 
@@ -139,13 +139,13 @@ class OrderedRoad(BuiltRoad):
     """all vehicles, in their order along the road"""
     cav_ids: tuple[str, ...]
     """the CAVs among them, in the same order"""
-    start_positions: NDArray[np.float64]
+    start_positions: Floats
     """front bumper of each vehicle along the route at the start [m]"""
     loop_length: float
     """length of a closed road [m]; infinite on a road with ends"""
-    center_line: NDArray[np.float64]
+    center_line: Floats
     """center line of a closed road: rows (coordinate along the route, x, y) [m]; no rows: straight"""
-    replayed_speeds: NDArray[np.float64] | None
+    replayed_speeds: Floats | None
     """speeds of the last of `vehicle_ids`, the first on the road, at the start and after each simulation step if it
     replays a recording [m/s], shape (S + 1,)"""
     crossings: tuple[tuple[float, float], ...] = ()
@@ -177,9 +177,9 @@ class ClosedRoad(OrderedRoad):
 class RecordedRoad(OrderedRoad):
     """A platoon on a straight road behind a vehicle that replays a recording."""
 
-    replayed_speeds: NDArray[np.float64]
+    replayed_speeds: Floats
     loop_length: float = inf
-    center_line: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    center_line: Floats = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 class VehicleType(NamedTuple):

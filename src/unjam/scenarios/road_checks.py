@@ -87,9 +87,7 @@ def _check_loop(road: ClosedRoad, vehicle_length: float) -> None:
     for name in road.cav_ids:
         _check_name("cav_ids", name, ids)
     if positions.shape != (len(ids),) or not np.isfinite(positions).all():
-        _refuse(
-            "start_positions", f"an array of shape {positions.shape}", f"{format_count(len(ids), 'finite position')}"
-        )
+        _refuse("start_positions", f"an array of shape {positions.shape}", format_count(len(ids), "finite position"))
     gaps = gap_on_loop(positions, np.roll(positions, -1), loop, vehicle_length)
     if len(ids) > 1 and (gaps.min() < 0 or gaps.sum() > loop):
         row = int(gaps.argmin())

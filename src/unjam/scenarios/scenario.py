@@ -319,9 +319,8 @@ class Scenario(Subclassable):
     def check_native_humans(self, context: str) -> None:
         """Raise `ValueError` unless SUMO itself can drive the human drivers, as it must on this road, `context`."""
         if self.driver_population and self.driver_population.residual is not None:
-            raise ValueError(
-                f"population: one with a residual network is not allowed {context}: SUMO's own IDM drives them there"
-            )
+            reason = "SUMO's own IDM drives them there"
+            raise ValueError(f"population: one with a residual network is not allowed {context}: {reason}")
         if self.human_control != "native":
             raise ValueError(f"human_control: 'commanded' is not allowed {context}; allowed: 'native'")
 

@@ -106,9 +106,8 @@ class UserNetwork(Scenario):
         used = ", ".join(sorted(files.used_types))
         for name in files.types:
             if (cav_type := CAV_TYPE_TEMPLATE.format(name)) in files.types:
-                raise ValueError(
-                    f"file: the vehicle type {cav_type!r} is not allowed: CAVs of type {name!r} have this name"
-                )
+                reason = f"CAVs of type {name!r} have this name"
+                raise ValueError(f"file: the vehicle type {cav_type!r} is not allowed: {reason}")
         if self.roadside.source != "vehicles":
             raise ValueError(f"roadside.source: {self.roadside.source!r} is not allowed here; allowed: 'vehicles'")
         for name in self.cav_classes:
@@ -264,9 +263,8 @@ class UserNetwork(Scenario):
 def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
     """Return the scenario of a .sumocfg file with `changes`; raise `InputError` about it before SUMO starts."""
     for name in (each for each in OPERATOR_SETTINGS if each in changes):
-        raise InputError(
-            f"{name}: it is not allowed on your own network, only on motorways such as on-ramp; {ALTERNATIVES}"
-        )
+        reason = "it is not allowed on your own network, only on motorways such as on-ramp"
+        raise InputError(f"{name}: {reason}; {ALTERNATIVES}")
     files = read_sumo_files(Path.cwd() / file)  # not its target: SUMO finds other files next to a link
     _log_once(*notes_on_files(files, MAX_LOGGED_NAMES))
     if isinstance(cruise := changes.get("cruise", {}), dict):
@@ -303,9 +301,8 @@ def notes_on_files(files: SumoFiles, max_names: int = MAX_NOTED_NAMES) -> list[s
     dropped, replaced = (_shorten_list(names, max_names) for names in (files.dropped_items, files.replaced_options))
     notes = [f"{files.path.name}: left out because they only write or listen: {dropped}"] if dropped else []
     notes += [f"{files.path.name}: replaced by values of unjam: {replaced}"] if replaced else []
-    if any(map(DEVICE_SHARE.fullmatch, files.options)) and any(
-        map(DROPPED_DEVICE_SHARE.fullmatch, files.dropped_items)
-    ):
+    shares = (DEVICE_SHARE, files.options), (DROPPED_DEVICE_SHARE, files.dropped_items)
+    if all(any(map(pattern.fullmatch, names)) for pattern, names in shares):
         notes.append(f"{files.path.name}: without the devices left out, SUMO equips other vehicles with the rest")
     if files.has_bicycle_lanes:
         notes.append(

@@ -118,20 +118,16 @@ class BrakingLog:
             self._block.clear()
 
 
-def is_recovering(
-    was_recovering: Any, time_behind_leader: Any, previous: FollowingState, current: FollowingState
-) -> Any:
+def is_recovering(was_recovering: Any, seconds: Any, previous: FollowingState, current: FollowingState) -> Any:
     """Return whether a CAV still recovers from a change of its leader: a short time gap that opens.
 
     It opens in each step after the first 5 s, or the leader is faster; recovery that has ended does not begin again.
     `was_recovering` and `previous` are those of the previous step behind this leader; they do not matter in the first
-    one, where `time_behind_leader` [s] is zero. Source: UN Regulation No. 157, 5.2.3.3.
+    one, where `seconds` behind it are zero. Source: UN Regulation No. 157, 5.2.3.3.
     """
     is_short = (current.speed > MIN_TIME_GAP_SPEED) & (current.gap < SHORT_TIME_GAP * current.speed)
     opens = (current.leader_speed > current.speed) | (current.gap * previous.speed > previous.gap * current.speed)
-    return is_short & (
-        (time_behind_leader <= 0.0) | (was_recovering & (opens | (time_behind_leader <= STEADY_FOLLOWING_SECONDS)))
-    )
+    return is_short & ((seconds <= 0.0) | (was_recovering & (opens | (seconds <= STEADY_FOLLOWING_SECONDS))))
 
 
 def following_statistics(

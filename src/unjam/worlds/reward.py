@@ -292,12 +292,10 @@ def episode_reward_terms(
     """
     steps, rows = len(speeds) - 1, max(1, MAX_REWARD_CELLS // max(1, speeds.shape[1]))
     parts = [slice(start, min(start + rows, steps)) for start in range(0, max(steps, 1), rows)]
-    terms = [
-        validate_reward_terms(
-            reward, _step_outcomes(speeds, trajectories, has_crashed and part.stop == steps, backlog, part), part.start
-        )
-        for part in parts
-    ]
+    terms = list[dict[str, Floats]]()
+    for part in parts:
+        outcome = _step_outcomes(speeds, trajectories, has_crashed and part.stop == steps, backlog, part)
+        terms.append(validate_reward_terms(reward, outcome, part.start))
     return {name: np.concatenate([each[name] for each in terms]) for name in terms[0]}
 
 

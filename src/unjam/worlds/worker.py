@@ -24,9 +24,7 @@ from unjam.worlds.sumo.simulation import Simulation
 PROGRESS_INTERVAL = 0.2
 
 
-def _answer_request(
-    open_once: Callable[[str], Backend], output: IO[bytes], request: dict[str, Any], arrays: Arrays
-) -> None:
+def _answer(open_once: Callable[[str], Backend], output: IO[bytes], request: dict[str, Any], arrays: Arrays) -> None:
     """Run an episode and send its record. The record of hours of traffic does not stay in memory here."""
     last = time.monotonic()
 
@@ -68,4 +66,4 @@ if __name__ == "__main__":
     answer_pipe = open_answer_pipe()
     gc.freeze()  # the imported objects stay; searching them for garbage would cost time in every episode
     with ExitStack() as stack:
-        answer_requests(partial(_answer_request, cache(partial(_open, stack)), answer_pipe))
+        answer_requests(partial(_answer, cache(partial(_open, stack)), answer_pipe))

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unjam.drivers.command import Command, Limits, commanded_accelerations
 from unjam.drivers.local_state import LocalState
@@ -124,11 +123,10 @@ class RecordedWorld(_OfflineWorld):
 
     def advance(self, command: Command | None) -> None:
         """Record the commands, and advance to the next recorded step."""
-        self._accelerations.append(
-            commanded_accelerations(command, self.limits, self._row_names, len(self._accelerations))
-        )
+        step = len(self._accelerations)
+        self._accelerations.append(commanded_accelerations(command, self.limits, self._row_names, step))
 
-    def record(self, driver_log: DriverLog) -> NDArray[np.float64]:
+    def record(self, driver_log: DriverLog) -> Floats:
         """Return the commanded accelerations within the limits [m/s2], shape (T, n)."""
         return np.array(self._accelerations)
 

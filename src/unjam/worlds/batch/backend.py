@@ -34,7 +34,7 @@ class BatchBackend:
     def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[RoadWorld]:
         """Yield the road of an episode; raise `InputError` if a batch cannot simulate it."""
         check_support(self, scenario)
-        world = SINGLE_ROADS[required_batch_kind(scenario).world](scenario, seed)
+        world = SINGLE[required_batch_kind(scenario).world](scenario, seed)
         world.measured_fields = options.measured_fields
         yield world
 
@@ -118,8 +118,4 @@ class SingleMotorway(_SingleRoad, MotorwayBatch):
         raise UnjamError("render: the batch draws no pictures of motorways; allowed: backend='sumo'")
 
 
-SINGLE_ROADS: dict[type, Any] = {
-    RingBatch: SingleRing,
-    RecordedBatch: SingleRecordedRoad,
-    MotorwayBatch: SingleMotorway,
-}
+SINGLE: dict[type, Any] = {RingBatch: SingleRing, RecordedBatch: SingleRecordedRoad, MotorwayBatch: SingleMotorway}

@@ -37,13 +37,11 @@ class NoiseState(NamedTuple):
 class SeededNoise:
     """Standard normal numbers for W worlds, equal to those of SUMO's episodes: each world has its own generators."""
 
-    def __init__(
-        self, seeds: WorldSeeds, vehicle_count: int, exploration_shape: tuple[int, int], to_array: ArrayFactory
-    ) -> None:
+    def __init__(self, seeds: WorldSeeds, vehicles: int, shape: tuple[int, int], to_array: ArrayFactory) -> None:
         self._human_generators = [np.random.default_rng(noise) for noise, *_ in seeds]
         self._exploration_seeds = [exploration for _, exploration, *_ in seeds]
-        self._block = np.empty((len(seeds), NOISE_BLOCK_STEPS, vehicle_count))
-        self._exploration_shape, self._to_array = exploration_shape, to_array
+        self._block = np.empty((len(seeds), NOISE_BLOCK_STEPS, vehicles))
+        self._exploration_shape, self._to_array = shape, to_array
         self._remaining_steps: list[Array] = []
         self._exploration: Array = None
 
@@ -59,10 +57,8 @@ class SeededNoise:
     def states(self) -> list[NoiseState]:
         """Return the state of each world's noise as NumPy arrays."""
         steps = np.array(self._remaining_steps).reshape(-1, *self._block.shape[2:], len(self._human_generators))
-        return [
-            NoiseState(generator.bit_generator.state, steps[:, :, world].copy())
-            for world, generator in enumerate(self._human_generators)
-        ]
+        generators = enumerate(self._human_generators)
+        return [NoiseState(each.bit_generator.state, steps[:, :, world].copy()) for world, each in generators]
 
     def restore(self, states: Sequence[NoiseState]) -> None:
         """Continue from these states; all remaining blocks have the same length."""

@@ -10,12 +10,7 @@ from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.scenarios.road import BuiltRoad, UserNetworkRoad
 from unjam.scenarios.scenario import MIN_CAV_GAP, SUMO_ACCELERATION, UNLIMITED_ACCELERATION, VEHICLE_LENGTH, Scenario
 from unjam.scenarios.user_network import PASSENGER_CLASS
-from unjam.sumo_files.reader import (
-    CALIBRATED_TYPE_TEMPLATE,
-    CAV_TYPE_TEMPLATE,
-    is_harmless_attribute,
-    is_harmless_parameter,
-)
+from unjam.sumo_files import reader
 from unjam.worlds.sumo.networks import XMLAttributes, network_file, xml_element
 
 SUMO_CAV_COLOR = "215,38,61"
@@ -65,7 +60,7 @@ def motorway_inputs(scenario: Scenario, road: MotorwayRoad) -> SumoInputs:
         model = {"carFollowModel": kind.model, "tau": kind.time_headway, "minGap": kind.minimum_gap}
         model |= {"accel": kind.acceleration, "decel": kind.deceleration}
         lines.append(xml_element("vType", id=name, **common, **model))
-        cav = {"id": CAV_TYPE_TEMPLATE.format(name), **common, **_cav_attributes(scenario)}
+        cav = {"id": reader.CAV_TYPE_TEMPLATE.format(name), **common, **_cav_attributes(scenario)}
         lines.append(xml_element("vType", **cav))
     # Vehicles that overlap would block each other; after a collision of a CAV the episode ends.
     return _built_road_inputs(road, lines, collision_action="remove")
@@ -128,23 +123,22 @@ def _user_network_types_xml(scenario: Scenario, road: UserNetworkRoad) -> str:
     files, lines, cav_types = road.files, list[str](), road.eligible_types.union(road.cav_types)
     for name, attributes in files.types.items():
         drivers = enumerate(road.drivers if name in road.calibrated_types else ())
-        models = {CALIBRATED_TYPE_TEMPLATE.format(name, number): _idm_attributes(idm) for number, idm in drivers}
+        models = {reader.CALIBRATED_TYPE_TEMPLATE.format(name, number): _idm_attributes(idm) for number, idm in drivers}
         if name in cav_types:
-            models |= {CAV_TYPE_TEMPLATE.format(base): {**model, **cav} for base, model in {name: {}, **models}.items()}
+            bases = {name: {}, **models}.items()
+            models |= {reader.CAV_TYPE_TEMPLATE.format(base): {**model, **cav} for base, model in bases}
         for variant, model in models.items():
-            lines.append(_type_variant_xml(variant, attributes, model, files.type_parameters.get(name, {})))
+            lines.append(_variant_xml(variant, attributes, model, files.type_parameters.get(name, {})))
     return "\n".join(["<additional>", *lines, "</additional>"])
 
 
-def _type_variant_xml(
-    name: str, attributes: XMLAttributes, car_following: XMLAttributes, parameters: dict[str, str]
-) -> str:
-    keys = filter(is_harmless_attribute, attributes.keys() - CAR_FOLLOWING_ATTRIBUTES)
+def _variant_xml(name: str, attributes: XMLAttributes, car_following: XMLAttributes, parameters: dict[str, str]) -> str:
+    keys = filter(reader.is_harmless_attribute, attributes.keys() - CAR_FOLLOWING_ATTRIBUTES)
     others = {key: attributes[key] for key in sorted(keys)}
     if attributes.get("carFollowModel") == "W99":  # which accelerates by its own parameter
         others["accel"] = attributes.get("cc8", W99_ACCELERATION)
     element = xml_element("vType", **{**others, "speedFactor": 1.0, "speedDev": 0.0, **car_following, "id": name})
-    harmless = filter(is_harmless_parameter, parameters)
+    harmless = filter(reader.is_harmless_parameter, parameters)
     nested = "".join(xml_element("param", key=key, value=parameters[key]) for key in harmless)
     return f"{element.removesuffix('/>')}>{nested}</vType>"
 
@@ -154,8 +148,8 @@ def vehicle_class_by_type(road: UserNetworkRoad) -> dict[str, str]:
     derived, own = dict[str, str](), dict[str, str]()
     for name, attributes in road.files.types.items():
         own[name] = attributes.get("vClass", PASSENGER_CLASS)
-        bases = [name, *(CALIBRATED_TYPE_TEMPLATE.format(name, number) for number in range(len(road.drivers)))]
-        derived |= dict.fromkeys([*bases, *map(CAV_TYPE_TEMPLATE.format, bases)], own[name])
+        bases = [name, *(reader.CALIBRATED_TYPE_TEMPLATE.format(name, number) for number in range(len(road.drivers)))]
+        derived |= dict.fromkeys([*bases, *map(reader.CAV_TYPE_TEMPLATE.format, bases)], own[name])
     return derived | own
 
 

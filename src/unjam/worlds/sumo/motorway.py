@@ -96,8 +96,7 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
         leaders, followers, position = self._leader[rows], self._follower[rows], self._position[rows]
         state = neighbor_state(rows, leaders, followers, self._position, self._speed, self._leader_gaps)
         if "lane_speeds" in fields or "road_speeds" in fields:
-            lane_speeds, road_speeds = self._receive_speeds_ahead(rows)
-            state = state._replace(lane_speeds=lane_speeds, road_speeds=road_speeds)
+            state = state._replace(**self._receive_speeds_ahead(rows))
         if "adjacent_gaps" in fields or "adjacent_speeds" in fields:
             motion, lane = (self._position, self._speed, self._length), self._lane[rows]
             sides = (observe_lane(self._neighbors, rows, lane + each, *motion) for each in (1, -1))  # left, right
@@ -111,14 +110,15 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
             penetration_rate=np.full(len(rows), sum(self._entered_is_cav) / max(len(self._entered_is_cav), 1)),
         )
 
-    def _receive_speeds_ahead(self, rows: NDArray[np.intp]) -> tuple[Floats | None, Floats | None]:
-        """Send the current measurement, and return the speeds ahead of the last message, on own lanes and all lanes."""
+    def _receive_speeds_ahead(self, rows: NDArray[np.intp]) -> dict[str, Floats]:
+        """Send the current measurement, and return the speeds ahead of the last message, by field of the state."""
         is_cav = np.array([name in self.road.cav_ids for name in self._names], bool)
         vehicles = MeasuredVehicles(self._lane, self._position, self._speed, is_cav)
         self._messages.send(self._measurement.update(vehicles))
         if self.road.roadside.source == "none":
-            return None, None
-        return self._road_sections.speeds_ahead(self._messages.latest, self._lane[rows], self._position[rows])
+            return {}
+        ahead = self._road_sections.speeds_ahead(self._messages.latest, self._lane[rows], self._position[rows])
+        return dict(zip(("lane_speeds", "road_speeds"), ahead, strict=True))
 
     def _following_states(self, names: Sequence[str]) -> list[FollowingState]:
         return [state for _, state in self._tracked_leaders(names)]

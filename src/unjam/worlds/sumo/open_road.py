@@ -297,12 +297,10 @@ class OpenTraffic(Traffic[OpenRoadT]):
 
     def _make_record(self, driver_log: DriverLog) -> Episode:
         log, vehicles, details = self._log, self._vehicles, self.options.record_details
-        trajectories = log.trips.trajectories(
-            driver_log, self.has_crashed, lambda: self._report_progress(self.control_steps)
-        )
+        trips = log.trips.trajectories(driver_log, self.has_crashed, lambda: self._report_progress(self.control_steps))
         branches = self._branches(log.traffic.vehicle_ids)
         groups = self._column_groups(log.traffic.vehicle_ids)
-        columns, fields = log.episode_fields(trajectories, branches, list(vehicles.teleported), groups)
+        columns, fields = log.episode_fields(trips, branches, list(vehicles.teleported), groups)
         fields |= {
             "fuel": np.repeat(log.fuel, self._fuel_interval)[: self.control_steps] if details else np.zeros((0, 0)),
             "arrivals": vehicles.arrivals,

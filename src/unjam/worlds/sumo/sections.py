@@ -29,9 +29,8 @@ class LaneSections:
         counts = [max(1, ceil(lane.length / ROAD_SECTION_LENGTH)) for lane in self._lanes.values()]
         self._section_ranges = dict(zip(self._lanes, pairwise([0, *accumulate(counts)]), strict=True))
         """number of each lane's first section, and of the next lane's"""
-        sections = [
-            (lane, number) for lane, count in zip(self._lanes.values(), counts, strict=True) for number in range(count)
-        ]
+        lanes = zip(self._lanes.values(), counts, strict=True)
+        sections = [(lane, number) for lane, count in lanes for number in range(count)]
         self.speed_limits: Floats = np.array([lane.speed_limit for lane, _ in sections])
         rows: dict[tuple[str, int], int] = {}
         cross_sections = [rows.setdefault((lane.edge, number), len(rows)) for lane, number in sections]
@@ -103,12 +102,10 @@ class RoadsideService:
         is_congested = self._monitor.update(density, flow)[across] & sections.is_monitored
         self._messages.send(np.stack([means, is_congested.astype(np.float64)]))
 
-    def local_state_fields(
-        self, names: Sequence[str], lane_positions: Sequence[tuple[str, float]]
-    ) -> dict[str, Floats]:
+    def local_state_fields(self, names: Sequence[str], positions: Sequence[tuple[str, float]]) -> dict[str, Floats]:
         """Return the fields of a `LocalState` with the CAVs' roadside information."""
         sections, desired = self._sections, self._desired_speeds
-        for name, place, route in zip(names, lane_positions, self._simulation.remaining_routes(names), strict=True):
+        for name, place, route in zip(names, positions, self._simulation.remaining_routes(names), strict=True):
             if place[0] in sections:
                 self._last_sections[name] = sections.sections_ahead(*place, route)
         ahead = np.array([self._last_sections[name] for name in names], np.intp).reshape(-1, SECTIONS_AHEAD)

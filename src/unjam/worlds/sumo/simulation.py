@@ -13,9 +13,9 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unjam.errors import EpisodeError, SumoInputError, invalid_value
+from unjam.physics.arrays import Floats
 from unjam.processes import PrivateFolder, capture_stderr
 from unjam.scenarios.scenario import Actuation
 from unjam.sumo_files import file_stamp, write_harmless_copy
@@ -94,9 +94,8 @@ class Simulation(AbstractContextManager["Simulation"]):
         self.step: Callable[[], None] = self._library.step
         self._folder = PrivateFolder()
         folder = Path(self._folder.name)
-        self._error_log, self._trip_file, self._traffic_file = (
-            folder / name for name in ("error.log", "trips.xml", "traffic.rou.xml")
-        )
+        files = (folder / name for name in ("error.log", "trips.xml", "traffic.rou.xml"))
+        self._error_log, self._trip_file, self._traffic_file = files
         self._stdout_log = folder / "printed.log" if owns_stdout else None
         """SUMO's messages before it has a log"""
         self._harmless_copies: dict[tuple[Path, int], tuple[list[tuple[int, int]], Path]] = {}
@@ -154,10 +153,8 @@ class Simulation(AbstractContextManager["Simulation"]):
         """
         self.check()
         self._traffic_file.write_text(inputs.traffic_xml, encoding="utf-8")
-        paths = {
-            option: [self._readable_path(path, inputs) for path in files]
-            for option, files in inputs.existing_files.items()
-        }
+        existing = inputs.existing_files.items()
+        paths = {option: [self._readable_path(path, inputs) for path in files] for option, files in existing}
         paths.setdefault(inputs.traffic_option, []).append(str(self._traffic_file))
         options = [f"{option}={','.join(each)}" for option, each in paths.items() if each]
         options += [*inputs.options, "--step-length", str(step), "--seed", str(seed)]
@@ -206,7 +203,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         limit, factor, lanes = self._sumo.lane.getMaxSpeed, self._sumo.vehicle.getSpeedFactor, map(self._get_lane, ids)
         return [limit(lane) * factor(name) if lane else nan for name, lane in zip(ids, lanes, strict=True)]
 
-    def poses(self, ids: Sequence[str]) -> NDArray[np.float64]:
+    def poses(self, ids: Sequence[str]) -> Floats:
         """Return rows (x, y, heading) of front bumpers: [m], and [rad] against the x axis."""
         vehicle = self._sumo.vehicle
         rows = [(*vehicle.getPosition(name)[:2], vehicle.getAngle(name)) for name in ids]

@@ -324,14 +324,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         """Return the edges of a route that other vehicles enter from a side without a signal or yield line."""
         along = set(pairwise(route))
         joining = {pair for edges in self._route_counts for pair in pairwise(edges)} - along
-        targets = set(route[1:])
         lanes = {lane.name: lane for lane in self._simulation.lanes()}
-        return {
-            lanes[successor].edge
-            for lane in lanes.values()
-            for successor in lane.successors
-            if not lane.has_stop_line
-            and successor in lanes
-            and lanes[successor].edge in targets
-            and (lane.edge, lanes[successor].edge) in joining
-        }
+        free = (lane for lane in lanes.values() if not lane.has_stop_line)
+        links = {(lane.edge, lanes[other].edge) for lane in free for other in lane.successors if other in lanes}
+        return {target for _, target in links & joining if target in route[1:]}

@@ -104,11 +104,9 @@ class MotorwayLog:
         for number, (start, end) in enumerate(pairwise(starts)):
             rows = order[start:end]
             rows = rows[every.step_index[rows] <= self.end_steps[number]]
-            placements = _Placements(*(values[rows] for values in every))  # pyright: ignore[reportCallIssue, reportArgumentType]
-            own_steady = steady[1:, steady[0] == number]
-            episodes.append(
-                self._make_episode(number, seeds[number], placements, trips[number], backlogs[number], own_steady)
-            )
+            placed = _Placements(*(values[rows] for values in every))  # pyright: ignore[reportCallIssue, reportArgumentType]
+            pairs = steady[1:, steady[0] == number]
+            episodes.append(self._make_episode(number, seeds[number], placed, trips[number], backlogs[number], pairs))
         return tuple(episodes)
 
     def _trips(self, driver_log: DriverLog) -> list[list[record.Trajectory]]:

@@ -214,9 +214,8 @@ class BatchMotorways:
         max_speed = np.where(vehicles.is_eidm, vehicles.speed_cap, allowed)
         safe = np.minimum(np.minimum(speed + vehicles.max_acceleration * step, max_speed), follow)
         may_be_free = as_rows(safe > speed - LEADER_BRAKING_THRESHOLD * step)
-        free = drivers.select(may_be_free).desired_speed(
-            speed[may_be_free], free_gap[may_be_free], next_allowed[may_be_free], step
-        )
+        own, ahead, limits = (each[may_be_free] for each in (speed, free_gap, next_allowed))
+        free = drivers.select(may_be_free).desired_speed(own, ahead, limits, step)
         # Of the leader and the allowed speed, drivers obey the one that requires more braking without coolness.
         is_free = np.zeros(len(speed), bool)
         is_free[may_be_free] = free.uncooled_acceleration < uncooled[may_be_free] + eidm.EIDM_EPSILON

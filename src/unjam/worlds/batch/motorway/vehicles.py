@@ -116,12 +116,10 @@ class MotorwayDrivers(NamedTuple):
         return self.desired_speed(speed, gap, leader_speed, step).speed
 
     def desired_speed(
-        self, speed: Array, gap: Array, leader_speed: Array, step: float, leader_motion: LeaderMotion | None = None
+        self, speed: Array, gap: Array, leader_speed: Array, step: float, motion: LeaderMotion | None = None
     ) -> DesiredSpeed:
-        """Return the same with its urgency; drivers may stay cool about `leader_motion`."""
-        values, urgency = eidm.eidm_follow_speed(
-            speed, gap, leader_speed, self.parameters, self.errors, step, leader_motion
-        )
+        """Return the same with its urgency; drivers may stay cool about `motion`."""
+        values, urgency = eidm.eidm_follow_speed(speed, gap, leader_speed, self.parameters, self.errors, step, motion)
         desired = self._eidm_or_idm(values, _idm_follow_speed, speed, gap, leader_speed, step=step)
         return DesiredSpeed(desired, np.where(self.is_eidm, urgency, (desired - speed) / step))
 
@@ -156,14 +154,12 @@ class MotorwayDrivers(NamedTuple):
         braking, time_headway = self.parameters.comfortable_deceleration, self.parameters.time_headway
         return stopping_distance(speed, braking, step) + speed * time_headway
 
-    def _eidm_or_idm(
-        self, eidm_values: Array, idm_function: Callable[..., Array], *values: Array, **options: float
-    ) -> Array:
+    def _eidm_or_idm(self, found: Array, idm_function: Callable[..., Array], *values: Array, **options: float) -> Array:
         """Return the values of EIDM drivers, and those of `idm_function` for the others."""
         is_idm = as_rows(~self.is_eidm)
         if not len(is_idm):
-            return eidm_values
-        found = eidm_values + 0.0
+            return found
+        found = found + 0.0
         found[is_idm] = idm_function(*(each[is_idm] for each in values), self.select(is_idm).parameters, **options)
         return found
 

@@ -90,11 +90,8 @@ class MotorwayBatch:
         if self._replay is not None and not self._replay.has_driver_errors:
             return np.zeros(shape)
         counts = np.bincount(self._traffic.vehicles.road, minlength=len(self.roads)).tolist()
-        draws = [
-            generator.standard_normal((shape[0], count))
-            for generator, count in zip(self._human_generators, counts, strict=True)
-        ]
-        return np.concatenate(draws, 1)
+        pairs = zip(self._human_generators, counts, strict=True)
+        return np.concatenate([generator.standard_normal((shape[0], count)) for generator, count in pairs], 1)
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
         """Start with empty roads, without a history."""

@@ -55,10 +55,9 @@ class RecordedBatch(RingBatch):
 
     def replace_roads(self, roads: Any, source: Any, source_roads: Any) -> None:
         """Continue on some roads with those of another batch, see `RingBatch.replace_roads`."""
-        longest = np.arange(max(len(each._replayed_speeds) for each in (self, source)))
-        own, other = (
-            each._replayed_speeds[longest.clip(max=len(each._replayed_speeds) - 1)] for each in (self, source)
-        )
+        both = self._replayed_speeds, source._replayed_speeds
+        longest = np.arange(max(map(len, both)))
+        own, other = (each[longest.clip(max=len(each) - 1)] for each in both)
         self._replayed_speeds = replace_columns(own, roads, other, source_roads)
         super().replace_roads(roads, source, source_roads)
 

@@ -372,10 +372,8 @@ class RingReadings:
 
     def __init__(self, scenario: Scenario, cav_ids: Sequence[str], seeds: WorldSeeds, to_array: ArrayFactory) -> None:
         sensors, braking = scenario.sensors, scenario.safety.leader_braking
-        self._ring_readings = [
-            SensorReadings(sensors, braking, scenario.simulation_step, seed)
-            for *_, seed in (() if sensors.is_exact else seeds)
-        ]
+        step, used = scenario.simulation_step, () if sensors.is_exact else seeds
+        self._ring_readings = [SensorReadings(sensors, braking, step, seed) for *_, seed in used]
         self._cav_ids, self._to_array, self._shape = cav_ids, to_array, (len(cav_ids), len(seeds))
         self._cached_readings: tuple[int, LocalState] | None = None
 

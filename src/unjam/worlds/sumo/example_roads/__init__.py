@@ -10,22 +10,15 @@ from unjam.processes import PrivateFolder
 from unjam.worlds.sumo.networks import run_netconvert
 
 EXAMPLE_ROADS = ("on-ramp",)
-INPUT_FILES = {
-    "--node-files": "nodes.nod.xml",
-    "--edge-files": "edges.edg.xml",
-    "--connection-files": "connections.con.xml",
-}
+INPUTS = {"--node-files": "nodes.nod.xml", "--edge-files": "edges.edg.xml", "--connection-files": "connections.con.xml"}
 
 
 def write_example_road(name: str, folder: Path) -> Path:
     """Write the files of an example network into a folder that exists, and return SUMO's configuration."""
     if name not in EXAMPLE_ROADS:
         raise unknown_name("road", name, EXAMPLE_ROADS)
-    contents = {
-        each.name: each.read_text(encoding="utf-8")
-        for each in (files("unjam.worlds.sumo.example_roads") / name).iterdir()
-    }
-    inputs = {(option, file): contents[file] for option, file in INPUT_FILES.items()}
+    contents = {each.name: each.read_text(encoding="utf-8") for each in files(__name__).joinpath(name).iterdir()}
+    inputs = {(option, file): contents[file] for option, file in INPUTS.items()}
     with PrivateFolder() as private:
         network = run_netconvert(inputs, [], Path(private)).read_text(encoding="utf-8")
     contents[f"{name}.net.xml"] = re.sub(r"<!--.*?-->\n*", "", network, count=1, flags=re.DOTALL)  # it names files
