@@ -11,7 +11,6 @@ import torch
 from ppo_single_file import INPUTS, learn, policy
 
 import unjam
-from unjam.adapters import PolicyInput
 
 UPDATES, HORIZON = (int(text) for text in (*sys.argv[1:], "50", "600")[:2])
 SLOTS = 8
@@ -22,8 +21,7 @@ def column(values: dict[str, Any]) -> torch.Tensor:
     return torch.as_tensor(np.array([*values.values()]))
 
 
-features = [PolicyInput(**each) for each in INPUTS]
-merge = unjam.parallel_env("merge", slots=SLOTS, horizon=HORIZON, features=features)
+merge = unjam.parallel_env("merge", slots=SLOTS, horizon=HORIZON, features=INPUTS)
 for update in range(UPDATES):
     observations, infos = merge.reset(seed=update)
     steps, total = [], 0.0

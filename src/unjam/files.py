@@ -139,8 +139,8 @@ def remove_leftovers(folder: Path, min_age: float = -math.inf) -> None:
 
 def remove_if_empty(folder: Path) -> None:
     """Remove a folder if it is empty."""
-    with suppress(OSError):
-        folder.rmdir()
+    with suppress(OSError, InputError), open_folder(folder.parent) as parent:
+        os.rmdir(parent.entry_path(folder.name), dir_fd=parent.handle)
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:

@@ -96,7 +96,9 @@ def test_command_without_its_package_names_the_extra_in_one_line(
     before = set(tmp_path.rglob("*"))
     ran = run_without([package], ["-m", "unjam", *command.split()])
     assert ran.returncode == 3, ran.stderr
-    assert ran.stderr == f"unjam: {package} is not installed; install it: pip install 'unjam[{EXTRAS[package]}]'\n"
+    *plan, error = ran.stderr.splitlines()
+    assert error == f"unjam: {package} is not installed; install it: pip install 'unjam[{EXTRAS[package]}]'"
+    assert all(line.startswith("training ") for line in plan)
     assert {path for path in tmp_path.rglob("*") if path.is_file() and "site" not in path.parts} <= before
 
 

@@ -179,7 +179,7 @@ def _plan_text(config: "RunConfig") -> str:
     roads = f"{len(tasks)} roads" if len(tasks) > 1 else Path(config.scenario).name
     policy = f"{config.agent} without an expert" if config.expert == "none" else f"{config.agent} on {config.expert}"
     ratio = config.model.model_ratio
-    model = f"{ratio:g} steps of the learned model for each" if ratio else "without a learned model"
+    model = f"{ratio:g} steps of the learned model for each of them" if ratio else "without a learned model"
     return f"{policy}: {roads}, {config.steps:,} environment steps, {model}"
 
 
@@ -225,7 +225,7 @@ def search_command(
     folder = opt.new_folder(out, f"search-{Path(base.scenario).stem}")
     on_message = (lambda line: None) if json else err_console.print
     if not json:
-        plan = f"{format_count(trials, 'training')}, {workers} at once: {_plan_text(base)} each, into {folder}"
+        plan = f"{format_count(trials, 'training')}, {workers} at once, into {folder}; each: {_plan_text(base)}"
         err_console.print(f"searching {', '.join(space)} in {plan}", soft_wrap=True)
     resume = output.suggest_resume(folder / REQUEST_FILE, *output.arguments_without("--out"), "--out", folder)
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), resume:
