@@ -52,6 +52,7 @@ def test_slots_are_the_same_all_the_time_and_empty_ones_are_zero() -> None:
     *_, terminations, truncations, _ = steps[-1]
     assert (set(terminations.values()), set(truncations.values())) == ({False}, {True})
     assert environment.agents == []
+    assert {steps[-1][-1][slot]["episode_metrics"]["steps"] for slot in terminations} == {30}
 
 
 def test_a_slot_is_used_again_and_cavs_without_a_slot_never_get_one() -> None:

@@ -81,11 +81,14 @@ def test_an_interval_without_vehicles_has_no_speed_whatever_the_detector_writes(
         ([f"{HEAD},edge", "a,1,0,60,1000,30,b"], "columns named edge: 2"),
         ([HEAD, "a,1,0,60,5,nan"], "speed: 'nan'"),
         ([HEAD, "a,inf,0,60,5,20"], "position: 'inf'"),
+        ([HEAD, "a,1,0,60,1e308,20"], "flow_veh_per_h: '1e308' is not allowed; allowed: a number >= 0, <= 1e+09"),
+        ([HEAD, "a,1,0,60,1_00,20"], "flow_veh_per_h: '1_00'"),
+        ([HEAD, "a,1,30,90,5,20", "a,2,0,60,5,20", "a,1,0,60,5,20"], "line 2: overlaps the interval of line 4"),
         ([HEAD, "a,1,60,60,5,20"], "end: 60.0 is not allowed; allowed: after begin, 60 s"),
         ([HEAD, ",1,0,60,5,20"], "edge: ''"),
         (
             [HEAD, "a,1,0,60,5,20", "a,1,60,90,5,", "a,1.0,0,60,9,21"],
-            "line 4: has the place and time of line 2; allowed",
+            "line 4: overlaps the interval of line 2; allowed",
         ),
     ],
 )

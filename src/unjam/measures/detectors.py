@@ -4,7 +4,8 @@ import csv
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import isfinite, isnan, nan
+from itertools import pairwise
+from math import isnan, nan
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ from unjam.worlds.sumo.simulation import DetectorPassage
 
 DETECTOR_COLUMNS = ("position", "begin", "end", "flow_veh_per_h", "speed")
 """columns of a file of measurements, in addition to `edge` or `lane`"""
+MAX_NUMBER = 1e9
+TIME_TOLERANCE = 1e-6
+"""time by which intervals may overlap, as their ends are rounded [s]"""
 GEH_LIMIT = 5.0  # GEH below which a simulated flow agrees with the measured flow
 SAME_PASSAGE_SECONDS = 10.0  # time within which a second passage of loops of the same edge is only a lane change [s]
 
@@ -47,8 +51,9 @@ def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
     """Return whether a CSV file names places by `edge` or by `lane`, and its measurements.
 
     It needs that column and `DETECTOR_COLUMNS`; an empty speed is unknown, as is one of an interval without vehicles,
-    and other columns are ignored. Raise `InputError` if a value is wrong, a row is there twice or has other cells than
-    the header, with its line, and if the file, a column or all rows are missing or a column is there twice.
+    and other columns are ignored. Raise `InputError` if a value is wrong, intervals of a detector overlap or a row has
+    other cells than the header, with its line, and if the file, a column or all rows are missing, or a column is there
+    twice.
     """
     if not path.is_file():  # reading a device would never end
         raise InputError(f"detectors: {str(path)!r} is not a file; allowed: a CSV file")
@@ -69,11 +74,11 @@ def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
         raise InputError(f"detectors: {str(path)!r} cannot be read: {reason}") from None
     if not lines:
         raise InputError(f"{path.name}: has no rows; allowed: one measurement at least")
-    first_lines: dict[tuple[str, float, float, float], int] = {}
-    for line, row in lines:
-        first = first_lines.setdefault((row.place, row.position, row.begin, row.end), line)
-        if first != line:
-            raise InputError(f"{path.name}: line {line}: has the place and time of line {first}; allowed: each once")
+    in_order = sorted(lines, key=lambda each: (each[1].place, each[1].position, each[1].begin, each[0]))
+    for (first, before), (line, row) in pairwise(in_order):
+        if (row.place, row.position) == (before.place, before.position) and row.begin < before.end - TIME_TOLERANCE:
+            allowed = "intervals of a detector that do not overlap"
+            raise InputError(f"{path.name}: line {line}: overlaps the interval of line {first}; allowed: {allowed}")
     return kinds[0], [row for _, row in lines]
 
 
@@ -93,8 +98,8 @@ def _parse_measurement(file: str, line: int, kind: str, row: dict[str, str | Non
             value = nan if name == "speed" and not text else float(text)
         except ValueError:
             value = nan
-        if (text or name != "speed") and not (isfinite(value) and value >= 0):
-            raise invalid_value(f"{context}: {name}", text, "a number >= 0")
+        if (text or name != "speed") and not (0 <= value <= MAX_NUMBER and "_" not in text):
+            raise invalid_value(f"{context}: {name}", text, f"a number >= 0, <= {MAX_NUMBER:g}")
         values.append(value)
     measurement = Measurement(place, *values)
     if measurement.flow == 0:  # detectors write 0, or the limit, where no vehicle has passed
