@@ -90,7 +90,7 @@ def test_each_road_type_is_driven_with_its_own_limits_and_control_step(tmp_path:
 def test_all_drivers_of_a_ring_have_the_same_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
     runs: list[tuple[set[str], list[tuple[int, ...]]]] = []
 
-    def drive(scenario: object, drivers: dict[str, str], seeds: list[tuple[int, ...]], run: object) -> Any:
+    def drive(scenario: object, drivers: dict[str, str], seeds: list[tuple[int, ...]], *rest: object) -> Any:
         runs.append((set(drivers.values()), seeds))
         return {label: [] for label in drivers}
 

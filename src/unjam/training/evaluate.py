@@ -223,12 +223,8 @@ def evaluate_on_roads(
     tasks = {(label, index): EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs}
     remote = [pair for pair in pairs if tasks[pair].is_serializable]
     local = [pair for pair in pairs if not tasks[pair].is_serializable]
-
     watch = FileWatch({file for scenario, _ in drivers.values() for file in scenario.user_files})
-
-    def on_progress(pair: tuple[str, int], steps: int) -> None:
-        if progress is not None:
-            progress(pair, steps)
+    on_progress = progress or (lambda pair, steps: None)
 
     def measure_task(pair: tuple[str, int], episode: Episode) -> tuple[dict[str, Any], Episode | None]:
         watch.check()
