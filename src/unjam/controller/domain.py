@@ -43,7 +43,8 @@ def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[
         states = [each.states for each in episodes[name].trajectories] if name in episodes else []
         share = max((outside_domain_share(controller, each) for each in states), default=0.0)
         if share > OUTSIDE_DOMAIN_THRESHOLD:
-            notes.append(f"{name} was outside of its certified domain in {100 * share:.0f} % of control steps")
+            steps = f"{100 * share:.0f} % of the control steps of its first episode"
+            notes.append(f"{name} was outside of its certified domain in {steps}")
     return notes
 
 
