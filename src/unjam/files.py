@@ -14,7 +14,7 @@ import time
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -226,23 +226,28 @@ def sha256_of_file(path: Path) -> str:
 
 
 class FileWatch:
-    """Notices when the content of files changes, so that no result mixes two versions of them."""
+    """Notices when the content of files changes, or which they are, so that no result mixes two versions of them."""
 
-    def __init__(self, paths: Iterable[Path]) -> None:
-        self._files = {path: (_stamp(path), sha256_of_file(path)) for path in paths}
+    def __init__(self, list_files: Callable[[], Iterable[Path]]) -> None:
+        self._list_files = list_files
+        self._files = {path: (_stamp(path), sha256_of_file(path)) for path in list_files()}
 
     def check(self) -> None:
         """Raise `InputError` if a file has changed since the watch began."""
-        for path, (stamp, sha256) in self._files.items():
-            with suppress(OSError):
-                if _stamp(path) == stamp or sha256_of_file(path) == sha256:
-                    continue
-            raise InputError(f"{path.name}: has changed since the start; allowed: files that stay as they are")
+        changed = [path for path, known in self._files.items() if not _is_unchanged(path, *known)]
+        if changed := changed or sorted(self._files.keys() ^ set(self._list_files())):
+            raise InputError(f"{changed[0].name}: has changed since the start; allowed: files that stay as they are")
 
 
-def _stamp(path: Path) -> tuple[int, int]:
+def _is_unchanged(path: Path, stamp: tuple[int, ...], sha256: str) -> bool:
+    with suppress(OSError):
+        return _stamp(path) == stamp or sha256_of_file(path) == sha256
+    return False
+
+
+def _stamp(path: Path) -> tuple[int, ...]:
     status = path.stat()
-    return status.st_mtime_ns, status.st_size
+    return status.st_mtime_ns, status.st_ctime_ns, status.st_size
 
 
 def to_json(value: Any, indent: int | None = None) -> str:

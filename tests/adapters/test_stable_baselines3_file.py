@@ -158,6 +158,10 @@ def test_serialized_parts_of_the_data_are_not_read(tmp_path: Path) -> None:
         (lambda: PPO("MlpPolicy", Space(action=2), device="cpu"), "its actions are not one number"),
         (lambda: SAC("MlpPolicy", Space(), use_sde=True, device="cpu"), "its weights are not those"),
         (
+            lambda: PPO("MlpPolicy", Space(), policy_kwargs={"squash_output": 1}, use_sde=True, device="cpu"),
+            "squash_output is neither true nor false",
+        ),
+        (
             lambda: PPO("MlpPolicy", Space(), policy_kwargs={"activation_fn": torch.nn.ELU}, device="cpu"),
             "activation ELU; known: Tanh, ReLU",
         ),

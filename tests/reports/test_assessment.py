@@ -19,6 +19,7 @@ from unjam.reports.assessment import (
     ASSESSMENT_FILE,
     effect_figure,
     feasibility_text,
+    keep_earlier_answer,
     render_assessment,
     write_assessment,
 )
@@ -214,3 +215,19 @@ def test_names_of_drivers_have_no_hidden_characters(tmp_path: Path) -> None:
     page = render_assessment(tmp_path)
     assert "p?i" in page
     assert "\u202e" not in page
+
+
+@pytest.mark.parametrize(
+    ("rates", "drivers", "is_kept"),
+    [([0.1], {"pi": {"window": 30.0}}, False), ([0.2], {"pi": {"window": 30.0}}, True), ([0.1], {"pi": {}}, True)],
+)
+def test_the_answer_to_another_question_is_kept(
+    rates: list[float], drivers: dict[str, Any], is_kept: bool, tmp_path: Path
+) -> None:
+    (tmp_path / "assessment.json").write_text('{"penetration_rates": [0.1], "drivers": {"pi": {"window": 30.0}}}')
+    (tmp_path / "assessment.html").write_text("page")
+    (tmp_path / "assessment-1.html").write_text("of an interrupted call")
+    kept = keep_earlier_answer(tmp_path, rates, drivers)
+    assert kept == (tmp_path / "assessment-2.html" if is_kept else None)
+    names = {path.name for path in tmp_path.iterdir()} - {"assessment-1.html"}
+    assert names == {f"assessment{'-2' if is_kept else ''}.{suffix}" for suffix in ("json", "html")}

@@ -96,6 +96,8 @@ INVALID: dict[str, tuple[str, list[str]]] = {
     "controller that is missing": ("does not exist", ["drive ring --driver none.unjam"]),
     "file that is not a controller": ("not a controller", ["drive ring --driver torn.unjam"]),
     "folder that is not empty": ("full' is not empty", ["drive ring --driver pi --out full"]),
+    "option without its value": ("Option '-d' requires an argument", ["drive ring -d"]),
+    "flag with a value": ("--json", ["drive ring --json=5"]),
     "parameter as an option": ("parameters of scenarios: --set actuator.delay=", ["drive ring --delay 0.4"]),
     "parameter as an option of a training": ("--set scenario_options.actuator.delay=", ["train ring --delay 0.4"]),
     "missing configuration": ("none.toml: No such file", ["train ring --config none.toml"]),

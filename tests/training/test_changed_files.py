@@ -72,3 +72,16 @@ def test_command_goes_on_if_the_content_is_the_same(tmp_path: Path) -> None:
     file = straight(tmp_path, FLOW, length=200.0, end=30.0)
     run_drive(str(file), tmp_path / "out", file.touch)
     assert (tmp_path / "out" / "evaluation.json").is_file()
+
+
+def test_command_ends_if_a_recording_is_added(tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+
+    def add(name: str) -> None:
+        (folder / name).write_text("time,speed\n" + "".join(f"{0.1 * step:.1f},10\n" for step in range(100)))
+
+    add("a.csv")
+    options = {"recordings": str(folder)}
+    with pytest.raises(InputError, match=r"^b\.csv: has changed since the start"):
+        drive("recorded", "pi", 2, scenario_options=options, workers=1, progress=lambda *_: add("b.csv"))

@@ -181,6 +181,24 @@ def test_a_search_shows_how_far_trainings_are(
     assert sum(message.startswith("2 of 2: trial ") for message in messages) == 1
 
 
+def test_search_ends_if_a_file_changes_while_it_runs(
+    tmp_path: Path, trainings: Trainings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("unjam.trust.is_all_code_trusted", lambda: True)
+    file = tmp_path / "mine.py"
+    file.write_text("def calm(outcome): return 0.0\n")
+    base, messages = trial_config(BASE, {"reward": f"{file}:calm"}), list[str]()
+
+    def change(message: str) -> None:
+        messages.append(message)
+        file.write_text("def calm(outcome): return 1.0\n")
+
+    with pytest.raises(InputError, match=r"mine\.py: has changed since the start; allowed"):
+        search(base, SPACE, 3, tmp_path / "out", 1, on_message=change)
+    assert len(messages) == 1
+    assert (tmp_path / "out" / TRIALS_FILE).read_text().count('"objective"') == 1
+
+
 @pytest.mark.parametrize(("code", "exit_code"), [(74, 74), (3, 1), (143, 1), (-9, 1)])
 def test_trials_that_were_stopped_resume(code: int, exit_code: int, tmp_path: Path, trainings: Trainings) -> None:
     trainings.failing_code = code

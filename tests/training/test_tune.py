@@ -260,6 +260,22 @@ def test_own_file_is_tuned_and_not_continued_after_a_change(part: str, tmp_path:
             tune({"ring": SMALL}, expert, space, STEPS, folder, workers, reward)
 
 
+def test_ranges_of_an_own_class_are_around_its_defaults(tmp_path: Path) -> None:
+    arguments = "gain=1, lanes: int = 2, time_gap=-2, limit=float('inf'), name='x'"
+    (tmp_path / "mine.py").write_text(OWN_CODE.replace("gain=0.2, time_gap=2.0", arguments))
+    assert default_search_space(f"{tmp_path / 'mine.py'}:Calm", 0.1) == {
+        "gain": FloatDistribution(0.25, 4.0, log=True),
+        "lanes": IntDistribution(1, 8, log=True),
+        "time_gap": FloatDistribution(-8.0, -0.5),
+    }
+
+
+def test_a_class_that_cannot_be_made_is_refused_before_the_trials(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(OWN_CODE.replace("gain=0.2, time_gap=2.0", "gain, time_gap=2.0"))
+    with pytest.raises(InputError, match=r"mine\.py:Calm: TypeError when made: "):
+        default_search_space(f"{tmp_path / 'mine.py'}:Calm", 0.1)
+
+
 def test_function_of_a_file_has_nothing_to_tune(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(OWN_CODE)
     with pytest.raises(InputError, match=r"expert: '.*mine\.py:calm' has nothing to tune"):

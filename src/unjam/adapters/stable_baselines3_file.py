@@ -183,12 +183,13 @@ def _read_options(data: dict[str, Any], actor: _Actor) -> tuple[Callable[[Floats
     name = re.sub(r".*\.|'>", "", options.pop("activation_fn", actor.activation))
     if not data["policy_class"]["__module__"].startswith(POLICY_PACKAGES):
         raise ValueError("its policy class is not one of Stable-Baselines3")
-    is_squashed = actor.is_squashed or options.pop("squash_output", False) is True
+    if not isinstance(is_squashed := options.pop("squash_output", False), bool):
+        raise ValueError("squash_output is neither true nor false")
     if unknown := options.keys() - HARMLESS_POLICY_OPTIONS:
         raise ValueError(f"policy_kwargs {min(unknown)}")
     if name not in ACTIVATIONS:
         raise ValueError(f"activation {name}; known: {', '.join(ACTIVATIONS)}")
-    return ACTIVATIONS[name], is_squashed
+    return ACTIVATIONS[name], is_squashed or actor.is_squashed
 
 
 def _read_layers(weights: dict[str, Floats], actor: _Actor) -> list[tuple[Floats, Floats]]:

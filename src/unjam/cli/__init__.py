@@ -169,10 +169,11 @@ def _run_app() -> int:
             values = [value for word, value in pairwise(sys.argv) if word in options and value]
             given = f"; given: {values[0]!r}" if values else ""
             command = getattr(getattr(error, "ctx", None), "command", None)
-            if hasattr(error, "option_name") and any("--set" in each.opts for each in command.params):  # pyright: ignore
+            options = [option for each in getattr(command, "params", ()) for option in each.opts]
+            if "--set" in options and getattr(error, "option_name", "--set") not in options:
                 from unjam.cli.catalog import suggest_setting  # imported late: it imports all scenarios
 
-                given += suggest_setting(error.option_name, command.name)  # pyright: ignore
+                given += suggest_setting(error.option_name, command.name)  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
             return _print_error(f"{error.format_message()}{given}", 2)  # pyright: ignore[reportAttributeAccessIssue]
         raise
 

@@ -116,7 +116,7 @@ class CalibratedIDM:
 
 def calibrate_idm(
     trajectories: Sequence[FollowingTrajectory],
-    settings: CalibrationSettings,
+    settings: CalibrationSettings | None = None,
     headway_factors: Sequence[float] | None = None,
 ) -> CalibratedIDM:
     """Return the IDM parameters with the smallest error of the simulated gaps of all `trajectories`.
@@ -126,6 +126,7 @@ def calibrate_idm(
     """
     from scipy.optimize import differential_evolution  # takes half a second, which --help need not wait for
 
+    settings = settings or CalibrationSettings()
     segments = make_segments(trajectories, settings.segment_seconds)
     factors = 1.0 if headway_factors is None else np.array(headway_factors)[segments.trajectory_index]
     result = differential_evolution(

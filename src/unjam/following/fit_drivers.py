@@ -146,7 +146,7 @@ def _name_prefixes(files: Sequence[Path]) -> list[str]:
 
 def fit_drivers(
     trajectories: Sequence[FollowingTrajectory],
-    settings: FitDriversSettings,
+    settings: FitDriversSettings | None = None,
     on_progress: DriverProgress = lambda *done: None,
 ) -> Population:
     """Calibrate a population with a driver for each driver of `trajectories`.
@@ -154,6 +154,7 @@ def fit_drivers(
     A residual is used only if it reduces the error of simulated gaps for validation drivers. Raise `InputError` if
     there are too few drivers for it, the time steps differ, or a simulated gap is not finite.
     """
+    settings = settings or FitDriversSettings()
     for name in settings.individual:
         if name not in CALIBRATED_PARAMETERS:
             raise unknown_name("individual", name, CALIBRATED_PARAMETERS)

@@ -1,7 +1,7 @@
 """The page of an assessment: effects of ACC vehicles and controllers on a road, and the recommendation."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import count
@@ -14,7 +14,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from unjam.errors import InputError
-from unjam.files import INVALID_DATA_ERRORS, atomic_write, check_parent_folder, parse_json
+from unjam.files import INVALID_DATA_ERRORS, atomic_write, check_parent_folder, parse_json, to_json
 from unjam.folders import open_folder
 from unjam.measures.effect import FLOW_METRIC, MAX_FLOW_LOSS, TIME_METRIC
 from unjam.measures.feasibility import FEASIBLE
@@ -42,20 +42,27 @@ ACC_DIFFERENCES = "difference_to_acc", "flow_difference_to_acc"
 MISSING = Estimate(nan, nan, nan, 0)
 
 
-def keep_earlier_answer(folder: Path, rates: Sequence[float], drivers: Iterable[str]) -> Path | None:
-    """Rename document and page of another question in a folder; return the page's new path, None without any."""
+def keep_earlier_answer(folder: Path, rates: Sequence[float], drivers: dict[str, Any]) -> Path | None:
+    """Rename page and document of another question in a folder; return the new path of one, None without any.
+
+    The question is the penetration rates and `drivers`, recipes by name.
+    """
     if not (folder / ASSESSMENT_FILE).is_file():
         return None
     with suppress(InputError, *INVALID_DATA_ERRORS):
         earlier = parse_json((folder / ASSESSMENT_FILE).read_bytes())
-        if (earlier["penetration_rates"], sorted(earlier["drivers"])) == ([*rates], sorted(drivers)):
+        if (earlier["penetration_rates"], earlier["drivers"]) == ([*rates], json.loads(to_json(drivers))):
             return None
     with open_folder(folder) as opened:
         stems = (f"{Path(ASSESSMENT_FILE).stem}-{number}" for number in count(1))
         stem = next(each for each in stems if not opened.mode(f"{each}.json") and not opened.mode(f"{each}.html"))
-        for name in filter(opened.mode, (ASSESSMENT_FILE, ASSESSMENT_PAGE)):
-            opened.rename(name, f"{stem}{Path(name).suffix}")
-    return folder / f"{stem}.html"
+        # The document is last: as long as it is there, the next call knows that there is an answer.
+        renamed = {
+            name: f"{stem}{Path(name).suffix}" for name in filter(opened.mode, (ASSESSMENT_PAGE, ASSESSMENT_FILE))
+        }
+        for name, new_name in renamed.items():
+            opened.rename(name, new_name)
+    return folder / next(iter(renamed.values()))
 
 
 def write_assessment(folder: Path, target: Path) -> Path:

@@ -206,7 +206,7 @@ def assess(
     if log.episodes:
         known = f"{format_count(len(log.episodes), 'episode')} of earlier calls in {folder}"
         on_message(f"{known}: not simulated again for the same controllers; data that their code reads is not compared")
-    watch = FileWatch(request.network.user_files)
+    watch = FileWatch(lambda: request.network.user_files)
     budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
 
     def evaluate_options(
@@ -285,7 +285,7 @@ def assess(
     }
     save_evaluation(folder / SELECTION_FOLDER, Evaluation(selection_rows, {}), metadata)
     save_evaluation(folder, Evaluation(test_rows, plot_episodes), metadata)
-    if kept_page := keep_earlier_answer(folder, rates, request.drivers):
+    if kept_page := keep_earlier_answer(folder, rates, document["drivers"]):
         on_message(f"the answer to the earlier question is now in {kept_page}")
     atomic_write(folder / ASSESSMENT_FILE, to_json(document, indent=1))
     page = write_assessment(folder, folder / ASSESSMENT_PAGE)

@@ -246,7 +246,7 @@ def calibrate(
     does not depend on the number of processes. Raise `UnjamError` if SUMO cannot simulate the original network, or if
     its process was lost repeatedly.
     """
-    original, watch = dict.fromkeys(space, 1.0), FileWatch((corridor.detectors, *corridor.files.sources))
+    original, watch = dict.fromkeys(space, 1.0), FileWatch(lambda: (corridor.detectors, *corridor.files.sources))
     log = TrialLog(folder, corridor.metadata() | {"space": repr(space), "seeds": seeds_per_trial, "seed": seed})
     measurements = corridor.measurements
 

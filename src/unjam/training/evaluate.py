@@ -223,7 +223,7 @@ def evaluate_on_roads(
     tasks = {(label, index): EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs}
     remote = [pair for pair in pairs if tasks[pair].is_serializable]
     local = [pair for pair in pairs if not tasks[pair].is_serializable]
-    watch = FileWatch({file for scenario, _ in drivers.values() for file in scenario.user_files})
+    watch = FileWatch(lambda: {file for scenario, _ in drivers.values() for file in scenario.user_files})
     on_progress = progress or (lambda pair, steps: None)
 
     def measure_task(pair: tuple[str, int], episode: Episode) -> tuple[dict[str, Any], Episode | None]:

@@ -82,7 +82,8 @@ def search(
     more `trials` in total. `base` and `space` must pass `check_search_space`. Raise `InputError` if the folder has
     another search, `UnjamError` if all trainings failed or one was stopped: then the same search resumes.
     """
-    log = TrialLog(folder, {"config": asdict(base), "space": repr(space), "files": _file_hashes(base, space)})
+    files = _file_hashes(base, space)
+    log = TrialLog(folder, {"config": asdict(base), "space": repr(space), "files": files})
     atomic_write(folder / CONFIG_FILE, to_toml(base))  # below it, files may only name trusted code
     study = _restore_study(log, space)
     proposed = _propose_trials(study, log, space, trials, base.seed)
@@ -97,7 +98,9 @@ def search(
             if not ended_jobs:
                 on_message(_running_line(folder, jobs.values(), base.steps))
             for done in ended_jobs:
-                number = jobs.pop(done)
+                number, now = jobs.pop(done), _file_hashes(base, space)
+                if changed := [name for name in {**files, **now} if files.get(name) != now.get(name)]:
+                    raise InputError(f"{changed[0]}: has changed since the start; allowed: files that stay as they are")
                 if (code := done.result()) not in (0, *TRIAL_FAILURE_CODES):  # a full disk would end all others, too
                     reason = f"trial {number} was stopped with exit code {code}; its log: {_log_file(folder, number)}"
                     raise (DiskError if code == DiskError.exit_code else UnjamError)(reason)

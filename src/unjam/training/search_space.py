@@ -82,7 +82,11 @@ def tunable_parameters(expert: str, time_step: float) -> dict[str, tuple[Any, An
     if is_file_reference(expert):
         kind = FileReference.parse(expert).load_object()
         parameters = signature(kind).parameters.values() if isclass(kind) else ()
+        driver_from_name(expert, time_step)  # an error of the class is reported here, and not in each trial
         found = {each.name: (each.default, each.annotation) for each in parameters if each.default is not each.empty}
+        for name, (value, hint) in found.items():
+            if type(value) is int and hint not in (int, "int"):  # a number as most people write it
+                found[name] = float(value), hint
     else:
         names = [name for name, kind in DRIVERS.items() if not kind.is_native]
         if expert not in names:
@@ -106,11 +110,13 @@ def _default_range(value: Any, hint: Any) -> Distribution | None:
         return CategoricalDistribution((False, True))
     if get_origin(hint) is Literal:
         return CategoricalDistribution(get_args(hint))
+    if isinstance(value, int) and value < 0:
+        return IntDistribution(round(value * RANGE_FACTOR), min(-1, round(value / RANGE_FACTOR)))
     if isinstance(value, int):
         if value == 0:
             return IntDistribution(0, round(RANGE_FACTOR))
         return IntDistribution(max(1, round(value / RANGE_FACTOR)), round(value * RANGE_FACTOR), log=True)
-    if not isinstance(value, float):
+    if not isinstance(value, float) or not math.isfinite(value * RANGE_FACTOR):
         return None
     if value == 0:
         return FloatDistribution(0.0, ZERO_DEFAULT_HIGH)

@@ -196,7 +196,7 @@ class Trainer:
     ) -> None:
         self.folder, self.config, self.workers = folder, config, workers
         self.tasks = config.make_tasks()
-        self._watch = FileWatch({file for task in self.tasks for file in task.scenario.user_files})
+        self._watch = FileWatch(lambda: {file for task in self.tasks for file in task.scenario.user_files})
         self.folders = [folder / task.name for task in self.tasks]
         string_gain = self._string_gain_function() if config.policy.max_string_gain else None
         self.spec = AgentSpec(self.tasks, config.policy, config.model, config.learner.gamma, config.seed, string_gain)

@@ -196,7 +196,7 @@ def tune(
     request |= {"files": files} if files else {}
     request |= {"max_string_gain": max_string_gain} if max_string_gain else {}
     log = TrialLog(folder, request | {"seed": seed, "screen": bool(screened), "backend": backend})
-    watch = FileWatch({file for road in roads.values() for file in road.user_files})
+    watch = FileWatch(lambda: {file for road in roads.values() for file in road.user_files})
     points = find_operating_points(roads, workers) if max_string_gain else {}
     sumo_runners = dict.fromkeys(roads, partial(_run_in_sumo, workers))
     trial_runners = sumo_runners | dict.fromkeys(screened, _run_in_batch)
