@@ -83,6 +83,16 @@ def test_actions_are_held_for_the_time_step_of_the_policy(tmp_path: Path) -> Non
         make_driver(f"{file}:step=0.2", 0.1)
 
 
+def test_a_model_of_unjam_holds_its_actions_as_in_training(tmp_path: Path) -> None:
+    model = PPO("MlpPolicy", Space(), seed=1, device="cpu")
+    model.unjam = {"expert": "pi", "action_repeat": 4}  # pyright: ignore[reportAttributeAccessIssue]
+    for policy in (model, save(model, tmp_path)):
+        drivers = (
+            policy_driver(policy, ("local",), PISaturation(), policy_time_step=step) for step in (None, 0.4, 0.1)
+        )
+        assert [driver.description.time_step for driver in drivers] == [0.4, 0.4, 0.1]
+
+
 class Runs:
     """An object that creates a file when it is unpickled."""
 

@@ -41,7 +41,8 @@ def policy_driver(
         expert: a driver to which the accelerations are added; None: the policy drives alone.
         output: what its numbers mean; without limits, those of a model's action space.
         time_step: control step of the road [s].
-        policy_time_step: control step of the policy [s], a multiple of that of the road; None: that of the road.
+        policy_time_step: control step of the policy [s], a multiple of that of the road; None: that of the road,
+            or for models of `unjam export --sb3` the one with which they were trained on such a road.
 
     Raises:
         InputError: the policy does not take these inputs, returns another shape, has other actions, or is recurrent;
@@ -54,7 +55,10 @@ def policy_driver(
         label, policy = Path(policy).name, read_policy(Path(policy))
     if hasattr(policy, "predict"):
         _check_model(label, policy)
-        added_to = one_line(getattr(policy, "unjam", {}).get("expert", Constant.name))
+        exported = getattr(policy, "unjam", {})  # by `unjam export --sb3`
+        added_to, repeat = one_line(exported.get("expert", Constant.name)), exported.get("action_repeat")
+        if policy_time_step is None and isinstance(repeat, int) and repeat > 1:
+            policy_time_step = repeat * time_step
         if expert is None and added_to != Constant.name:
             raise InputError(f"{label}: it is a residual; allowed: policy_driver with its expert, {added_to!r}")
         function, output, size = _predict(policy), _limit_output(output, policy), policy.observation_space.shape[0]
