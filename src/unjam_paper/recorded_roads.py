@@ -106,6 +106,8 @@ IDEAL_CAR: dict[str, Any] = {"actuator": Actuator(), "safety": SafetyFilter(acti
 """the car of a plan"""
 SEARCH_BUDGET = SearchBudget()
 PLAN_LABEL = "plan that knows the recording"
+RING_DRIVER = "pi"
+"""driver of the paper's rings, compared behind the drives alone"""
 DRIVES_PARTS = {TRAINING_DRIVES_PART: TRAINING_MONTH, TEST_DRIVES_PART: TEST_MONTH}
 SETTING_METRICS = "fuel_by_power", "cav_mean_gap", "min_time_gap", "feasibility"
 SUMO_METRICS = ("fuel_ml_per_km", "fuel_by_power")
@@ -227,7 +229,7 @@ def make_recorded_parts(study_folder: StudyFolder, seeds: int) -> dict[str, Stud
     if not all(run.controller.is_file() for run in runs):
         return parts
     names = (HUMAN_LABEL, STOPPER, PUBLISHED_LABEL, *tuned)
-    drivers = (*names, PLAN_LABEL, *(str(run.controller) for run in runs))
+    drivers = (*names, RING_DRIVER, PLAN_LABEL, *(str(run.controller) for run in runs))
     for (part, month), name in product(DRIVES_PARTS.items(), drivers):
         parts[f"{part}/{_entry(name)}"] = measure_driver, (root, month, STANDARD_SETTING, name)
     for name in names:

@@ -35,6 +35,7 @@ from unjam_paper.recorded_roads import (
     PUBLISHED_FILES,
     RECORDED_ROADS,
     RECORDINGS_FOLDER,
+    RING_DRIVER,
     TEST_DRIVES_PART,
     TRAINING_DRIVES_PART,
     DriveResults,
@@ -136,15 +137,15 @@ def test_the_study_tunes_trains_and_then_compares_all_drivers(folder: Path, monk
     trained = [f"smooth-acc and residual {name}" for name in MODEL_RATIOS]
     for table, part, drives in (("drivers", TRAINING_DRIVES_PART, 2), ("test", TEST_DRIVES_PART, 1)):
         frame = pd.read_csv(study / f"{table}.csv")
-        assert list(frame["driver"]) == [*laws, PLAN_LABEL, *trained]
+        assert list(frame["driver"]) == [*laws, RING_DRIVER, PLAN_LABEL, *trained]
         assert frame["fuel of the platoon [%]"].tolist()[0] == "–"
-        assert len(read_part(study, part)) == 9 * drives
+        assert len(read_part(study, part)) == 10 * drives
     assert list(pd.read_csv(study / "search.csv")["method"]) == ["smooth-acc", "acc"]
     settings = pd.read_csv(study / "assumptions.csv")
     assert list(settings.columns[1:]) == laws[1:]
     assert len(settings) == 3  # two settings, and fuel in SUMO
     assert list(pd.read_csv(study / "residuals.csv")["trainings"]) == [1, 1, 1]
-    assert len(pd.read_csv(study / "waves.csv")) == 9
+    assert len(pd.read_csv(study / "waves.csv")) == 10
 
 
 def test_several_trainings_are_one_driver_with_paired_drives() -> None:
