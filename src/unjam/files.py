@@ -236,7 +236,12 @@ class FileWatch:
         """Raise `InputError` if a file has changed since the watch began."""
         changed = [path for path, known in self._files.items() if not _is_unchanged(path, *known)]
         if changed := changed or sorted(self._files.keys() ^ set(self._list_files())):
-            raise InputError(f"{changed[0].name}: has changed since the start; allowed: files that stay as they are")
+            raise changed_file_error(changed[0].name)
+
+
+def changed_file_error(name: str) -> InputError:
+    """Return the error for a file that has changed while a command ran."""
+    return InputError(f"{name}: has changed since the start; allowed: files that stay as they are")
 
 
 def _is_unchanged(path: Path, stamp: tuple[int, ...], sha256: str) -> bool:

@@ -39,8 +39,10 @@ SMOOTHING_SECONDS, FINAL_SECONDS = 10, 60
 """duration over which the mean speed is averaged for the settling time, and at the end of an episode [s]"""
 SETTLED_SHARE = 0.95
 """mean speed that counts as settled, as a share of the speed limit of the road"""
-ADAPTATION_DRIVERS = {HUMAN_LABEL: "human", PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS}
-ADAPTATION_DRIVERS |= {"FollowerStopper": "follower-stopper", "unjam:best": "unjam:best"}
+ADAPTATION_DRIVERS = {
+    **{HUMAN_LABEL: "human", PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS},
+    **{"FollowerStopper": "follower-stopper", "unjam:best": "unjam:best"},
+}
 
 
 class ChangingRings(RingBatch):

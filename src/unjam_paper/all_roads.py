@@ -82,15 +82,19 @@ SINGLE_CONTROLLERS: dict[str, str] = {
 CLOSED_ROAD_CONTROLLERS = ("unjam:ring-best-ideal", "unjam:ring-jammed-best-ideal", "unjam:figure-eight-best")
 MOTORWAY_CONTROLLERS = ("unjam:on-ramp-tuned",)
 """packaged controllers, each with the control step of its type of road"""
-FAMILY_DRIVERS: dict[str, str] = {**SINGLE_CONTROLLERS}
-FAMILY_DRIVERS |= {"jam-ahead": "jam-ahead", "FollowerStopper": "follower-stopper"}
-FAMILY_DRIVERS |= {name: name for name in (*CLOSED_ROAD_CONTROLLERS, *MOTORWAY_CONTROLLERS)}
+FAMILY_DRIVERS: dict[str, str] = {
+    **SINGLE_CONTROLLERS,
+    **{"jam-ahead": "jam-ahead", "FollowerStopper": "follower-stopper"},
+    **{name: name for name in (*CLOSED_ROAD_CONTROLLERS, *MOTORWAY_CONTROLLERS)},
+}
 """drivers that are evaluated on every road, by label"""
 TWO_LAWS_LABEL = "PI on rings and figure eights, jam-ahead on motorways (tuned on all roads)"
 """label of the combination of two controllers by the type of road; its results are taken from theirs"""
 RING_GROUP = "rings"
-RING_BASELINES = {RINGS_EXPERT: RINGS_EXPERT}
-RING_BASELINES |= {label: FAMILY_DRIVERS[label] for label in (PI_ON_RINGS_LABEL, "unjam:ring-best-ideal")}
+RING_BASELINES = {
+    RINGS_EXPERT: RINGS_EXPERT,
+    **{label: FAMILY_DRIVERS[label] for label in (PI_ON_RINGS_LABEL, "unjam:ring-best-ideal")},
+}
 SHARED_RING_BASELINES = {SHARED_RINGS_EXPERT: SHARED_RINGS_EXPERT, RINGS_EXPERT: RINGS_EXPERT}
 ALL_ROADS_BASELINES = {label: FAMILY_DRIVERS[label] for label in ("unjam:best", PI_ON_RINGS_LABEL, "jam-ahead")}
 """drivers that are evaluated together with the trained ones; the first is the expert for these roads"""

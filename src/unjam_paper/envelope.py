@@ -34,9 +34,11 @@ CONTROLLER_ROADS: dict[str, str] = {
     **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned-ideal")},
 }
 """packaged controllers for closed roads that were tuned or trained for ideal cars, and the road of each"""
-USUAL_CAR_ROADS: dict[str, str] = {"unjam:ring-best": "ring", "unjam:ring-gap-tuned": "ring"}
-USUAL_CAR_ROADS |= {f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")}
-USUAL_CAR_ROADS |= {"unjam:figure-eight-tuned": "figure-eight"}
+USUAL_CAR_ROADS: dict[str, str] = {
+    **{"unjam:ring-best": "ring", "unjam:ring-gap-tuned": "ring"},
+    **{f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
+    "unjam:figure-eight-tuned": "figure-eight",
+}
 """those that are evaluated in usual cars"""
 LANE_CONTROLLERS = ("unjam:on-ramp-tuned",)
 USUAL_CAR_CONTROLLERS = tuple(name for name, road in USUAL_CAR_ROADS.items() if road != "figure-eight")

@@ -80,12 +80,16 @@ FEASIBILITY_STUDY_METRICS = (
 ON_RAMP_ROAD = replace(ON_RAMP, penetration_rate=0.05)
 ON_RAMP_SEEDS = 100
 ON_RAMP_TUNED_LABEL, LARGER_BUDGET_LABEL = "unjam:on-ramp-tuned", "tuned, larger budget"
-ON_RAMP_DRIVERS = {HUMAN_LABEL: "human", "ACC baseline": "cruise"}
-ON_RAMP_DRIVERS |= {ON_RAMP_TUNED_LABEL: ON_RAMP_TUNED_LABEL, LARGER_BUDGET_LABEL: ON_RAMP_JAM_AHEAD}
+ON_RAMP_DRIVERS = {
+    **{HUMAN_LABEL: "human", "ACC baseline": "cruise"},
+    **{ON_RAMP_TUNED_LABEL: ON_RAMP_TUNED_LABEL, LARGER_BUDGET_LABEL: ON_RAMP_JAM_AHEAD},
+}
 """drivers that do not learn; residuals are added to one of the last two"""
 ON_RAMP_TIME, ON_RAMP_FLOW = "travel_time", "outflow_veh_per_h"
-ON_RAMP_METRICS = (ON_RAMP_TIME, ON_RAMP_FLOW, "human_braking_beyond_4_5", "mean_speed", "fuel_ml_per_km")
-ON_RAMP_METRICS += ("feasibility", "min_time_gap", "cav_max_braking")
+ON_RAMP_METRICS = (
+    *(ON_RAMP_TIME, ON_RAMP_FLOW, "human_braking_beyond_4_5", "mean_speed", "fuel_ml_per_km"),
+    *("feasibility", "min_time_gap", "cav_max_braking"),
+)
 
 
 @dataclass(frozen=True)

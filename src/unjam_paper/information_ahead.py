@@ -47,8 +47,10 @@ FOLLOWERS = 5
 VALUE_BUDGET = SearchBudget(generations=10, size=24)
 SHARED_SPACE = {name: SEARCH_SPACES["smooth-acc"][name] for name in ("time_gap", "averaging_time", "leader_weight")}
 SPACE_AHEAD = {"ahead_weight": FloatDistribution(0, 1), "ahead_averaging_time": FloatDistribution(1, 60, log=True)}
-FIXED_PARAMETERS = {"gap_gain": 0.05, "catch_up_speed": 2.7, "time_constant": 0.3}
-FIXED_PARAMETERS |= {"acceleration_limit": 0.53, "braking_limit": 0.36, "largest_gap": 91.0}
+FIXED_PARAMETERS = {
+    **{"gap_gain": 0.05, "catch_up_speed": 2.7, "time_constant": 0.3},
+    **{"acceleration_limit": 0.53, "braking_limit": 0.36, "largest_gap": 91.0},
+}
 """of the search without information, see `unjam_paper.recorded_roads`"""
 INFORMATION_STUDY, PART = "information-ahead", "value"
 

@@ -140,8 +140,10 @@ def _draw_settings() -> list[EnsembleSetting]:
     return settings
 
 
-CAPACITIES: tuple[float, ...] = (1926, 1806, 1627, 1694, 1836, 1758, 1757, 1644, 1766, 1721, 1670, 1579)
-CAPACITIES += (1710, 1657, 1717, 1655, 1742, 1744, 1781, 1736, 1787, 1612, 1507, 1877)
+CAPACITIES: tuple[float, ...] = (
+    *(1926, 1806, 1627, 1694, 1836, 1758, 1757, 1644, 1766, 1721, 1670, 1579),
+    *(1710, 1657, 1717, 1655, 1742, 1744, 1781, 1736, 1787, 1612, 1507, 1877),
+)
 """flow before a breakdown of each setting: means of the part `capacity` [veh/h per lane]"""
 SETTING_FREE_FLOW_TIMES: tuple[float, ...] = (
     *(132.2, 140.7, 133.9, 134.0, 184.4, 136.3, 141.2, 134.1, 136.5, 135.7, 183.9, 134.9),

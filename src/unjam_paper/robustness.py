@@ -28,8 +28,10 @@ from unjam_paper.variants import VARIANTS
 CONDITION_EPISODES = 10
 """number of episodes of each driver under each condition"""
 TUNED_EXPERT = "tuned expert"
-ROBUSTNESS_METRICS = ("mean_speed", "mean_speed_steady", "speed_std_fleet", "min_time_gap", "collisions")
-ROBUSTNESS_METRICS += ("insertion_backlog_veh",)
+ROBUSTNESS_METRICS = (
+    *("mean_speed", "mean_speed_steady", "speed_std_fleet", "min_time_gap", "collisions"),
+    "insertion_backlog_veh",
+)
 COMMON_CONDITIONS: dict[str, dict[str, Any]] = {
     "as in training": {},
     "twice the noise": {"noise": 0.4},
@@ -39,9 +41,12 @@ COMMON_CONDITIONS: dict[str, dict[str, Any]] = {
     "two CAVs": {"cavs": 2},
 }
 """differences from training: changes to the scenario, and `impairments`, the arguments of `ImpairedDriver`"""
-RING_CONDITIONS: dict[str, dict[str, Any]] = {**COMMON_CONDITIONS}
-RING_CONDITIONS |= {"one CAV in 44, 520 m": {"vehicles": 44, "length": [520, 520]}}
-RING_CONDITIONS |= {"200 to 219 m": {"length": [200, 219]}, "271 to 300 m": {"length": [271, 300]}}
+RING_CONDITIONS: dict[str, dict[str, Any]] = {
+    **COMMON_CONDITIONS,
+    "one CAV in 44, 520 m": {"vehicles": 44, "length": [520, 520]},
+    "200 to 219 m": {"length": [200, 219]},
+    "271 to 300 m": {"length": [271, 300]},
+}
 ROAD_CONDITIONS: dict[str, dict[str, dict[str, Any]]] = {
     "ring": {**RING_CONDITIONS, "after ten minutes of jam": {"warmup": 6000}},
     "ring-jammed": {**RING_CONDITIONS, "before there is a jam": {"warmup": 0}},

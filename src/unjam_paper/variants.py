@@ -9,8 +9,10 @@ STEP_BUDGET, MILLION_STEPS, PAPER_STEP_BUDGET = 300_000, 1_000_000, 4_000_000
 """environment steps of a training; the larger budget where it takes less than an hour; those of the paper"""
 RINGS_EXPERT, SHARED_RINGS_EXPERT = "unjam:rings-tuned", "unjam:shared-rings-tuned"
 """best experts for all rings of the family, and for rings that several CAVs share"""
-JAMMED_IDEAL: dict[str, Any] = {"expert": "unjam:ring-jammed-tuned-ideal"}
-JAMMED_IDEAL |= {"policy.exploration_std": 0.013, "trpo.target_kl": 0.0086}
+JAMMED_IDEAL: dict[str, Any] = {
+    "expert": "unjam:ring-jammed-tuned-ideal",
+    **{"policy.exploration_std": 0.013, "trpo.target_kl": 0.0086},
+}
 """expert and exploration for ideal cars on the jammed ring, as changes to `best`, which has those for usual cars"""
 ON_RAMP_JAM_AHEAD = (
     "jam-ahead:first_section=3,last_section=4,speed_margin=-1.536,margin_by_penetration=19.83,min_speed=2.568,"
@@ -65,11 +67,15 @@ NO_MODEL = {
 WEAK_EXPERT = {"expert": "jam-ahead:speed_margin=2,margin_by_penetration=0", "backend": "sumo"}
 """an expert without effect on the on-ramp: the tuned one leaves little to learn"""
 ON_RAMP_VARIANTS = reduced_step_variants("ramp", 9_600, 86_400, horizon=2400, **WEAK_EXPERT, **NO_MODEL)
-SMALL_ITERATIONS = {**ON_RAMP_VARIANTS["ramp-few"].changes}
-SMALL_ITERATIONS |= {"trpo.steps_per_iteration": 4_800, "evaluation.validation_interval": 6}
+SMALL_ITERATIONS = {
+    **ON_RAMP_VARIANTS["ramp-few"].changes,
+    **{"trpo.steps_per_iteration": 4_800, "evaluation.validation_interval": 6},
+}
 """twice as many updates from the same steps: as many as alternating updates make with three times their steps"""
-LONG_TRAINING = {"expert": ON_RAMP_JAM_AHEAD, "backend": "batch", "trpo.steps_per_iteration": 153_600, **NO_MODEL}
-LONG_TRAINING |= {"evaluation.validation_interval": 10, "evaluation.validation_episodes": 128}
+LONG_TRAINING = {
+    **{"expert": ON_RAMP_JAM_AHEAD, "backend": "batch", "trpo.steps_per_iteration": 153_600, **NO_MODEL},
+    **{"evaluation.validation_interval": 10, "evaluation.validation_episodes": 128},
+}
 NO_EXPERT = {"expert": "none", "model.model_ratio": 0.0}
 NO_EARLY_STOPPING = {"evaluation.convergence_window": 0}
 TWO_EPISODES_PER_ROAD = {"evaluation.episodes": 2}

@@ -10,8 +10,12 @@ from unjam.drivers.observation import MAX_OBSERVATION
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import import_optional, unknown_name
 
-ALGORITHMS = {"trpo": ("sb3_contrib", "TRPO"), "ppo": ("stable_baselines3", "PPO")}
-ALGORITHMS |= {"sac": ("stable_baselines3", "SAC"), "td3": ("stable_baselines3", "TD3")}
+ALGORITHMS = {
+    "trpo": ("sb3_contrib", "TRPO"),
+    "ppo": ("stable_baselines3", "PPO"),
+    "sac": ("stable_baselines3", "SAC"),
+    "td3": ("stable_baselines3", "TD3"),
+}
 """packages and names of the algorithms, by the agent of a training"""
 MIN_EXPLORATION = 1e-3  # smallest standard deviation of exploration, as a share of the authority
 
@@ -58,9 +62,12 @@ def stable_baselines3_bytes(driver: ResidualDriver, agent: str) -> bytes:
                 parameter.copy_(torch.as_tensor(array.T))
         if agent == "td3":
             model.actor_target.load_state_dict(actor.state_dict())
-    action = "residual acceleration [m/s2], added to that of the expert"
-    model.unjam = {"expert": driver.expert.describe(), "features": list(driver.inputs)}
-    model.unjam |= {"action": action, "action_repeat": driver.action_repeat}
+    model.unjam = {
+        "expert": driver.expert.describe(),
+        "features": list(driver.inputs),
+        "action": "residual acceleration [m/s2], added to that of the expert",
+        "action_repeat": driver.action_repeat,
+    }
     content = io.BytesIO()
     model.save(content)
     return content.getvalue()

@@ -27,20 +27,11 @@ SAFE_TORCH = (2, 6)
 """version of torch from which on reading weights cannot run code (CVE-2025-32434)"""
 ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {"Tanh": np.tanh, "ReLU": lambda units: np.maximum(units, 0.0)}
 POLICY_PACKAGES = ("stable_baselines3.", "sb3_contrib.")
-HARMLESS_POLICY_OPTIONS = {
-    *("net_arch", "log_std_init", "ortho_init", "optimizer_class", "optimizer_kwargs", "share_features_extractor"),
-    *(
-        "n_critics",
-        "n_quantiles",
-        "clip_mean",
-        "full_std",
-        "use_expln",
-        "normalize_images",
-        "use_sde",
-        ":type:",
-        ":serialized:",
-    ),
-}
+_HARMLESS_OPTIONS = """
+net_arch log_std_init ortho_init optimizer_class optimizer_kwargs share_features_extractor n_critics n_quantiles
+clip_mean full_std use_expln use_sde normalize_images :type: :serialized:
+"""
+HARMLESS_POLICY_OPTIONS = set(_HARMLESS_OPTIONS.split())
 """options of policies that do not change their deterministic actions, or that the shapes of the weights show"""
 
 

@@ -164,18 +164,22 @@ def _run_app() -> int:
     except Exception as error:
         if isinstance(error, RuntimeError) and "start new thread" in str(error):
             return _print_error(TOO_LITTLE_MEMORY, InputError.exit_code)
-        if hasattr(error, "format_message"):  # typer's errors about the command line, without the value of the option
-            options = getattr(getattr(error, "param", None), "opts", [])
-            values = [value for word, value in pairwise(sys.argv) if word in options and value]
-            given = f"; given: {values[0]!r}" if values else ""
-            command = getattr(getattr(error, "ctx", None), "command", None)
-            options = [option for each in getattr(command, "params", ()) for option in each.opts]
-            if "--set" in options and getattr(error, "option_name", "--set") not in options:
-                from unjam.cli.catalog import suggest_setting  # imported late: it imports all scenarios
-
-                given += suggest_setting(error.option_name, command.name)  # pyright: ignore[reportAttributeAccessIssue, reportOptionalMemberAccess]
-            return _print_error(f"{error.format_message()}{given}", 2)  # pyright: ignore[reportAttributeAccessIssue]
+        if hasattr(error, "format_message"):
+            return _print_error(_usage_text(error), InputError.exit_code)
         raise
+
+
+def _usage_text(error: Any) -> str:
+    """Return the message of an error of typer about the command line, with the value of the option or a hint."""
+    words = getattr(getattr(error, "param", None), "opts", ())
+    values = [f"; given: {value!r}" for word, value in pairwise(sys.argv) if word in words and value]
+    command: Any = getattr(getattr(error, "ctx", None), "command", None)
+    known = [word for each in getattr(command, "params", ()) for word in each.opts]
+    if "--set" in known and getattr(error, "option_name", "--set") not in known:
+        from unjam.cli.catalog import suggest_setting  # imported late: it imports all scenarios
+
+        return error.format_message() + suggest_setting(error.option_name, command.name)
+    return "".join([error.format_message(), *values[:1]])
 
 
 def _has_working_folder() -> bool:

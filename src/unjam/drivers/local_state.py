@@ -84,8 +84,10 @@ STATE_UNITS = dict(zip(LocalState._fields, _FIELD_UNITS, strict=True))
 COMMON_FIELDS = tuple(name for name in LocalState._fields if name not in LocalState._field_defaults)
 """fields that every road provides"""
 ADJACENT_POSITIONS = ("ahead on the left", "behind on the left", "ahead on the right", "behind on the right")
-FIELD_SIZES: dict[str, int] = dict.fromkeys(("lane_speeds", "road_speeds", "congestion"), SECTIONS_AHEAD)
-FIELD_SIZES |= dict.fromkeys(("adjacent_gaps", "adjacent_speeds"), len(ADJACENT_POSITIONS))
+FIELD_SIZES = {
+    **dict.fromkeys(("lane_speeds", "road_speeds", "congestion"), SECTIONS_AHEAD),
+    **dict.fromkeys(("adjacent_gaps", "adjacent_speeds"), len(ADJACENT_POSITIONS)),
+}
 """numbers per CAV of the fields that have several"""
 
 

@@ -22,8 +22,10 @@ from unjam.parameters import build_dataclass, check_part, check_values, is_packa
 from unjam.text import spelling_hint
 from unjam.tree import Arrays, named_parts, pack, unpack
 
-_DRIVER_CLASSES = (Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, SmoothACC, LACC, BCM, OVM)
-_DRIVER_CLASSES += (Pacer, JamAbsorber, Cruise, AdvisorySpeed, JamAhead, GapMaker, AdaptiveACC, Constant)
+_DRIVER_CLASSES = (
+    *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, SmoothACC, LACC, BCM, OVM),
+    *(Pacer, JamAbsorber, Cruise, AdvisorySpeed, JamAhead, GapMaker, AdaptiveACC, Constant),
+)
 DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _DRIVER_CLASSES}
 DRIVER_CLASSES: dict[str, type[Driver]] = {
     **DRIVERS,

@@ -122,8 +122,9 @@ class SlottedRoadEnv(RoadAgents):
 
     def _infos(self, infos: dict[str, Any], shown: dict[str, str], left: dict[str, str]) -> dict[str, Any]:
         found: dict[str, Any] = {}
-        # At the end, the CAVs of the metrics may have no slot.
-        final = {name: value for info in infos.values() for name, value in info.items() if name == "episode_metrics"}
+        # At the end all slots have the metrics: the CAVs that are there may have none.
+        metrics = [info["episode_metrics"] for info in infos.values() if "episode_metrics" in info]
+        final = {"episode_metrics": metrics[0]} if metrics else {}
         for slot in self.possible_agents:
             state = {"is_occupied": slot in self._cavs, "has_left": slot in left, "vehicle": shown.get(slot, "")}
             found[slot] = final | infos.get(state["vehicle"], {}) | state

@@ -17,7 +17,7 @@ from unjam.worlds.sumo.simulation import DetectorPassage
 
 DETECTOR_COLUMNS = ("position", "begin", "end", "flow_veh_per_h", "speed")
 """columns of a file of measurements, in addition to `edge` or `lane`"""
-MAX_NUMBER = 1e9
+MAX_NUMBER = 1e9  # largest allowed number in a file
 TIME_TOLERANCE = 1e-6
 """time by which intervals may overlap, as their ends are rounded [s]"""
 GEH_LIMIT = 5.0  # GEH below which a simulated flow agrees with the measured flow

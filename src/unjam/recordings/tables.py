@@ -26,8 +26,10 @@ MAX_BINARY_LENGTH = 16
 """longest value of a column of equally long binary values in Parquet that is read [bytes], as decimal numbers have"""
 MAX_PARQUET_MEMORY = 8 << 30
 """maximum memory that a Parquet file takes while it is read [bytes]"""
-RECONSTRUCTED_COLUMN_ORDER = ("vehicleid", "frameid", "laneid", "localy", "meanspeed")
-RECONSTRUCTED_COLUMN_ORDER += ("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid")
+RECONSTRUCTED_COLUMN_ORDER = (
+    *("vehicleid", "frameid", "laneid", "localy", "meanspeed"),
+    *("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid"),
+)
 """columns of the reconstructed NGSIM files, which have no header, in their order"""
 NGSIM_COLUMN_ORDER = (
     *("vehicle_id", "frame_id", "total_frames", "global_time", "local_x", "local_y", "global_x", "global_y"),

@@ -21,8 +21,18 @@ from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import UserNetwork, load_user_network
 from unjam.scenarios.user_scenario import CODE_ENTRY, class_recipe, load_class, load_python_scenario, load_toml_scenario
 
-__all__ = ["SCENARIOS", "FigureEight", "Merge", "Motorway", "Ramp", "Recorded", "Ring", "Road", "Scenario"]
-__all__ += ["make_scenario"]
+__all__ = [
+    "SCENARIOS",
+    "FigureEight",
+    "Merge",
+    "Motorway",
+    "Ramp",
+    "Recorded",
+    "Ring",
+    "Road",
+    "Scenario",
+    "make_scenario",
+]
 
 SCENARIOS: dict[str, Scenario] = {
     "ring": Ring(),

@@ -159,7 +159,8 @@ class XmlReader:
             self.root, self.version = tag, attributes.get("version", "")
         if (handler := self._handlers.get(tag)) is not None:
             handler(attributes)
-        if tag in CHECKED_ELEMENTS or self._changed_attributes or not self._harmless_names.issuperset(attributes):
+        is_changed = bool(self._changed_attributes) and tag.startswith(FOLLOWING_MODEL_PREFIX)
+        if is_changed or tag in CHECKED_ELEMENTS or not self._harmless_names.issuperset(attributes):
             self._process_element(tag, attributes)
         elif self._write is not None:
             self._write_start(tag, attributes)

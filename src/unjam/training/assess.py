@@ -220,7 +220,7 @@ def assess(
             if progress is not None:
                 progress((batch, *episode), steps)
 
-        return evaluate_on_roads(setups, seeds, workers, progress=report_progress, with_plots=with_plots)
+        return evaluate_on_roads(setups, seeds, workers, progress=report_progress, with_plots=with_plots, watch=watch)
 
     def run_options(kind: str, options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
         hashes = {option: log.setup_hash(*request.make_setup(option)) for option in options}
@@ -231,7 +231,6 @@ def assess(
             numbers = f"seeds {first} to {last}" if first < last else f"seed {first}"
             stage = f"simulating {kind} {numbers} of {format_count(len(new_options), 'option')}"
             new_rows = evaluate_options(stage, [*new_options], new_seeds).rows
-            watch.check()
             for option in new_options:
                 log.add(hashes[option], new_seeds, new_rows[option.label])
         budget.spend(len(options) * len(seeds), len(new_options) * len(new_seeds))

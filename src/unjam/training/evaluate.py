@@ -215,6 +215,7 @@ def evaluate_on_roads(
     progress: EvaluationProgress | None = None,
     with_plots: bool = True,
     backend: BackendLike = "sumo",
+    watch: FileWatch | None = None,
 ) -> Evaluation:
     """Run every driver, each on its own road, on every seed, and measure; `with_plots` keeps an episode of each."""
     settings: dict[str, Any] = {"reward": reward, "backend": backend}
@@ -223,7 +224,7 @@ def evaluate_on_roads(
     tasks = {(label, index): EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs}
     remote = [pair for pair in pairs if tasks[pair].is_serializable]
     local = [pair for pair in pairs if not tasks[pair].is_serializable]
-    watch = FileWatch(lambda: {file for scenario, _ in drivers.values() for file in scenario.user_files})
+    watch = watch or FileWatch(lambda: {file for scenario, _ in drivers.values() for file in scenario.user_files})
     on_progress = progress or (lambda pair, steps: None)
 
     def measure_task(pair: tuple[str, int], episode: Episode) -> tuple[dict[str, Any], Episode | None]:

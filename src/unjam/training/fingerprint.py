@@ -48,12 +48,14 @@ def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
             _LOG.warning("resume: other %s than in the checkpoint: the result may differ", part)
 
 
-def check_settings(stored: dict[str, Any], current: dict[str, Any], command: str, ignored_prefix: str = "-") -> None:
-    """Raise `InputError` if a setting has changed whose name does not begin with `ignored_prefix`."""
+def check_settings(
+    stored: dict[str, Any], current: dict[str, Any], command: str, ignored_prefixes: tuple[str, ...] = ()
+) -> None:
+    """Raise `InputError` if a setting has changed whose name begins with none of `ignored_prefixes`."""
     _check_form(stored, command)
     for name, value in current["settings"].items():
         before = stored["settings"].get(name, value)
-        if not name.startswith(ignored_prefix) and _without_folders(before) != _without_folders(value):
+        if not name.startswith(ignored_prefixes) and _without_folders(before) != _without_folders(value):
             raise invalid_value(f"{command}: {name}", value, f"{before!r}, as in the checkpoint")
 
 

@@ -325,7 +325,7 @@ def check_run_files(folder: Path, config: RunConfig, command: str) -> None:
     newest = next((state for _, state, _ in _valid_checkpoints(folder / "checkpoint")), {})
     if stored := newest.get("fingerprint"):
         current = fingerprint(config)
-        check_settings(stored, current, command, ignored_prefix="evaluation.")
+        check_settings(stored, current, command, ignored_prefixes=("evaluation.",))
         check_file_hashes(stored, current, command)
 
 

@@ -17,7 +17,7 @@ from optuna.samplers import TPESampler
 from optuna.trial import TrialState, create_trial
 
 from unjam.errors import DiskError, InputError, UnjamError, invalid_value
-from unjam.files import atomic_write, to_json
+from unjam.files import atomic_write, changed_file_error, to_json
 from unjam.learners.settings import unused_tables
 from unjam.manifest import manifest
 from unjam.parameters import merge_changes, nest_keys
@@ -99,8 +99,8 @@ def search(
                 on_message(_running_line(folder, jobs.values(), base.steps))
             for done in ended_jobs:
                 number, now = jobs.pop(done), _file_hashes(base, space)
-                if changed := [name for name in {**files, **now} if files.get(name) != now.get(name)]:
-                    raise InputError(f"{changed[0]}: has changed since the start; allowed: files that stay as they are")
+                if changed := {name for name, _ in files.items() ^ now.items()}:
+                    raise changed_file_error(min(changed))
                 if (code := done.result()) not in (0, *TRIAL_FAILURE_CODES):  # a full disk would end all others, too
                     reason = f"trial {number} was stopped with exit code {code}; its log: {_log_file(folder, number)}"
                     raise (DiskError if code == DiskError.exit_code else UnjamError)(reason)

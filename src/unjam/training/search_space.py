@@ -110,12 +110,11 @@ def _default_range(value: Any, hint: Any) -> Distribution | None:
         return CategoricalDistribution((False, True))
     if get_origin(hint) is Literal:
         return CategoricalDistribution(get_args(hint))
-    if isinstance(value, int) and value < 0:
-        return IntDistribution(round(value * RANGE_FACTOR), min(-1, round(value / RANGE_FACTOR)))
     if isinstance(value, int):
         if value == 0:
             return IntDistribution(0, round(RANGE_FACTOR))
-        return IntDistribution(max(1, round(value / RANGE_FACTOR)), round(value * RANGE_FACTOR), log=True)
+        low, high = sorted((round(value / RANGE_FACTOR), round(value * RANGE_FACTOR)))
+        return IntDistribution(max(1, low), high, log=True) if value > 0 else IntDistribution(low, min(-1, high))
     if not isinstance(value, float) or not math.isfinite(value * RANGE_FACTOR):
         return None
     if value == 0:
