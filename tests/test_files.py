@@ -255,6 +255,7 @@ def test_json_has_null_where_a_number_is_not_finite(value: float) -> None:
 def test_numbers_and_arrays_of_other_packages_are_plain_json() -> None:
     values = {"a": np.int64(3), "b": np.float32(0.5), "c": torch.tensor(2.0), "d": np.array([1.0, np.nan])}
     assert to_json(values) == '{"a": 3, "b": 0.5, "c": 2.0, "d": [1.0, null]}'
+    assert to_json([np.longdouble(1.5), np.array([np.nan], np.longdouble)]) == "[1.5, [null]]"
 
 
 @given(

@@ -268,4 +268,7 @@ def _replace_nonfinite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     to_list = getattr(value, "tolist", None)  # of NumPy and torch
-    return value if to_list is None else _replace_nonfinite(to_list())
+    if to_list is None:
+        return value
+    listed = to_list()
+    return _replace_nonfinite(float(value) if type(listed) is type(value) else listed)  # a long double lists itself

@@ -152,6 +152,18 @@ def test_on_an_own_network_the_first_that_the_share_picks_is_driven(tmp_path: Pa
     np.testing.assert_allclose(speeds[:-1], driven.states.speed[1:], atol=1e-5)
 
 
+@pytest.mark.slow
+def test_a_network_that_changes_between_two_episodes_is_refused(tmp_path: Path) -> None:
+    flow = '<flow id="car" type="car" route="along" begin="0" end="60" period="2"/>'
+    environment = RoadEnv(str(straight(tmp_path, flow)), penetration_rate=0.5, horizon=300, cavs=1)
+    environment.reset(seed=2)
+    demand = tmp_path / "demand.rou.xml"
+    demand.write_text(demand.read_text().replace('period="2"', 'period="3"'))
+    with pytest.raises(InputError, match=r"^demand\.rou\.xml: has changed since the start"):
+        environment.reset(seed=2)
+    environment.close()
+
+
 def test_a_collision_terminates_and_does_not_truncate() -> None:
     environment = RoadEnv("ring", actuation="raw", length=(160, 160), safety={"active": False})
     environment.reset(seed=0)

@@ -3,6 +3,7 @@
 import json
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from unjam.training.run_folder import (
     check_run_files,
     create_run_folder,
     fingerprint,
+    read_config,
     restore_newest_checkpoint,
     save_checkpoint,
 )
@@ -115,6 +117,18 @@ def test_changed_settings_of_a_training_are_refused_by_commands_that_read_the_ru
         check_run_files(run, small_config(evaluation__episodes=3), command)
         with pytest.raises(InputError, match=rf"^{command}: scenario_options\.horizon: 300 .*; allowed: 100"):
             check_run_files(run, changed, command)
+
+
+def test_changed_settings_of_a_task_are_refused_by_commands_that_read_its_folder(tmp_path: Path) -> None:
+    config = small_config(tasks=[{"name": "first"}, {"name": "second", "weight": 2.0}])
+    with_checkpoint(tmp_path, config)
+    (tmp_path / "second").mkdir()
+    (tmp_path / "second" / "config.toml").write_text(to_toml(config.task_configs()["second"]))
+    task = read_config(tmp_path / "second")
+    check_run_files(tmp_path / "second", task, "export")
+    changed = replace(task, scenario_options={**task.scenario_options, "horizon": 300})
+    with pytest.raises(InputError, match=r"^export: scenario_options\.horizon: 300 .*; allowed: 100"):
+        check_run_files(tmp_path / "second", changed, "export")
 
 
 def test_other_packages_and_kernels_give_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

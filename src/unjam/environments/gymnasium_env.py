@@ -4,8 +4,9 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from copy import copy
-from functools import wraps
+from functools import partial, wraps
 from math import isfinite
+from operator import attrgetter
 from threading import RLock
 from typing import Any, ClassVar, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
@@ -22,6 +23,7 @@ from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features,
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
+from unjam.files import FileWatch
 from unjam.measures.step_metrics import StepMetricMeans
 from unjam.parameters import check_integer, merge_changes, nest_keys
 from unjam.physics.arrays import clip
@@ -124,6 +126,7 @@ class RoadStepper:
         self._base, self._changes = scenario, changes
         self.scenario = self.episode_scenario = made
         """that of the constructor; `episode_scenario` is that of the last reset, with its options"""
+        self._watch = FileWatch(partial(attrgetter("user_files"), made))
         reward = reward or self.scenario.reward
         self.reward, self.has_user_reward = make_reward(reward), not is_packaged_reward(reward)
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
@@ -174,10 +177,11 @@ class RoadStepper:
         """Start an episode, run its warm-up, and return the first observations.
 
         It is that of `seed`, or the next after the last seed, at first one from `generator`. `options` change
-        parameters of the scenario in this episode alone.
+        parameters of the scenario in this episode alone. Raise `InputError` if a file of the scenario has changed.
         """
         seed = None if seed is None else check_integer("seed", seed, 0)
         warn_of_reserved_seed(seed)
+        self._watch.check()
         if self._opened is None:
             self._opened = self._backend_context.enter_context(open_backend(self._backend))
         scenario = self.scenario if options is None else self._with_options(options, self._opened)

@@ -321,10 +321,17 @@ def _valid_checkpoints(folder: Path) -> Iterator[tuple[Path, dict[str, Any], byt
 
 
 def check_run_files(folder: Path, config: RunConfig, command: str) -> None:
-    """Raise `InputError` if files or settings that a run was trained with have changed; not without a checkpoint."""
+    """Raise `InputError` if files or settings that a run was trained with have changed; not without a checkpoint.
+
+    The folder of a task has the checkpoint of its run.
+    """
     newest = next((state for _, state, _ in _valid_checkpoints(folder / "checkpoint")), {})
-    if stored := newest.get("fingerprint"):
-        current = fingerprint(config)
+    stored, current = newest.get("fingerprint"), fingerprint(config)
+    if not stored and (name := folder.absolute().name) in _task_names(parent := folder.absolute().parent):
+        run = read_config(parent)
+        check_run_files(parent, run, command)
+        stored = fingerprint(run.task_configs()[name])
+    if stored:
         check_settings(stored, current, command, ignored_prefixes=("evaluation.",))
         check_file_hashes(stored, current, command)
 
