@@ -72,6 +72,10 @@ PACER_LONG_TUNED = (
 have no effect with `use_tuned`. With 600,000 steps it is `unjam:figure-eight-tuned-ideal`"""
 PACER_TUNED_LABEL, PACER_GENTLE_LABEL = "pacer, tuned", "pacer, tuned, gentle"
 PACER_LONG_LABEL = "pacer, tuned, training budget"
+PACER_IDEAL_LABEL = "pacer, tuned for ideal cars"
+PACER_GENTLE: str = preset_values("best", "figure-eight")["expert"]
+PACERS = {HUMAN_LABEL: "human", "pacer": "pacer", "varying pacer": "pacer:use_tuned=true"}
+FIGURE_EIGHT_RADII = (32, 33, 34, 35)
 FEASIBILITY_STUDY_METRICS = (
     *("return", "return_eq16", "mean_speed", "mean_speed_steady", "outflow_veh_per_h", "fuel_ml_per_km"),
     *("feasibility", "min_time_gap", "cav_max_braking", "filter_override_share", "speed_std_fleet_steady"),
@@ -159,13 +163,24 @@ FEASIBLE_ROADS = {
         evaluate=study.evaluate_in_batches,
         gain_road="ring-jammed",
     ),
+    "figure-eight-usual-car": EvaluationRoad(
+        sizes=FIGURE_EIGHT_RADII,
+        make_scenario=lambda radius: FigureEight(radius=(radius, radius)),
+        drivers={
+            **PACERS,
+            **{PACER_TUNED_LABEL: "unjam:figure-eight-tuned", PACER_GENTLE_LABEL: PACER_GENTLE},
+            PACER_IDEAL_LABEL: "unjam:figure-eight-tuned-ideal",
+        },
+        baselines=(PACER_TUNED_LABEL, PACER_GENTLE_LABEL, PACER_IDEAL_LABEL),
+        metric="return_eq16",
+        gain_road="figure-eight",
+    ),
     "figure-eight": EvaluationRoad(
-        sizes=(32, 33, 34, 35),
+        sizes=FIGURE_EIGHT_RADII,
         make_scenario=lambda radius: FigureEight(radius=(radius, radius), actuator=INSTANT_ACTUATOR),
         drivers={
-            **{HUMAN_LABEL: "human", "pacer": "pacer", "varying pacer": "pacer:use_tuned=true"},
-            **{PACER_TUNED_LABEL: "unjam:figure-eight-tuned-ideal", PACER_LONG_LABEL: PACER_LONG_TUNED},
-            PACER_GENTLE_LABEL: preset_values("best", "figure-eight")["expert"],
+            **{**PACERS, PACER_TUNED_LABEL: "unjam:figure-eight-tuned-ideal", PACER_LONG_LABEL: PACER_LONG_TUNED},
+            PACER_GENTLE_LABEL: PACER_GENTLE,
         },
         baselines=(PACER_TUNED_LABEL, PACER_LONG_LABEL, PACER_GENTLE_LABEL),
         metric="return_eq16",

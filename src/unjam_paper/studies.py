@@ -93,8 +93,13 @@ STUDIES: dict[str, Study] = {
         minutes=20.0,
     ),
     "feasible-figure-eight": feasible_study(
-        "feasible residual compared with the tuned expert in ideal cars, on the figure eight",
-        {"figure-eight": "best"},
+        "feasible residual compared with tuned experts in usual cars, on the figure eight",
+        {"figure-eight-usual-car": "best"},
+        minutes=5.0,
+    ),
+    "feasible-figure-eight-ideal": feasible_study(
+        "feasible residual compared with tuned experts in ideal cars, on the figure eight",
+        {"figure-eight": "eight-ideal"},
         minutes=5.0,
     ),
     "on-ramp-trained": on_ramp_study({"ramp-long": "residual on the expert tuned with the larger budget"}),

@@ -39,7 +39,7 @@ IDEAL_CAVS: dict[str, Any] = {"scenario_options.actuator": NO_LATENCY}
 STUDY_ROADS: dict[str, dict[str, Any]] = {
     **{name: {"scenario": name, **IDEAL_CAVS} for name in ("ring", "ring-jammed", "figure-eight", "merge")},
     "on-ramp": {"scenario": "on-ramp", "scenario_options.penetration_rate": 0.05},
-    **{f"{name}-usual-car": {"scenario": name} for name in ("ring", "ring-jammed")},
+    **{f"{name}-usual-car": {"scenario": name} for name in ("ring", "ring-jammed", "figure-eight")},
     **{name: {"scenario": "ring"} for name in ("rings", "shared-rings", "all-roads")},
     "ring-11": {"scenario": "ring", "scenario_options.vehicles": 11, **IDEAL_CAVS},
     "ring-5": {"scenario": "ring", "scenario_options.vehicles": 5, **IDEAL_CAVS},

@@ -117,6 +117,7 @@ VARIANTS: dict[str, Variant] = {
     "ours-without-model": Variant("unjam residual without model", "quick", {"model.model_ratio": 0.0}),
     "best": Variant("unjam residual, all steps", "best", {}, None),
     "jammed-ideal": Variant("unjam residual, all steps", "best", JAMMED_IDEAL, None),
+    "eight-ideal": Variant("unjam residual, all steps", "best", {"backend": "sumo"}, None),
     **BEST_VARIANTS,
     **{
         f"best-road-model-{name}": replace(

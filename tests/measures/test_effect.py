@@ -130,7 +130,7 @@ def test_beneficial_effect_has_no_rejection_reasons() -> None:
         ({"feasibility": ""}, "infeasible: no CAV drove"),
         (
             {"hard_braking": between(-1, 9)},
-            "human drivers brake beyond 4.5 m/s² more often than in the human baseline: +4 [-1, +9] times "
+            "human drivers may brake beyond 4.5 m/s² more often than in the human baseline: +4 [-1, +9] times "
             "in a million vehicle-steps (the sign of the mean counts)",
         ),
     ],
