@@ -11,6 +11,7 @@ from unjam.measures.verdict import Verdict, short_table_metrics
 from unjam.reports.results import Results
 from unjam.reports.summary import (
     baseline_differences,
+    command_differences,
     common_baseline,
     csv_text,
     first_alternative,
@@ -290,6 +291,19 @@ def test_title_names_what_was_compared() -> None:
     assert report_title([trained_on_pi([1.0], [1.0])]) == "ring: a trained residual on pi"
     both = [drive_results(pi=rows_of([1.0])), drive_results(scenario="ring-warm", pi=rows_of([1.0]))]
     assert report_title(both) == "ring, ring-warm: comparison of 2 results"
+
+
+def test_a_comparison_names_the_options_in_which_the_commands_differ() -> None:
+    def result(name: str, *words: str) -> Results:
+        return Results(Path(name), {"manifest": {"command": ["unjam", "drive", "ring", *words]}}, {}, {})
+
+    first = result("a", "-d", "pi", "--length", "230", "--out", "a")
+    assert command_differences([first, result("b", "-d", "pi", "--length", "250", "--workers", "2")]) == [
+        ("a", "--length 230"),
+        ("b", "--length 250"),
+    ]
+    assert command_differences([first, result("b", "-d", "pi", "--length", "230", "-n", "2")])[0] == ("a", "")
+    assert command_differences([first, result("b", "-d", "pi", "--length", "230", "--out", "b")]) == []
 
 
 def test_title_without_an_expert_names_no_residual() -> None:

@@ -104,6 +104,7 @@ def render_report(results: Sequence[Results]) -> str:
         first_alternative=first if first in rows else "",
         findings=[(name, finding) for name, result in sources if (finding := summary.main_finding(result))],
         warning=summary.mismatch_warning(results),
+        command_differences=[] if single else summary.command_differences(results),
         notes=[(name, note) for name, result in sources for note in summary.report_notes(result)],
         cards=summary.key_figures(single) if single else [],
         figures={name: figures.data_uri(figure) for name, figure in _report_figures(sources, columns, panels).items()},

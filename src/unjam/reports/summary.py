@@ -1,5 +1,6 @@
 """Texts, key figures and tables of the report, from the results of one or several folders."""
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,10 +22,12 @@ from unjam.measures.statistics import (
     paired_difference,
 )
 from unjam.measures.verdict import Verdict, is_better, road_metrics, verdicts
-from unjam.reports.results import PlotEpisode, Results, kept_row
+from unjam.reports.results import PlotEpisode, Results, kept_row, original_command
 from unjam.text import format_count, printable
 
 CLOSE_TIME_GAP = 1.0  # time gap below which the report has a note [s]; the paper's h_max
+IRRELEVANT_OPTIONS = ("--out", "--workers", "--json", "--all")
+"""options of a command on which its results do not depend"""
 FORMULA_STARTS = {*"=+-@\t\r\n"}  # first letters of a cell that a spreadsheet takes for a formula
 MAX_LIMIT_RATIO = 1.01  # ratio of mean speed to the limit above which the report has a note
 COMPARED_METRICS = (
@@ -130,6 +133,26 @@ def mismatch_warning(results: Sequence[Results]) -> str:
         return ""
     listed = ", ".join(different)
     return f"These folders have different {listed}: differences between them are not effects of the drivers alone."
+
+
+def command_differences(results: Sequence[Results]) -> list[tuple[str, str]]:
+    """Return for each of several folders the options of the command that wrote it which not all of them have.
+
+    Empty where no command is known to differ, apart from the folder for its results and the number of workers.
+    """
+    commands = [_command_options(result) for result in results]
+    shared = set.intersection(*map(set, commands))
+    texts = ["; ".join(each for each in command if each not in shared) for command in commands]
+    return [*zip(folder_names(results), texts, strict=True)] if any(texts) else []
+
+
+def _command_options(result: Results) -> list[str]:
+    """Return the arguments of the command that wrote a folder, each option with its value."""
+    options = list[str]()
+    for word in shlex.split(original_command(result))[1:]:
+        is_value = options and options[-1].startswith("-") and " " not in options[-1] and not word.startswith("-")
+        options = [*options[:-1], f"{options[-1]} {word}"] if is_value else [*options, word]
+    return [each for each in options if not each.startswith(IRRELEVANT_OPTIONS)]
 
 
 def name_baselines(results: Sequence[Results]) -> str:
