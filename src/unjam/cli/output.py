@@ -75,7 +75,9 @@ def new_table(text_columns: Sequence[str] = (), number_columns: Sequence[str] = 
     return table
 
 
-def print_results(rows_by_driver: RowsByDriver, shows_all: bool, baseline: str = "") -> None:
+def print_results(
+    rows_by_driver: RowsByDriver, shows_all: bool, baseline: str = "", first_metrics: Sequence[str] = ()
+) -> None:
     """Print the verdicts on drivers and the metrics that matter on their road, or all metrics with differences."""
     for verdict in verdicts(rows_by_driver, baseline):
         for line in verdict.lines:
@@ -83,7 +85,7 @@ def print_results(rows_by_driver: RowsByDriver, shows_all: bool, baseline: str =
     if shows_all:
         print_metrics(rows_by_driver, choose_baseline(rows_by_driver, baseline))
     else:
-        print_metrics(rows_by_driver, "", short_table_metrics(rows_by_driver))
+        print_metrics(rows_by_driver, "", (*first_metrics, *short_table_metrics(rows_by_driver)))
         err_console.print("all metrics, with differences: --all")
 
 

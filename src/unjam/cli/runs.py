@@ -98,7 +98,7 @@ def evaluate_command(
         print_json({**facts, "drivers": drivers, "notes": results.metadata["notes"]})
         return
     output.print_wrapped(main_finding(results))
-    output.print_results(evaluation.rows, show_all)
+    output.print_results(evaluation.rows, show_all, first_metrics=["return"])
     output.print_notes(results.metadata["notes"])
     err_console.print(f"report: {page}")
 

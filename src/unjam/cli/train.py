@@ -104,7 +104,7 @@ def train_command(
             console.print(f"{name}:")
         results = read_results(road.folder)
         output.print_wrapped(main_finding(results))
-        output.print_results(road.rows, show_all)
+        output.print_results(road.rows, show_all, first_metrics=["return"])
         output.print_notes(results.metadata["notes"])
         err_console.print(f"controller: {road.controller}")
         steps = max(config.steps, results.progress[-1]["environment_steps"])
