@@ -21,7 +21,8 @@ REASONS = {
     "ring-jammed-best-ideal": "the controller of this name for ideal cars, the ablation",
     "ring-jammed-tuned": "the largest return of a formula in a developed wave",
     "ring-jammed-tuned-ideal": "the controller of this name for ideal cars, the ablation",
-    "figure-eight-best": "the fastest figure eight; trained for ideal cars",
+    "figure-eight-best": "the fastest figure eight",
+    "figure-eight-best-ideal": "the controller of this name for ideal cars, the ablation",
     "figure-eight-tuned": "the largest return of a formula by Eq. 16",
     "figure-eight-tuned-ideal": "the controller of this name for ideal cars, the ablation",
 }

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from unjam.scenarios import make_scenario
     from unjam.seeds import held_out_seeds
     from unjam.training.config import load_config
-    from unjam.training.evaluate import drive
+    from unjam.training.drive import drive
     from unjam.training.export import export_controller
     from unjam.training.learned_model import load_world_model
     from unjam.training.runs import list_runs

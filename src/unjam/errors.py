@@ -2,7 +2,7 @@
 
 import errno
 import shlex
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
@@ -102,6 +102,14 @@ def error_from_name(name: str, message: str) -> UnjamError:
     parents = UnjamError, InputError, EpisodeError
     classes = {error.__name__: error for parent in parents for error in parent.__subclasses__()}
     return classes.get(name, UnjamError)(message)
+
+
+def raise_failure(rows: Sequence[dict[str, Any]]) -> None:
+    """Raise the first failure among the rows of episodes, as the original kind of error."""
+    for row in rows:
+        if row["status"] == "failed":
+            seed = "" if row["error"] == InputError.__name__ else f" (seed {row['seed']})"
+            raise error_from_name(row["error"], f"{row['reason']}{seed}")
 
 
 def as_unjam_error(error: Exception) -> UnjamError:

@@ -4,6 +4,8 @@ An untrusted model is only data if it is pure arithmetic: ONNX has loops, functi
 tensors in external files. Therefore anything that is not listed here is refused, at any depth.
 """
 
+import logging
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -189,3 +191,17 @@ def _limit_memory() -> None:
     grow_as_requested = 1
     limits = runtime.OrtArenaCfg({"max_mem": MAX_RUN_BYTES, "arena_extend_strategy": grow_as_requested})
     runtime.create_and_register_allocator(memory, limits)
+
+
+@contextmanager
+def quiet_onnx_export() -> Iterator[None]:
+    """Silence what torch logs while it exports a graph: optional packages that it does not find."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            yield
+    finally:
+        logger.setLevel(level)

@@ -79,7 +79,7 @@ SINGLE_CONTROLLERS: dict[str, str] = {
     **{JAM_AHEAD_ON_ALL_LABEL: JAM_AHEAD_TUNED_ON_ALL, PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS},
 }
 """controllers for all roads: one expert, or one file with several"""
-CLOSED_ROAD_CONTROLLERS = ("unjam:ring-best-ideal", "unjam:ring-jammed-best-ideal", "unjam:figure-eight-best")
+CLOSED_ROAD_CONTROLLERS = ("unjam:ring-best-ideal", "unjam:ring-jammed-best-ideal", "unjam:figure-eight-best-ideal")
 MOTORWAY_CONTROLLERS = ("unjam:on-ramp-tuned",)
 """packaged controllers, each with the control step of its type of road"""
 FAMILY_DRIVERS: dict[str, str] = {

@@ -17,7 +17,8 @@ from unjam.measures.statistics import Estimate, format_difference
 from unjam.scenarios.motorway import ON_RAMP
 from unjam.scenarios.road import Connection
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
-from unjam.training.assess import Assessment, assess, make_request
+from unjam.training.assess import Assessment, assess
+from unjam.training.assessment_request import make_request
 from unjam.worlds.sumo.backend import sumo_inputs
 from unjam.worlds.sumo.networks import network_file, xml_element
 from unjam.worlds.worker_pool import WorkerPool

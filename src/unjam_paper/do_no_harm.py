@@ -15,6 +15,7 @@ import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
 from unjam.controller import make_driver
+from unjam.errors import raise_failure
 from unjam.measures.effect import FLOW_METRIC, HARD_BRAKING_METRIC, TIME_METRIC
 from unjam.measures.feasibility import overall_feasibility
 from unjam.measures.metric_table import HUMAN_LABEL
@@ -24,7 +25,6 @@ from unjam.reports.results import replace_null
 from unjam.scenarios import make_scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.seeds import held_out_seeds
-from unjam.training.evaluate import raise_failure
 from unjam.training.selection import ACC_DRIVER
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool

@@ -31,13 +31,13 @@ CONTROLLER_ROADS: dict[str, str] = {
     **{f"unjam:{name}": "ring" for name in ("ring-best-ideal", "ring-gap-tuned", "ring-tuned")},
     **{f"unjam:{name}": "ring" for name in ("rings-tuned", "shared-rings-tuned")},
     **{f"unjam:{name}-ideal": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
-    **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned-ideal")},
+    **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best-ideal", "figure-eight-tuned-ideal")},
 }
 """packaged controllers for closed roads that were tuned or trained for ideal cars, and the road of each"""
 USUAL_CAR_ROADS: dict[str, str] = {
     **{"unjam:ring-best": "ring", "unjam:ring-gap-tuned": "ring"},
     **{f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
-    "unjam:figure-eight-tuned": "figure-eight",
+    **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned")},
 }
 """those that are evaluated in usual cars"""
 LANE_CONTROLLERS = ("unjam:on-ramp-tuned",)

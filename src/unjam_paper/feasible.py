@@ -70,9 +70,12 @@ PACER_LONG_TUNED = (
 )
 """result of `unjam tune figure-eight --expert pacer --max-string-gain 0 --reward eq16 --steps 4860000`; both gaps
 have no effect with `use_tuned`. With 600,000 steps it is `unjam:figure-eight-tuned-ideal`"""
+PACER_USUAL_LONG_TUNED = (
+    "pacer:use_tuned=true,gathering_speed=2.126,gathering_gap=0.4935,regathering_gap=0.1352,time_constant=0.3639"
+)
+"""result of the same command for usual cars"""
 PACER_TUNED_LABEL, PACER_GENTLE_LABEL = "pacer, tuned", "pacer, tuned, gentle"
 PACER_LONG_LABEL = "pacer, tuned, training budget"
-PACER_IDEAL_LABEL = "pacer, tuned for ideal cars"
 PACER_GENTLE: str = preset_values("best", "figure-eight")["expert"]
 PACERS = {HUMAN_LABEL: "human", "pacer": "pacer", "varying pacer": "pacer:use_tuned=true"}
 FIGURE_EIGHT_RADII = (32, 33, 34, 35)
@@ -168,10 +171,10 @@ FEASIBLE_ROADS = {
         make_scenario=lambda radius: FigureEight(radius=(radius, radius)),
         drivers={
             **PACERS,
-            **{PACER_TUNED_LABEL: "unjam:figure-eight-tuned", PACER_GENTLE_LABEL: PACER_GENTLE},
-            PACER_IDEAL_LABEL: "unjam:figure-eight-tuned-ideal",
+            **{PACER_TUNED_LABEL: "unjam:figure-eight-tuned", PACER_LONG_LABEL: PACER_USUAL_LONG_TUNED},
+            **{PACER_GENTLE_LABEL: PACER_GENTLE, IDEAL_RESIDUAL_LABEL: "unjam:figure-eight-best-ideal"},
         },
-        baselines=(PACER_TUNED_LABEL, PACER_GENTLE_LABEL, PACER_IDEAL_LABEL),
+        baselines=(PACER_TUNED_LABEL, PACER_LONG_LABEL, PACER_GENTLE_LABEL),
         metric="return_eq16",
         gain_road="figure-eight",
     ),

@@ -31,7 +31,7 @@ EMISSION_CLASSES = {"HBEFA4": "HBEFA4/PC_petrol_Euro-6ab", "PHEMlight": "PHEMlig
 FUEL_DRIVERS: dict[str, tuple[str, ...]] = {
     "ring": (HUMAN_LABEL, "pi", "unjam:best", "unjam:ring-best-ideal"),
     "ring-jammed": (HUMAN_LABEL, "pi", "unjam:best", "unjam:ring-jammed-best-ideal"),
-    "figure-eight": (HUMAN_LABEL, "pi", "unjam:best", "unjam:figure-eight-best"),
+    "figure-eight": (HUMAN_LABEL, "pi", "unjam:best", "unjam:figure-eight-best-ideal"),
 }
 FUEL_SEEDS, SECONDS_PER_HOUR = 20, 3600.0
 IDLE_SPEED = 0.001

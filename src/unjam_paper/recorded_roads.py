@@ -25,7 +25,7 @@ from unjam.drivers.onnx_policy import OnnxDriver
 from unjam.drivers.policy import PolicyDescription, PolicyInput
 from unjam.drivers.safety import Actuator, SafetyFilter
 from unjam.drivers.smooth_acc import SmoothACC
-from unjam.errors import InputError
+from unjam.errors import InputError, raise_failure
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import METRICS, measure
@@ -35,7 +35,6 @@ from unjam.physics.arrays import Array, Floats
 from unjam.scenarios import Recorded
 from unjam.scenarios.road import RecordedRoad
 from unjam.scenarios.scenario import VEHICLE_LENGTH
-from unjam.training.evaluate import raise_failure
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import EpisodeTask

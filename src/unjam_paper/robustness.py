@@ -60,7 +60,7 @@ ROAD_CONDITIONS: dict[str, dict[str, dict[str, Any]]] = {
 ROAD_CONTROLLERS = {
     "ring": ("unjam:ring-best-ideal", "unjam:ring-gap-tuned"),
     "ring-jammed": ("unjam:ring-jammed-best-ideal", "unjam:ring-jammed-tuned-ideal"),
-    "figure-eight": ("unjam:figure-eight-best", "unjam:figure-eight-tuned-ideal"),
+    "figure-eight": ("unjam:figure-eight-best-ideal", "unjam:figure-eight-tuned-ideal"),
 }
 """packaged controller of a road and its best tuned expert"""
 VOLUME_ROADS = ("ring-5", "ring-11", "ring")

@@ -49,7 +49,7 @@ GAIN_LIMITS = {"ring": (1.02, 0.0, 1.1, 1.3), "ring-jammed": (1.02, 0.0, 1.1, 1.
 PACKAGED = {
     "ring": ("ring-tuned", "ring-gap-tuned", "rings-tuned", "shared-rings-tuned", "ring-best-ideal", "ring-best"),
     "ring-jammed": ("ring-jammed-tuned-ideal", "ring-jammed-best-ideal", "ring-jammed-tuned", "ring-jammed-best"),
-    "figure-eight": ("figure-eight-tuned-ideal", "figure-eight-best", "figure-eight-tuned"),
+    "figure-eight": ("figure-eight-tuned-ideal", "figure-eight-best-ideal", "figure-eight-tuned", "figure-eight-best"),
 }
 """packaged controllers, by the road on which they are compared"""
 EXPERT_COLUMNS = "largest gain allowed", "string gain", "set time gap [s]"

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
+from unjam.errors import raise_failure
 from unjam.files import atomic_write, make_folder
 from unjam.manifest import manifest, without_folders
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
@@ -26,7 +27,7 @@ from unjam.road_family import NO_LATENCY
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig, load_config
-from unjam.training.evaluate import TRAINED_LABEL, evaluate, raise_failure, raise_failures
+from unjam.training.evaluate import TRAINED_LABEL, evaluate, raise_failures
 from unjam.training.run_folder import read_config
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.record import Episode, Floats

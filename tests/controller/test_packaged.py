@@ -27,7 +27,7 @@ from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 
-IDEAL_BEST = ("ring-best-ideal", "ring-jammed-best-ideal")
+IDEAL_BEST = ("ring-best-ideal", "ring-jammed-best-ideal", "figure-eight-best-ideal")
 """controllers that were trained for vehicles that obey at once"""
 SINGLE_ROADS = ("ring-best", "ring-jammed-best", "figure-eight-best", *IDEAL_BEST)
 """controllers that are verified in make test-all alone, as each takes seconds"""
@@ -52,7 +52,9 @@ def test_there_is_one_for_each_preset_that_is_known_to_reach_furthest() -> None:
 
 @pytest.mark.parametrize("name", ["nothing", "", "../ring-best", "ring-best.unjam"])
 def test_another_name_lists_those_that_there_are(name: str) -> None:
-    with pytest.raises(InputError, match="allowed: unjam:best, unjam:figure-eight-best, unjam:figure-eight-tuned, "):
+    with pytest.raises(
+        InputError, match="allowed: unjam:best, unjam:figure-eight-best, unjam:figure-eight-best-ideal"
+    ):
         make_driver(f"{PACKAGED_PREFIX}{name}", 0.1)
 
 

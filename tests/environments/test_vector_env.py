@@ -228,6 +228,13 @@ def test_tensors_are_what_arrays_are(name: str) -> None:
         assert all(isinstance(values, torch.Tensor) for values in tensor_info["reward_terms"].values())
 
 
+def test_a_reward_in_numpy_is_refused_where_results_are_tensors() -> None:
+    environment = RoadVectorEnv(2, device="cpu", reward=lambda outcome: np.zeros(2))
+    environment.reset(seed=0)
+    with pytest.raises(InputError, match=r"a ndarray is not allowed for the term 'reward'; allowed: a tensor"):
+        environment.step(torch.zeros(2, 1))
+
+
 def test_gradients_flow_through_tensors_of_many_steps() -> None:
     def total_reward(actions: torch.Tensor) -> torch.Tensor:
         environment.reset(seed=0)

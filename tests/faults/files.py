@@ -35,7 +35,7 @@ from unjam.controller.verify import verify_controller_file
 from unjam.errors import DiskError, InputError
 from unjam.reports.html import write_report_page
 from unjam.training.config import load_config, to_toml
-from unjam.training.evaluate import drive
+from unjam.training.drive import drive
 from unjam.training.run_folder import load_checkpoint, save_checkpoint
 from unjam.training.runs import list_runs
 

@@ -217,6 +217,12 @@ def test_rings_with_a_noise_generator_have_a_warm_up_too() -> None:
     assert rings.step(driver.act(rings.local_state(), memory)[0]).shape == (2,)
 
 
+def test_a_reward_in_numpy_is_refused() -> None:
+    rings = DifferentiableRings("ring", [0], reward=lambda outcome: np.zeros(1))
+    with pytest.raises(InputError, match=r"a ndarray is not allowed for the term 'reward'; allowed: a tensor"):
+        rings.step(torch.zeros(1))
+
+
 def test_a_ring_counts_until_its_collision() -> None:
     road = replace(SMALL, safety=SafetyFilter(active=False), actuation="raw", horizon=400)
     rings = DifferentiableRings(road, [0, 1], reward="eq16")

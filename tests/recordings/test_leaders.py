@@ -103,6 +103,8 @@ def test_other_steps_are_interpolated(tmp_path: Path) -> None:
         ({"time": 1000.0 * TIMES, "speed": SPEEDS}, "time: steps of 100 s are not allowed; .* in seconds"),
         ({"time": TIMES, "speed": np.where(TIMES == 3.0, np.nan, SPEEDS)}, "line 32: speed: nan is not allowed"),
         ({"time": TIMES[:50], "speed": SPEEDS[:50]}, "no trajectory lasts 20 s"),
+        ({"time": TIMES[:0], "speed": SPEEDS[:0]}, "drive.csv: speed: there are no numbers"),
+        ({"time": TIMES, "speed": np.full(len(TIMES), np.nan)}, "drive.csv: speed: there are no numbers"),
     ],
 )
 def test_other_files_are_refused_in_one_line(tmp_path: Path, columns: dict[str, object], reason: str) -> None:

@@ -576,6 +576,16 @@ def test_reused_vehicle_number_is_another_driver(tmp_path: Path) -> None:
     assert sorted(each.driver for each in result) == ["i-80-8", "i-80-8-2"]
 
 
+def test_a_change_of_the_kind_within_a_pair_ends_a_trajectory(tmp_path: Path) -> None:
+    kinds = np.where(np.arange(2 * SAMPLES) < SAMPLES // 2, "ACC", "human")
+    read = read_trajectories(write_table_file(tmp_path / "table.csv", kind=kinds), SHORT)
+    assert [(each.kind, len(each.speed)) for each in read.trajectories] == [
+        ("ACC", SAMPLES // 2),
+        ("human", SAMPLES // 2),
+        ("human", SAMPLES),
+    ]
+
+
 def test_pair_without_driver_name_is_its_own_driver(tmp_path: Path) -> None:
     drivers = ["anna"] * SAMPLES + [None] * SAMPLES
     result = read_trajectories(write_table_file(tmp_path / "data.csv", driver=drivers, kind=None), options=SHORT)

@@ -21,7 +21,7 @@ from unjam.reports.results import (
     unpack_episode,
 )
 from unjam.scenarios import Ring, make_scenario
-from unjam.training.evaluate import DriveResult
+from unjam.training.drive import DriveResult
 from unjam.worlds.episode import run_episode
 
 ROAD = {"length": (120, 120), "vehicles": 8, "horizon": 150}

@@ -18,17 +18,8 @@ from unjam.errors import InputError, UnjamError
 from unjam.measures.metrics import METRICS
 from unjam.reports.assessment import render_assessment
 from unjam.reports.results import read_results, read_rows
-from unjam.training.assess import (
-    DEFAULT_CONTROLLERS,
-    SELECTION_FOLDER,
-    Assessment,
-    AssessmentRequest,
-    assess,
-    budget_lines,
-    make_request,
-    missing_budget,
-    sensing_notes,
-)
+from unjam.training.assess import SELECTION_FOLDER, Assessment, assess, budget_lines, missing_budget, sensing_notes
+from unjam.training.assessment_request import DEFAULT_CONTROLLERS, AssessmentRequest, make_request
 from unjam.training.episode_log import EPISODES_FILE, EpisodeLog
 from unjam.training.selection import (
     ACC_DRIVER,
@@ -249,6 +240,43 @@ def test_an_interrupted_assessment_resumes_with_the_same_result_on_any_number_of
 
 
 @pytest.mark.long
+def test_each_finished_episode_is_stored_and_each_round_leaves_an_answer(file: str, tmp_path: Path) -> None:
+    request, folder = make_request(file, [0.5], 22, 0.02, None, ["acc"], HELD), tmp_path / "out"
+    ended, messages = set[Any](), list[str]()
+
+    def interrupt_in_the_second_round(episode: Any, steps: int) -> None:
+        if steps == request.network.horizon:
+            ended.add(episode)
+        if len(ended) == 1 + 9 + 3:  # the baseline's picture, three test seeds of three options, and three episodes
+            raise KeyboardInterrupt
+
+    with WorkerPool(1) as workers, pytest.raises(KeyboardInterrupt):
+        assess(request, folder, workers, interrupt_in_the_second_round, messages.append)
+    assert len((folder / EPISODES_FILE).read_text().splitlines()) in (11, 12)
+    assert f"the answer so far is in {folder / 'assessment.html'}" in messages
+    assert not json.loads((folder / "assessment.json").read_text())["is_complete"]
+    assert "This is the answer so far" in (folder / "assessment.html").read_text()
+    steps = list[int]()
+    with WorkerPool(1) as workers:
+        finished = assess(request, folder, workers, on_stage=lambda _, count: steps.append(count))
+    assert finished.document["is_complete"]
+    assert "This is the answer so far" not in finished.page.read_text()
+    tested = 3 * finished.document["seeds"]["test"]
+    assert sum(steps) in [(2 + tested - stored) * request.network.horizon for stored in (11, 12)]
+
+
+@pytest.mark.long
+def test_no_seed_begins_that_does_not_fit_into_the_time(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(EpisodeBudget, "affordable_seeds", lambda *_: 10)
+    request = make_request(file, [0.5], 100, 0.02, 1e-3, ["acc"], HELD)
+    with WorkerPool(1) as workers:
+        found = assess(request, tmp_path / "out", workers)
+    assert found.document["seeds"]["test"] == 3, "the fewest of an answer"
+
+
+@pytest.mark.long
 def test_an_assessment_continues_with_other_controllers_and_more_episodes(file: str, tmp_path: Path) -> None:
     folder, stages = tmp_path / "out", list[str]()
     with WorkerPool(2) as workers:
@@ -295,7 +323,8 @@ def test_failed_episodes_are_tried_again(example_request: AssessmentRequest, tmp
         {**row, "status": "failed", "error": "NoCavError"},
     ]
     first = EpisodeLog(tmp_path / "out", example_request.network)
-    first.add("setup", [(1,), (2,), (3,)], rows)
+    for number, each in enumerate(rows, 1):
+        first.add("setup", (number,), each)
     assert len(first.episodes) == 3
     assert [*EpisodeLog(tmp_path / "out", example_request.network).episodes] == [("setup", (1,)), ("setup", (3,))]
 

@@ -11,11 +11,12 @@ from tests.training.test_run import small_config
 from tests.worlds.sumo.user_networks import straight
 from unjam.errors import InputError
 from unjam.scenarios import make_scenario
-from unjam.training.assess import assess, make_request
+from unjam.training.assess import assess
+from unjam.training.assessment_request import make_request
 from unjam.training.calibrate import FACTOR_RANGES, calibrate, load_corridor
-from unjam.training.evaluate import drive
+from unjam.training.drive import drive
 from unjam.training.search_space import SearchSpace
-from unjam.training.train import train
+from unjam.training.train import Trainer, train, train_in_process
 from unjam.training.tune import tune
 from unjam.worlds.sumo.detectors import DetectorPool
 from unjam.worlds.worker_pool import WorkerPool
@@ -72,6 +73,25 @@ def test_command_goes_on_if_the_content_is_the_same(tmp_path: Path) -> None:
     file = straight(tmp_path, FLOW, length=200.0, end=30.0)
     run_drive(str(file), tmp_path / "out", file.touch)
     assert (tmp_path / "out" / "evaluation.json").is_file()
+
+
+@pytest.mark.long
+def test_a_training_is_not_evaluated_on_files_that_changed_after_its_last_iteration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, learn = straight(tmp_path, FLOW), Trainer.train
+
+    def learn_and_change(trainer: Trainer) -> None:
+        learn(trainer)
+        demand = tmp_path / "demand.rou.xml"
+        demand.write_text(demand.read_text() + " ")
+
+    monkeypatch.setattr(Trainer, "train", learn_and_change)
+    options = {**HELD, "penetration_rate": 1.0, "horizon": 100}
+    config = small_config(scenario=str(file), scenario_options=options, model__model_ratio=0.0)
+    with pytest.raises(InputError, match=r"^demand\.rou\.xml: has changed since the start"):
+        train_in_process(config, tmp_path / "out")
+    assert not (tmp_path / "out" / "evaluation.json").exists()
 
 
 def test_command_ends_if_a_recording_is_added(tmp_path: Path) -> None:

@@ -19,7 +19,8 @@ from unjam.measures.metrics import METRICS, measure
 from unjam.reports.results import read_results
 from unjam.scenarios import Ring
 from unjam.seeds import held_out_seeds
-from unjam.training.evaluate import DriveResult, drive, raise_failures
+from unjam.training.drive import DriveResult, drive
+from unjam.training.evaluate import raise_failures
 from unjam.worlds.episode import run_episode
 
 ROAD: dict[str, Any] = {"length": (120, 130), "vehicles": 8, "horizon": 60}

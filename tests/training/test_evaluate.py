@@ -10,12 +10,12 @@ import pytest
 
 from unjam.drivers import IDM, Driver, PISaturation
 from unjam.drivers.user_driver import FileDriver
-from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, UnjamError
+from unjam.errors import DiskError, EpisodeError, InputError, MissingPartError, UnjamError, raise_failure
 from unjam.measures.metrics import METRICS
 from unjam.reports.results import read_results
 from unjam.scenarios import Ring
 from unjam.seeds import TUNING_SEED, VALIDATION_SEED, held_out_seeds, tuning_seeds
-from unjam.training.evaluate import Evaluation, evaluate, raise_failure, save_evaluation
+from unjam.training.evaluate import Evaluation, evaluate, save_evaluation
 from unjam.worlds.episode import run_episode
 from unjam.worlds.worker_pool import WorkerPool
 

@@ -23,6 +23,7 @@ from unjam.training.run_folder import (
     fingerprint,
     read_config,
     restore_newest_checkpoint,
+    resume_run_folder,
     save_checkpoint,
 )
 
@@ -112,11 +113,27 @@ def test_changed_files_of_a_training_are_refused(make: Callable[[Path], RunConfi
 def test_changed_settings_of_a_training_are_refused_by_commands_that_read_the_run(tmp_path: Path) -> None:
     config, run = small_config(), tmp_path / "run"
     changed = small_config(scenario_options={**config.scenario_options, "horizon": 300})
+    added = small_config(scenario_options={**config.scenario_options, "noise": 0.1})
+    removed = small_config(scenario_options={"horizon": config.scenario_options["horizon"]})
     with_checkpoint(run, config)
     for command in ("evaluate", "export", "model"):
         check_run_files(run, small_config(evaluation__episodes=3), command)
         with pytest.raises(InputError, match=rf"^{command}: scenario_options\.horizon: 300 .*; allowed: 100"):
             check_run_files(run, changed, command)
+        with pytest.raises(InputError, match=rf"^{command}: scenario_options\.noise: 0\.1 .*; allowed: 'absent'"):
+            check_run_files(run, added, command)
+        with pytest.raises(InputError, match=rf"^{command}: scenario_options\.\w+: 'absent' is not allowed"):
+            check_run_files(run, removed, command)
+
+
+def test_a_refused_resumption_changes_nothing(tmp_path: Path) -> None:
+    config, run = of_network(tmp_path), tmp_path / "run"
+    with_checkpoint(run, config)
+    (tmp_path / "demand.rou.xml").write_text((tmp_path / "demand.rou.xml").read_text() + " ")
+    before = (run / "config.toml").read_bytes()
+    with pytest.raises(InputError, match=r"demand\.rou\.xml has changed since the checkpoint"):
+        resume_run_folder(run, replace(config, steps=9 * config.steps))
+    assert (run / "config.toml").read_bytes() == before
 
 
 def test_changed_settings_of_a_task_are_refused_by_commands_that_read_its_folder(tmp_path: Path) -> None:

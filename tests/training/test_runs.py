@@ -7,9 +7,10 @@ import tomli_w
 
 import unjam
 from unjam.errors import InputError
-from unjam.files import append_line, to_json
+from unjam.files import append_line, sha256_of, to_json
 from unjam.measures.metrics import METRICS
 from unjam.processes import lock_folder
+from unjam.reports.results import CONTROLLER_FILE
 from unjam.training.config import RunConfig, load_config
 from unjam.training.run_folder import create_run_folder
 from unjam.training.runs import config_differences, read_run, remove_run
@@ -56,6 +57,16 @@ def test_runs_are_listed_with_state_and_steps(under: Path) -> None:
     assert gain.mean == pytest.approx(7.0)
     assert found["deep/ring-002"].gains == {"": None}
     assert [run.name for run in unjam.list_runs(under, "merge")] == ["merge-001"]
+
+
+def test_an_evaluation_of_an_earlier_controller_does_not_count(under: Path) -> None:
+    folder = under / "ring-001"
+    (folder / CONTROLLER_FILE).write_bytes(b"newer")
+    about = json.loads((folder / "evaluation.json").read_text())
+    for content, state in ((b"newer", "finished"), (b"older", "stopped")):
+        (folder / "evaluation.json").write_text(json.dumps(about | {"controllers": {"trained": sha256_of(content)}}))
+        (found,) = (run for run in unjam.list_runs(under) if run.name == "ring-001")
+        assert (found.state, found.gains[""] is None) == (state, state == "stopped")
 
 
 @pytest.mark.parametrize("key", ["scenario", "tasks"])

@@ -1,9 +1,6 @@
 """Write a network of torch as an ONNX file that describes its inputs and its output."""
 
-import logging
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +12,7 @@ from unjam.drivers.observation import PolicyInput
 from unjam.drivers.policy import PolicyOutput
 from unjam.errors import import_optional, invalid_value
 from unjam.files import atomic_write, check_parent_folder
+from unjam.onnx_models import quiet_onnx_export
 
 if TYPE_CHECKING:
     from torch import nn
@@ -48,7 +46,7 @@ def write_onnx_policy(
     check_parent_folder(path)
     observations, rows = torch.zeros(2, len(inputs)), torch.export.Dim("rows")
     was_training = network.training
-    with torch.no_grad(), _quiet_export():
+    with torch.no_grad(), quiet_onnx_export():
         program = torch.onnx.export(network.eval(), (observations,), dynamic_shapes=({0: rows},), verbose=False)
     network.train(was_training)
     from onnx_ir.passes import common
@@ -63,16 +61,3 @@ def write_onnx_policy(
 
 def _as_table(value: PolicyInput | PolicyOutput) -> dict[str, Any]:
     return {name: each for name, each in asdict(value).items() if each is not None}
-
-
-@contextmanager
-def _quiet_export() -> Iterator[None]:
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)
-            yield
-    finally:
-        logger.setLevel(level)

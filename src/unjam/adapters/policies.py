@@ -68,7 +68,8 @@ def policy_driver(
     inner, features = Constant() if expert is None else as_driver(expert, time_step), as_features(inputs)
     described = observation_size(features, inner)
     if size not in (None, described):
-        raise InputError(f"inputs: {described} numbers are not allowed; allowed: {size}, the inputs of {label}")
+        allowed = f"{size}, the inputs of {label}; a Python file that calls policy_driver can name its features"
+        raise InputError(f"inputs: {described} numbers are not allowed; allowed: {allowed}")
     description = PolicyDescription(features, output, policy_time_step)
     driver = kind(lambda rows, memory: (function(rows), memory), label, description, inner, time_step)
     driver.evaluate(np.zeros((2, described)), {})

@@ -27,7 +27,7 @@ from unjam.controller.file import read_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable, user_code_recipes
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, invalid_value, unknown_name
+from unjam.errors import InputError, invalid_value, raise_failure, unknown_name
 from unjam.files import make_folder, sha256_of, sha256_of_file, to_json
 from unjam.manifest import manifest, without_folders
 from unjam.measures.gain import EpisodeRows
@@ -39,7 +39,6 @@ from unjam.road_family import FAMILY_PREFIX
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.text import format_count, one_line
-from unjam.training.evaluate import raise_failure
 from unjam.worlds.backend import BackendLike, check_support, open_backend
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.batch.support import unsupported_reason
@@ -126,7 +125,7 @@ def benchmark(
             if path is not None:
                 write_result(path, result)
             row = result.road_rows()[len(result.roads) - 1]
-            progress(f"{number} of {len(scenarios)}: {name}: gain {row['gain']:.2f}, {row['feasible']}")
+            progress(f"{number} of {len(chosen)}: {name}: gain {row['gain']:.2f}, {row['feasible']}")
     return result
 
 

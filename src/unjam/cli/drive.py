@@ -13,7 +13,7 @@ from unjam.cli.output import console, err_console, print_json
 from unjam.controller import make_driver
 from unjam.controller.domain import controller_notes
 from unjam.drivers.driver import Driver
-from unjam.errors import InputError, MissingPartError, invalid_value
+from unjam.errors import InputError, MissingPartError, invalid_value, raise_failure
 from unjam.files import check_parent_folder
 from unjam.measures.metrics import measure
 from unjam.measures.notes import episode_notes
@@ -22,7 +22,8 @@ from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.text import format_duration
-from unjam.training.evaluate import drive, raise_failure, raise_failures
+from unjam.training.drive import drive
+from unjam.training.evaluate import raise_failures
 from unjam.training.run_folder import lock_new_folder
 from unjam.training.trial_log import REQUEST_FILE
 from unjam.worlds.backend import backend_notes, check_support, open_backend
@@ -220,7 +221,8 @@ def assess_command(
     - unjam assess my.sumocfg -d runs/my-001 --penetration-rates 0.1 --begin 28800 --end 32400 --json
     """
     from unjam.reports.assessment import OPTION_HEADINGS, option_rows, parse_assessment
-    from unjam.training.assess import DEFAULT_CONTROLLERS, assess, make_request
+    from unjam.training.assess import assess
+    from unjam.training.assessment_request import DEFAULT_CONTROLLERS, make_request
 
     drivers, changes = driver or DEFAULT_CONTROLLERS, opt.merge_settings(changes, opt.parse_settings(settings))
     request = make_request(scenario, _parse_rates(penetration_rates), episodes, precision, minutes, drivers, changes)

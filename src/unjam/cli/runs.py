@@ -17,7 +17,7 @@ from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, resume_hint
 from unjam.measures.statistics import format_difference
 from unjam.processes import check_not_locked, continue_in_limited_child, lock_folder
-from unjam.reports.results import read_progress, read_results
+from unjam.reports.results import CONTROLLER_FILE, read_progress, read_results
 from unjam.text import printable
 from unjam.training.evaluate import evaluate_run, evaluation_steps, gain_over_expert
 from unjam.training.run_folder import check_run_files, lock_new_folder, read_config
@@ -75,7 +75,7 @@ def evaluate_command(
     config = replace(config, scenario_options=options, evaluation=evaluation)
     if config.tasks:
         raise InputError(f"run: {str(run)!r} has several roads; allowed: the folder of one of them")
-    if not (run / "controller.unjam").is_file():
+    if not (run / CONTROLLER_FILE).is_file():
         raise InputError(f"run: {str(run)!r} has no controller yet{resume_hint(run)}")
     scenario = config.make_scenario()
     for name in driver or []:

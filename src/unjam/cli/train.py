@@ -16,7 +16,7 @@ from unjam.measures.notes import episode_notes
 from unjam.reports.results import read_progress, read_results
 from unjam.text import format_count, format_duration
 from unjam.training.config import RunConfig, load_config, planned_steps
-from unjam.training.evaluate import Evaluation, evaluation_steps
+from unjam.training.evaluate import Evaluation, duration_note, evaluation_steps
 from unjam.training.run_folder import check_config, lock_new_folder, make_new_folder, read_config, removing_if_empty
 from unjam.training.trial_log import REQUEST_FILE
 
@@ -180,7 +180,8 @@ def _plan_text(config: "RunConfig") -> str:
     policy = f"{config.agent} without an expert" if config.expert == "none" else f"{config.agent} on {config.expert}"
     ratio = config.model.model_ratio
     model = f"{ratio:g} steps of the learned model for each of them" if ratio else "without a learned model"
-    return f"{policy}: {roads}, {config.steps:,} environment steps, {model}"
+    durations = "; ".join(dict.fromkeys(filter(None, map(duration_note, tasks))))
+    return f"{policy}: {roads}, {config.steps:,} environment steps, {model}{durations and f', {durations}'}"
 
 
 def _worst_road_text(roads: dict[str, dict[str, Any]]) -> str:

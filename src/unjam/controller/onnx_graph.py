@@ -18,7 +18,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState, state_of_ones
 from unjam.drivers.speed_history import CircularWindow
 from unjam.errors import InputError, import_optional
-from unjam.onnx_models import parse_model
+from unjam.onnx_models import parse_model, quiet_onnx_export
 from unjam.tree import leaves, replace_leaves
 
 
@@ -82,7 +82,7 @@ def onnx_graph(driver: Driver, action_limit: float) -> bytes:
     rows = torch.export.Dim("cavs")
     options |= {"dynamic_shapes": (tuple({0: rows} for _ in arrays),), "opset_version": ONNX_OPSET}
     module = ControllerModule(driver, action_limit).eval()
-    with torch.no_grad():
+    with torch.no_grad(), quiet_onnx_export():
         program: Any = torch.onnx.export(module, tuple(arrays), dynamo=True, optimize=False, verbose=False, **options)
     _simplify(program.model)
     proto = program.model_proto

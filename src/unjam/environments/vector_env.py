@@ -34,7 +34,7 @@ from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.batch.support import required_batch_kind, statistically_unsupported_reason
 from unjam.worlds.episode import as_seed
-from unjam.worlds.reward import Outcome, RewardLike, validate_reward_terms
+from unjam.worlds.reward import Outcome, RewardLike, check_tensor_terms, validate_reward_terms
 
 EXPERT_CHECK_STEPS = 3  # random steps in which an expert must drive each row by itself, without a state of its own
 MAX_ENVIRONMENTS = 1_000_000  # maximum number of environments, of which each takes 2 kB or more
@@ -353,6 +353,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         if self._road.has_user_reward:  # it may write into the arrays
             outcome = Outcome(*map(copy_array, outcome))
         terms = reward(outcome)
+        if not self._is_numpy:
+            check_tensor_terms(reward, terms)
         is_valid = all(getattr(values, "shape", None) == (self.num_envs,) for values in terms.values())
         if is_valid and (not self._is_numpy or np.isfinite(sum(terms.values())).all()):
             return terms

@@ -4,6 +4,7 @@ import re
 from collections import Counter
 
 from unjam.errors import InputError
+from unjam.measures.effect import FLOW_METRIC
 from unjam.measures.feasibility import EpisodeRows, RowsByDriver
 from unjam.measures.statistics import count_teleports, has_ended_early
 from unjam.text import format_count
@@ -22,7 +23,7 @@ LOST_DEMAND_PATTERN = re.compile(
 def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return all notes on the episodes of several drivers, the most serious first."""
     lost, others = warning_notes(rows_by_driver)
-    traffic = early_end_notes, _backlog_notes, _unfinished_trip_notes, _entrance_notes
+    traffic = early_end_notes, _backlog_notes, _unfinished_trip_notes, _entrance_notes, _flow_notes
     notes = (note(rows_by_driver) for note in (*traffic, teleport_notes, _repeated_drive_notes))
     return [*lost, *(each for group in notes for each in group), *others]
 
@@ -117,6 +118,16 @@ def _entrance_notes(rows_by_driver: RowsByDriver) -> list[str]:
         "as fast as is safe, if the entrance has the capacity for the demand"
         for edge, each in slow.items()
     ]
+
+
+def _flow_notes(rows_by_driver: RowsByDriver) -> list[str]:
+    """Return a note if flow is the demand with every driver, since all vehicles arrive before the end."""
+    all_rows = [rows for rows in rows_by_driver.values() if rows]
+    flows = {tuple(row.get(FLOW_METRIC) for row in rows if row["status"] == "completed") for rows in all_rows}
+    have_arrived = all(row.get("unfinished_trips", 1) == 0 for rows in all_rows for row in rows)
+    if len(all_rows) < 2 or len(flows) > 1 or not have_arrived:
+        return []
+    return ["flow: that of the demand with all drivers, since all vehicles arrive before the end: it says nothing here"]
 
 
 def warning_notes(rows_by_driver: RowsByDriver) -> tuple[list[str], list[str]]:

@@ -159,12 +159,17 @@ class ControllerResult:
         """What is not yet known: the comparison that is worse so far, or has an interval with zero, as a clause."""
         comparisons = (self.difference_to_acc, ACC_BASELINE), (self.effect.travel_time, "the human baseline")
         change, baseline = max(
-            comparisons, key=lambda each: (each[0].mean >= 0, each[0].low <= 0 <= each[0].high, each[0].half_width)
+            comparisons,
+            key=lambda each: (
+                *(each[0].low > 0, each[0].mean >= 0, each[0].low <= 0 <= each[0].high),
+                each[0].half_width,
+            ),
         )
         seeds = f"with {format_count(change.count, 'test seed')}"
         if change.count < MIN_VERDICT_SEEDS:
             seeds += f", where a verdict needs {MIN_VERDICT_SEEDS}"
-        return f"{seeds}, the difference of travel time to {baseline} is {format_seconds(change)}"
+        so_far = ", so far longer" if change.low > 0 else ""
+        return f"{seeds}, the difference of travel time to {baseline} is {format_seconds(change)}{so_far}"
 
     @property
     def summary(self) -> str:

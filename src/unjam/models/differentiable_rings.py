@@ -22,7 +22,7 @@ from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import initial_batch_memory, warm_up_states
 from unjam.worlds.batch.support import unsupported_reason
 from unjam.worlds.episode import as_seed
-from unjam.worlds.reward import RewardLike, make_reward
+from unjam.worlds.reward import RewardLike, check_tensor_terms, make_reward
 
 
 class DifferentiableRings(RingBatch):
@@ -143,6 +143,7 @@ class DifferentiableRings(RingBatch):
         was_running = self._is_running
         self.advance(Command(self._as_tensor("step: acceleration", acceleration, (self.cav_count,))))
         terms = self._reward(self.last_outcome())
+        check_tensor_terms(self._reward, terms)
         self.reward_terms = {name: values * was_running for name, values in terms.items()}
         return torch.stack([*self.reward_terms.values()]).sum(0)
 

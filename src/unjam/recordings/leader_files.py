@@ -59,6 +59,8 @@ def _read_leaders(path: Path, stamp: tuple[int, int]) -> tuple[LeaderRecording, 
         read = loaders.trajectories_of_table(frame, path, options)
     else:
         table = _follower_table(frame, columns[0], path.stem)
+        if not bool(table["speed"].notna().to_numpy().any()):
+            raise InputError(f"{path.name}: {columns[0]}: there are no numbers")
         fastest = float(np.nanmax(table["speed"].to_numpy(np.float64)))
         if loaders.alphanumeric(columns[0]) == "speed" and fastest > MAX_SPEED_WITHOUT_UNIT:
             allowed = f"<= {MAX_SPEED_WITHOUT_UNIT:g} m/s without a unit; {UNIT_HINT}"

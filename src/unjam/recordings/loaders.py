@@ -312,7 +312,7 @@ def split_trajectories(
     intervals = [np.diff(rows["time"].to_numpy(np.float64)) for rows in groups]
     has_missing = [each > MISSING_ROW_INTERVAL * np.median(each) for each in intervals]
     parts = [*zip(groups, intervals, has_missing, strict=True)]
-    has_jump = [_find_jumps(rows, each) & ~missing for rows, each, missing in parts]
+    has_jump = [(_find_jumps(rows, each) | _find_other_facts(rows)) & ~missing for rows, each, missing in parts]
     regular = [each[~missing] for _, each, missing in parts]
     steps = _common_time_steps([float(each.mean()) for each in regular], [float(each.sum()) for each in regular])
     trajectories, part_counts, short_count, longest = list[FollowingTrajectory](), Counter[str](), len(good), 0.0
@@ -343,6 +343,13 @@ def split_trajectories(
     reasons = {**skipped_rows, f"trajectories shorter than {limit}": short_count}
     jump_count = int(sum(each.sum() for each in has_jump))
     return ReadResult(trajectories, len(frame) + sum(skipped_rows.values()), bad_rows, reasons, jump_count)
+
+
+def _find_other_facts(rows: pd.DataFrame) -> NDArray[np.bool_]:
+    """Return after which rows the driver, kind or split changes."""
+    facts = [rows[name].fillna("").to_numpy() for name in OPTIONAL_COLUMNS if name in rows]
+    changes = [each[1:] != each[:-1] for each in facts]
+    return np.logical_or.reduce(changes) if changes else np.zeros(len(rows) - 1, bool)
 
 
 def _find_jumps(rows: pd.DataFrame, intervals: Floats) -> NDArray[np.bool_]:

@@ -92,7 +92,9 @@ def render_report(results: Sequence[Results]) -> str:
     first = "" if baseline else summary.first_alternative(results)
     is_alternative = {each.name: each.name.endswith(f": {HUMAN_LABEL}") and each.name != first for each in columns}
     if first in rows:  # drivers of CAVs are compared with human drivers of their own folder
-        columns = [replace(each, baseline_rows=rows[first]) if is_alternative[each.name] else each for each in columns]
+        columns = [
+            summary.compare_alternative(each, rows[first]) if is_alternative[each.name] else each for each in columns
+        ]
     headings, table = metric_table(rows, baseline)
     roads = (", ".join(format_drawn_values(episode.drawn_values)) for episode in panels)
     return render_template(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load
 
 from unjam.errors import InputError, resume_hint
-from unjam.files import INVALID_DATA_ERRORS, read_json_lines, sha256_of
+from unjam.files import INVALID_DATA_ERRORS, read_json_lines, sha256_of, sha256_of_file
 from unjam.folders import reject_unsafe_files
 from unjam.measures.metric_table import driver_rank
 from unjam.measures.metrics import METRICS
@@ -22,6 +22,7 @@ from unjam.worlds.record import Episode
 Float32s = NDArray[np.float32]
 
 EVALUATION_FILE = "evaluation.json"  # metrics of each driver
+CONTROLLER_FILE = "controller.unjam"  # the controller of a run
 PLOT_EPISODES_FILE = "plot_episodes.safetensors"  # arrays of the episodes that figures show
 PLOT_EPISODES_HASH = "plot_episodes_sha256"  # entry of the evaluation with the hash of that file
 MODEL_FILE = "model.json"  # facts about the learned model of a run
@@ -155,6 +156,12 @@ def read_results(folder: Path) -> Results:
         return Results(folder, metadata, rows, episodes, read_progress(folder), config, read_model_facts(folder))
     except INVALID_DATA_ERRORS as error:
         raise damaged_results_error(folder, error) from None
+
+
+def is_outdated(folder: Path, metadata: dict[str, Any]) -> bool:
+    """Return whether an evaluation is of an earlier controller than the one in its folder."""
+    known, controller = metadata.get("controllers", {}).get(metadata.get("trained")), folder / CONTROLLER_FILE
+    return known is not None and controller.is_file() and sha256_of_file(controller) != known
 
 
 def damaged_results_error(folder: Path, error: Exception) -> InputError:

@@ -22,7 +22,7 @@ from unjam.measures.statistics import (
     paired_difference,
 )
 from unjam.measures.verdict import Verdict, is_better, road_metrics, verdicts
-from unjam.reports.results import PlotEpisode, Results, kept_row, original_command
+from unjam.reports.results import PlotEpisode, Results, is_outdated, kept_row, original_command
 from unjam.text import format_count, printable
 
 CLOSE_TIME_GAP = 1.0  # time gap below which the report has a note [s]; the paper's h_max
@@ -86,6 +86,13 @@ def first_alternative(results: Sequence[Results]) -> str:
     return f"{folder_names(results)[0]}: {HUMAN_LABEL}" if is_comparison else ""
 
 
+def compare_alternative(column: ReportColumn, first_rows: Sequence[dict[str, Any]]) -> ReportColumn:
+    """Return the column of human drivers on another network, compared with those on the first one."""
+    label = "human drivers of the first network"
+    (verdict,) = verdicts({label: [*first_rows], column.name: [*column.rows]}, label)
+    return replace(column, baseline_rows=first_rows, verdict=verdict)
+
+
 def _episode_keys(rows: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
     """Return a key for each episode of a driver; the keys differ between different roads."""
     return [(str(row["seed"]), str(row["return"])) for row in rows]
@@ -115,11 +122,18 @@ def report_title(results: Sequence[Results]) -> str:
 def mismatch_warning(results: Sequence[Results]) -> str:
     """Return a warning if several folders have different roads, seeds or durations; else an empty text.
 
+    Networks that are compared as alternatives have an explanation instead.
+
     The roads of one training are different by intention.
     """
     parents = {result.folder.resolve().parent for result in results}
     if len(parents) == 1 and (parents.pop() / "config.toml").is_file():
         return ""
+    if first := first_alternative(results):
+        return (
+            f"Human drivers of these networks are compared with {first}, on the same seeds. Delay is the time lost to "
+            "the speed that is allowed at each moment: a speed limit hides its own cost, so compare travel times."
+        )
     episodes = [next(iter(result.plot_episodes.values()), None) for result in results]
     known = [each for each in episodes if each is not None and not each.has_recorded_leader]
     kinds = {
@@ -221,6 +235,9 @@ def report_notes(result: Results) -> list[str]:
     """Return caveats of the main finding."""
     labels = [result.trained_label] if result.trained_label else list(filter(driver_rank, result.rows))
     notes = dict.fromkeys([*result.metadata.get("notes", []), *early_end_notes(result.rows)])
+    if is_outdated(result.folder, result.metadata):
+        outdated = "the evaluation is of an earlier controller than that in the folder; unjam evaluate repeats it"
+        notes = {outdated: None, **notes}
     return [*(f"{note}." for note in notes), *(note for label in labels for note in _driver_notes(result, label))]
 
 

@@ -5,17 +5,15 @@ These are human drivers alone, and ACC vehicles without a controller.
 
 import json
 import shlex
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from math import ceil, isfinite
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from unjam.controller import DEFAULT_DRIVER, make_driver
-from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable
-from unjam.errors import InputError, NoCavError, invalid_value
+from unjam.errors import NoCavError, raise_failure
 from unjam.files import FileWatch, atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import HARD_BRAKING_METRIC
@@ -32,18 +30,17 @@ from unjam.measures.recommendation import (
 )
 from unjam.measures.statistics import metric_estimate
 from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, keep_earlier_answer, write_assessment
-from unjam.scenarios import make_scenario, scenario_recipe
-from unjam.scenarios.scenario import Scenario
-from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
+from unjam.scenarios import scenario_recipe
 from unjam.seeds import held_out_seeds
 from unjam.text import format_count, format_duration
+from unjam.training.assessment_request import PLOT_EPISODE_COUNT, AssessmentRequest
 from unjam.training.episode_log import EpisodeLog
-from unjam.training.evaluate import Evaluation, evaluate_on_roads, raise_failure, save_evaluation
+from unjam.training.evaluate import DriverAndEpisode, Evaluation, evaluate_on_roads, save_evaluation
 from unjam.training.executors import MessageCallback
 from unjam.training.selection import (
     ACC_DRIVER,
     HUMAN_BASELINE,
-    UNCHANGED_ACC_DRIVER,
+    MIN_TEST_SEEDS,
     AssessmentFindings,
     EpisodeBudget,
     EpisodeSeed,
@@ -55,123 +52,20 @@ from unjam.training.selection import (
     select_controllers,
     verdict_episodes,
 )
-from unjam.worlds.episode import check_can_drive
+from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import WorkerPool
 
 StageCallback = Callable[[str, int], None]
 """called with the name of a stage that begins, and its maximum number of control steps"""
-DEFAULT_CONTROLLERS = (DEFAULT_DRIVER, "follower-stopper", "pi")
-ACC_PROPERTIES = ("acceleration", "deceleration", "keep_right", "speed_gain")
-"""settings of the CAVs' ACC that replace a property of the vehicle"""
 SPEEDS_AHEAD = {"lane_speeds", "road_speeds", "congestion"}
 """fields of a `LocalState` with messages about the traffic ahead"""
+FEWEST_SEEDS = {"tuning": 1, "test": MIN_TEST_SEEDS}
+"""seeds that are simulated however little time there is"""
 MIN_BASELINE_EPISODES = 20
 """episodes of the baseline to which early ends are related before the last one: two of them are too many"""
-PLOT_EPISODE_COUNT = 2
-ZERO_PENETRATION_RATE = 1e-12
-"""penetration rate of human-only traffic: zero is not allowed on user networks"""
 SELECTION_FOLDER = "selection"
 """folder within the results with the rows of the selection seeds"""
-CAV_SELECTION_OPTIONS = "penetration_rate", "cav_types", "cavs"
-"""options of a road that the penetration rates replace"""
 BASELINE_METRICS = ("travel_time", "outflow_veh_per_h", "fuel_ml_per_km", HARD_BRAKING_METRIC, "collisions")
-
-
-@dataclass(frozen=True)
-class AssessmentRequest:
-    """The settings of an assessment, all of them checked."""
-
-    file: str
-    network: UserNetwork
-    """user network with human drivers alone"""
-    drivers: dict[str, Driver]
-    penetration_rates: tuple[float, ...]
-    episodes: int
-    minutes: float | None
-    """time budget, checked between batches"""
-    precision: float
-    """target half-width of the CI of travel time, as a share of the baseline's travel time"""
-
-    @property
-    def options(self) -> list[Option]:
-        """All penetration rates with all controllers."""
-        return [Option(rate, driver) for rate in self.penetration_rates for driver in self.drivers]
-
-    @property
-    def compared_options(self) -> list[Option]:
-        """All that may be simulated: the human baseline, ACC vehicles and the controllers."""
-        return [HUMAN_BASELINE, *(Option(rate, ACC_DRIVER) for rate in self.penetration_rates), *self.options]
-
-    @property
-    def has_acc_properties(self) -> bool:
-        """Whether the user replaces a property of the vehicles for CAVs."""
-        return any(getattr(self.network.cruise, name) is not None for name in ACC_PROPERTIES)
-
-    @property
-    def verdict_episodes(self) -> int:
-        """Number of episodes of the smallest verdict."""
-        counts = len(self.penetration_rates), len(self.drivers), self.has_acc_properties
-        return verdict_episodes(*counts) + PLOT_EPISODE_COUNT
-
-    @property
-    def smallest_question(self) -> "AssessmentRequest":
-        """The same request with its median penetration rate and first controller only."""
-        rate = self.penetration_rates[len(self.penetration_rates) // 2]
-        drivers = dict(list(self.drivers.items())[:1])
-        return replace(self, penetration_rates=(rate,), drivers=drivers)
-
-    def make_setup(self, option: Option) -> tuple[Scenario, Driver]:
-        """Return the road with this penetration rate, and the driver of the CAVs."""
-        if option == HUMAN_BASELINE:
-            return self.network, make_driver(HUMAN_BASELINE.driver, self.network.control_step)
-        road = replace(self.network, penetration_rate=option.penetration_rate)
-        if option.driver not in (ACC_DRIVER, UNCHANGED_ACC_DRIVER):
-            return road, self.drivers[option.driver]
-        unchanged = dict.fromkeys(ACC_PROPERTIES if option.driver == UNCHANGED_ACC_DRIVER else ())
-        safety, cruise = replace(road.safety, active=False), replace(road.cruise, **unchanged)
-        road = replace(road, actuation="cruise", safety=safety, cruise=cruise)
-        return road, make_driver(ACC_DRIVER, road.control_step)
-
-
-def make_request(
-    file: str,
-    penetration_rates: Sequence[float],
-    episodes: int,
-    precision: float,
-    minutes: float | None = None,
-    drivers: Sequence[str] = DEFAULT_CONTROLLERS,
-    options: dict[str, Any] | None = None,
-) -> AssessmentRequest:
-    """Return a checked request, with the human baseline; raise `InputError` if an argument is wrong."""
-    if not file.endswith(".sumocfg"):
-        raise invalid_value("scenario", file, "your own .sumocfg file")
-    for name in [name for name in options or {} if name in CAV_SELECTION_OPTIONS]:
-        raise InputError(f"{name}: it is not allowed here: --penetration-rates says how many vehicles are CAVs")
-    for rate in penetration_rates:
-        if not 0 <= rate <= 1:
-            raise invalid_value("penetration_rates", rate, "shares from 0 to 1, such as 0.05 for 5 %")
-    rates = tuple(sorted(set(penetration_rates) - {0.0}))
-    if not rates:
-        text = ",".join(f"{rate:g}" for rate in penetration_rates)
-        raise invalid_value("penetration_rates", text, "one above 0 at least")
-    if minutes is not None and not minutes > 0:
-        raise invalid_value("minutes", minutes, "> 0")
-    if not 0 < precision < 1:
-        raise invalid_value("precision", precision, "> 0, < 1")
-    changes = {**ACC_SETTINGS, **(options or {}), "penetration_rate": ZERO_PENETRATION_RATE}
-    road = cast(UserNetwork, make_scenario(file, changes))
-    controllers = {name: make_driver(name, road.control_step) for name in drivers if name != ACC_DRIVER}
-    for name, driver in controllers.items():
-        if driver.is_native:
-            raise invalid_value("driver", name, "the human baseline is always included")
-        check_can_drive(driver, road, f"driver {name}")
-    request = AssessmentRequest(file, road, controllers, rates, episodes, minutes, precision)
-    minimum = min_episodes(len(rates), len(controllers), request.has_acc_properties) + PLOT_EPISODE_COUNT
-    if episodes < minimum:
-        counts = format_count(len(rates), "penetration rate"), format_count(len(controllers), "controller")
-        allowed = f">= {minimum} for {' and '.join(counts)}"
-        raise invalid_value("episodes", episodes, allowed)
-    return request
 
 
 @dataclass(frozen=True)
@@ -194,47 +88,73 @@ def assess(
     on_message: MessageCallback = lambda line: None,
     on_stage: StageCallback = lambda name, steps: None,
 ) -> Assessment:
-    """Run an assessment, and write rows, `assessment.json` and the page into a folder, at its end.
+    """Run an assessment, and write rows, `assessment.json` and the page into a folder.
 
-    Finished batches are in a log: in the same folder an assessment of the same road and files resumes, or continues
-    with other controllers, penetration rates and budgets. Without `minutes`, the result does not depend on the number
-    of workers. `progress` is called with the control steps of an episode, `on_stage` when a batch of episodes begins,
-    and `on_message` with a line about its result. Raise `InputError` if the folder has something else, or no driver can
-    drive on this road.
+    Finished episodes are in a log: in the same folder an assessment of the same road and files resumes, or continues
+    with other controllers, penetration rates and budgets. After each round of test seeds the folder has the answer so
+    far. Without `minutes`, the result does not depend on the number of workers. `progress` is called with the control
+    steps of an episode, `on_stage` when a batch of episodes begins, and `on_message` with a line about its result.
+    Raise `InputError` if the folder has something else, or no driver can drive on this road.
     """
     log = EpisodeLog(folder, request.network)
     if log.episodes:
         known = f"{format_count(len(log.episodes), 'episode')} of earlier calls in {folder}"
-        on_message(f"{known}: not simulated again for the same controllers; data that their code reads is not compared")
+        on_message(
+            f"{known}: not simulated again for the same controllers, except those of pictures; data that their code "
+            "reads is not compared"
+        )
     watch = FileWatch(lambda: request.network.user_files)
     budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
+    new_episodes = set[tuple[Option, EpisodeSeed]]()
 
     def evaluate_options(
-        stage: str, options: Sequence[Option], seeds: Sequence[EpisodeSeed], with_plots: bool = False
+        options: Sequence[Option],
+        seeds: Sequence[EpisodeSeed],
+        skipped: Collection[DriverAndEpisode] = (),
+        with_plots: bool = False,
     ) -> Evaluation:
-        on_stage(stage, request.network.horizon * len(options) * len(seeds))
         setups = {option.label: request.make_setup(option) for option in options}
+        hashes = {label: log.setup_hash(*setup) for label, setup in setups.items()}
         batch = budget.used_episodes
 
-        def report_progress(episode: tuple[str, int], steps: int) -> None:
+        def report_progress(episode: DriverAndEpisode, steps: int) -> None:
             if progress is not None:
                 progress((batch, *episode), steps)
 
-        return evaluate_on_roads(setups, seeds, workers, progress=report_progress, with_plots=with_plots, watch=watch)
+        def store(episode: DriverAndEpisode, row: dict[str, Any]) -> None:
+            label, index = episode
+            if not with_plots:
+                log.add(hashes[label], seeds[index], row)
+
+        settings: dict[str, Any] = {"with_plots": with_plots, "watch": watch, "skipped": skipped, "on_row": store}
+        return evaluate_on_roads(setups, seeds, workers, progress=report_progress, **settings)
 
     def run_options(kind: str, options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
+        """Return rows of the seeds, or of the first of them if the time ends."""
         hashes = {option: log.setup_hash(*request.make_setup(option)) for option in options}
         missing = [(option, seed) for option in options for seed in seeds if (hashes[option], seed) not in log.episodes]
-        new_options, new_seeds = dict.fromkeys(option for option, _ in missing), sorted({seed for _, seed in missing})
         if missing:
-            first, last = new_seeds[0][-1] + 1, new_seeds[-1][-1] + 1
+            first, last = (choose(seed[-1] for _, seed in missing) + 1 for choose in (min, max))
             numbers = f"seeds {first} to {last}" if first < last else f"seed {first}"
-            stage = f"simulating {kind} {numbers} of {format_count(len(new_options), 'option')}"
-            new_rows = evaluate_options(stage, [*new_options], new_seeds).rows
-            for option in new_options:
-                log.add(hashes[option], new_seeds, new_rows[option.label])
-        budget.spend(len(options) * len(seeds), len(new_options) * len(new_seeds))
-        rows = {option: [log.episodes[hashes[option], seed] for seed in seeds] for option in options}
+            names = format_count(len({option for option, _ in missing}), "option")
+            on_stage(f"simulating {kind} {numbers} of {names}", request.network.horizon * len(missing))
+        done = list[EpisodeSeed]()
+        # With a limit of time one seed after another: an answer needs all options on the same seeds.
+        for part in [[seed] for seed in seeds] if request.minutes else [seeds]:
+            absent = [(option, seed) for option, seed in missing if seed in part]
+            if part[0][-1] >= FEWEST_SEEDS[kind] and absent and not budget.has_time_for(len(absent)):
+                break
+            known = [
+                (option.label, index)
+                for option in options
+                for index, seed in enumerate(part)
+                if (option, seed) not in absent
+            ]
+            evaluate_options(options, part, known)
+            budget.spend(len(options) * len(part), len(absent))
+            new_episodes.update(absent)
+            done += part
+        rows = {option: [log.episodes[hashes[option], seed] for seed in done] for option in options}
         human_rows = rows[HUMAN_BASELINE]
         baseline.extend(human_rows)
         check_baseline(baseline, MIN_BASELINE_EPISODES)
@@ -247,8 +167,12 @@ def assess(
             for option in options
         }
 
-    first = evaluate_options("simulating the human baseline, seed 1 of 1", [HUMAN_BASELINE], held_out_seeds(1), True)
-    budget.spend(1)
+    def drive_for_pictures(stage: str, option: Option) -> Evaluation:
+        on_stage(f"simulating {stage}", request.network.horizon)
+        budget.spend(1)
+        return evaluate_options([option], held_out_seeds(1), with_plots=True)
+
+    first = drive_for_pictures("the human baseline, seed 1 of 1", HUMAN_BASELINE)
     raise_failure(first.rows[HUMAN_BASELINE.label])
     setups = {log.setup_hash(*request.make_setup(option)) for option in request.compared_options}
     stored_episodes = sum(setup in setups for setup, _ in log.episodes)
@@ -256,39 +180,45 @@ def assess(
         on_message(line)
     selection = select_controllers(request.options, partial(run_options, "tuning"), budget, on_message)
     selection_episodes = budget.used_episodes - 1
-    rates, precision = request.penetration_rates, request.precision
+
+    def write_answer(findings: AssessmentFindings, pictures: dict[str, Episode], is_complete: bool) -> Assessment:
+        metadata = {"scenario": Path(request.file).name, "reward": request.network.reward, "manifest": manifest()}
+        selection_rows = {option.label: rows for option, rows in selection.rows.items()}
+        test_rows = {option.label: rows for option, rows in findings.rows.items()}
+        check_baseline(baseline, 0 if is_complete else MIN_BASELINE_EPISODES)
+        all_rows = {label: [*selection_rows.get(label, ()), *rows] for label, rows in test_rows.items()}
+        document = {
+            **metadata,
+            **_assessment_document(request, selection, findings, selection_episodes, budget),
+            "is_complete": is_complete,
+            "notes": [*episode_notes(all_rows), *request.network.notes, *sensing_notes(request)],
+        }
+        save_evaluation(folder / SELECTION_FOLDER, Evaluation(selection_rows, {}), metadata)
+        save_evaluation(folder, Evaluation(test_rows, pictures), metadata)
+        if kept_page := keep_earlier_answer(folder, request.penetration_rates, document["drivers"]):
+            on_message(f"the answer to the earlier question is now in {kept_page}")
+        atomic_write(folder / ASSESSMENT_FILE, to_json(document, indent=1))
+        page = write_assessment(folder, folder / ASSESSMENT_PAGE)
+        return Assessment(findings.controller_results, findings.acc_results, json.loads(to_json(document)), page)
+
+    def write_interim_answer(findings: AssessmentFindings) -> None:
+        if new_episodes:  # else the folder may have a better answer
+            on_message(f"the answer so far is in {write_answer(findings, first.plot_episodes, False).page}")
+
     findings = compare_on_test_seeds(
         selection.finalists,
-        rates,
+        request.penetration_rates,
         request.has_acc_properties,
         partial(run_options, "test"),
         budget,
-        precision,
+        request.precision,
         on_message,
+        write_interim_answer,
     )
     best = plotted_result(findings.controller_results)
-    plotted = Option(best.penetration_rate, best.driver) if best else Option(rates[-1], ACC_DRIVER)
-    plot_episodes = first.plot_episodes
-    plot_episodes |= evaluate_options("simulating the pictures", [plotted], held_out_seeds(1), True).plot_episodes
-    budget.spend(1)
-
-    metadata = {"scenario": Path(request.file).name, "reward": request.network.reward, "manifest": manifest()}
-    selection_rows = {option.label: rows for option, rows in selection.rows.items()}
-    test_rows = {option.label: rows for option, rows in findings.rows.items()}
-    check_baseline(baseline)
-    all_rows = {label: [*selection_rows.get(label, ()), *rows] for label, rows in test_rows.items()}
-    document = {
-        **metadata,
-        **_assessment_document(request, selection, findings, selection_episodes, budget),
-        "notes": [*episode_notes(all_rows), *request.network.notes, *sensing_notes(request)],
-    }
-    save_evaluation(folder / SELECTION_FOLDER, Evaluation(selection_rows, {}), metadata)
-    save_evaluation(folder, Evaluation(test_rows, plot_episodes), metadata)
-    if kept_page := keep_earlier_answer(folder, rates, document["drivers"]):
-        on_message(f"the answer to the earlier question is now in {kept_page}")
-    atomic_write(folder / ASSESSMENT_FILE, to_json(document, indent=1))
-    page = write_assessment(folder, folder / ASSESSMENT_PAGE)
-    return Assessment(findings.controller_results, findings.acc_results, json.loads(to_json(document)), page)
+    plotted = Option(best.penetration_rate, best.driver) if best else Option(request.penetration_rates[-1], ACC_DRIVER)
+    pictures = first.plot_episodes | drive_for_pictures("the pictures", plotted).plot_episodes
+    return write_answer(findings, pictures, True)
 
 
 def budget_lines(request: AssessmentRequest, budget: EpisodeBudget, stored_episodes: int = 0) -> list[str]:

@@ -28,7 +28,7 @@ from unjam.seeds import held_out_seeds, tuning_seeds
 from unjam.sumo_files import SumoFiles, read_sumo_files
 from unjam.sumo_files.variants import write_variant
 from unjam.text import spelling_hint
-from unjam.training.assess import ZERO_PENETRATION_RATE
+from unjam.training.assessment_request import ZERO_PENETRATION_RATE
 from unjam.training.search_space import SearchSpace, boundary_values, float_range, parse_search_space
 from unjam.training.trial_log import TrialLog
 from unjam.worlds.sumo.detectors import DetectorPool

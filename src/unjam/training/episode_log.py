@@ -1,8 +1,8 @@
 """Log of the episodes of an assessment, with which it resumes, or continues with more episodes."""
 
-from collections.abc import Iterable
 from pathlib import Path
 from secrets import token_hex
+from threading import Lock
 from typing import Any
 
 from safetensors.numpy import save
@@ -31,7 +31,7 @@ class EpisodeLog(RowLog):
         request = {"scenario": scenario_recipe(scenario), "files": file_hashes((), scenario)}
         request |= {"unjam": __version__, "commit": manifest()["commit"]}
         super().__init__(folder, request, EPISODES_FILE)
-        self._call = token_hex(16)
+        self._call, self._lock = token_hex(16), Lock()
         self.episodes: dict[tuple[str, tuple[int, ...]], dict[str, Any]] = {}
         """rows by the hash of a setup and the seed"""
         for entry in self.rows:
@@ -52,12 +52,12 @@ class EpisodeLog(RowLog):
         recipe, arrays = driver_recipe(driver) if is_known else (f"{driver.describe()} {self._call} {id(driver)}", {})
         return sha256_of(to_json([scenario_recipe(scenario), recipe]).encode() + save(arrays))
 
-    def add(self, setup: str, seeds: Iterable[tuple[int, ...]], rows: Iterable[dict[str, Any]]) -> None:
-        """Add the rows of the episodes of a setup; they are on the disk when this returns.
+    def add(self, setup: str, seed: tuple[int, ...], row: dict[str, Any]) -> None:
+        """Add the row of an episode, from any thread; it is on the disk when this returns.
 
-        Failed episodes are not: their cause may be mended in a later call.
+        A failed one is not: its cause may be mended in a later call.
         """
-        for seed, row in zip(seeds, rows, strict=True):
+        with self._lock:
             self.episodes[setup, seed] = row
             if row["status"] != "failed" or row["error"] == NoCavError.__name__:
                 self.append({"setup": setup, "seed": seed, "row": row})

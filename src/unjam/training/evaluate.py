@@ -1,35 +1,27 @@
-"""Evaluation: several drivers on the same seeds, measured and saved for reports, or as tables and in a notebook.
+"""Evaluation: several drivers on the same seeds, measured and saved for reports, or as tables.
 
-`unjam drive` takes any drivers and seeds; the controller of a run is compared with others on test seeds.
+The controller of a run is compared with others on test seeds.
 """
 
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
-from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from safetensors.numpy import save
 
 from unjam.controller import PACKAGED_PREFIX, controller_hash, make_driver
-from unjam.controller.domain import controller_notes
 from unjam.drivers.driver import Driver
-from unjam.drivers.registry import driver_names, unique_label
-from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, error_from_name, invalid_value, unknown_name
+from unjam.drivers.registry import unique_label
+from unjam.errors import raise_failure
 from unjam.files import FileWatch, atomic_write, make_folder, remove_leftovers, sha256_of, to_json
 from unjam.manifest import manifest
-from unjam.measures.effect import effects_by_driver
-from unjam.measures.feasibility import feasibility_by_driver
-from unjam.measures.metric_table import RowsByDriver, choose_baseline, in_order
-from unjam.measures.metrics import METRICS, measure
-from unjam.measures.notes import count_early_ends, episode_notes
+from unjam.measures.metric_table import RowsByDriver, in_order
+from unjam.measures.metrics import measure
+from unjam.measures.notes import episode_notes
 from unjam.measures.statistics import Estimate, paired_difference, summarize
-from unjam.measures.verdict import metric_frame, short_table_metrics, verdicts
-from unjam.parameters import check_integer
 from unjam.reports.results import (
     EPISODE_ENTRIES,
     EVALUATION_FILE,
@@ -38,28 +30,24 @@ from unjam.reports.results import (
     pack_episode,
     to_plot_episode,
 )
-from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.seeds import TRAINING_SEED_LIMIT, held_out_seeds
+from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig
-from unjam.training.run_folder import lock_new_folder
-from unjam.worlds.backend import BackendLike, backend_notes, check_support, open_backend
-from unjam.worlds.checked_world import backend_label
-from unjam.worlds.episode import can_drive, check_can_drive, run_episode
+from unjam.worlds.backend import BackendLike, backend_notes, open_backend
+from unjam.worlds.episode import can_drive, run_episode
 from unjam.worlds.record import Episode
-from unjam.worlds.reward import RewardLike, make_reward, reward_label
+from unjam.worlds.reward import RewardLike
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 if TYPE_CHECKING:  # imported late, so that commands start quickly
     import pandas as pd
-    from matplotlib.figure import Figure
 
-EFFECT_ENTRIES = ("travel_time", "delay_reduction", "speed", "flow", "fuel", "hard_braking")
-MISSING_ACC_NOTE = "limits the ACC of a CAV, but CAVs have none: --set actuation=cruise --set safety.active=false"
 TRAINED_LABEL = "trained"
 """label of the trained controller in tables and figures"""
-EvaluationProgress = Callable[[tuple[str, int], int], None]
-"""called repeatedly with (label of the driver, index of its episode) and the control steps so far"""
+DriverAndEpisode = tuple[str, int]
+"""label of a driver, and index of its episode"""
+EvaluationProgress = Callable[[DriverAndEpisode, int], None]
+"""called repeatedly with the control steps of an episode so far"""
 
 
 @dataclass(frozen=True)
@@ -80,110 +68,6 @@ class Evaluation:
         return {label: {name: each.mean for name, each in self.summary(label).items()} for label in self.rows}
 
 
-@dataclass(frozen=True)
-class DriveResult(Evaluation):
-    """Episodes of one or several drivers on the same traffic, and the files with them."""
-
-    scenario: str = ""
-    backend: str = "sumo"
-    folder: Path | None = None
-    report: Path | None = None
-    notes: list[str] = field(default_factory=list)
-    """caveats, as controllers on a road that they were not made for"""
-    baseline: str = ""
-    """label of the driver that the others are compared with; empty: human drivers, or else the best expert"""
-    first_driver: str = ""
-    """label of the driver that was given first; empty: that of the first rows"""
-
-    @property
-    def mean(self) -> dict[str, float]:
-        """Mean of every metric over the episodes of the driver that was given first."""
-        return self.means()[self.first_driver or next(iter(self.rows))]
-
-    def table(self, brief: bool = False) -> "pd.DataFrame":
-        """Return a row per metric with the mean and both ends of the 95 % CI of each driver; `brief`: what matters.
-
-        `result.table().loc["mean_speed", ("pi", "mean")]` is one number.
-        """
-        import pandas as pd
-
-        names = short_table_metrics(self.rows) if brief else tuple(METRICS)
-        summaries = {label: self.summary(label) for label in self.rows}
-        numbers = {
-            (label, part): [getattr(summary[name], part) for name in names]
-            for label, summary in summaries.items()
-            for part in ("mean", "low", "high")
-        }
-        frame = pd.DataFrame(numbers, index=pd.Index(names, name="metric"))
-        return frame.rename_axis(columns=("driver", None))
-
-    def episodes(self) -> "pd.DataFrame":
-        """Return a row per episode and driver, with seed, status and every metric."""
-        return rows_to_frame(self.rows)
-
-    def __str__(self) -> str:
-        """Return the verdicts and the table of the metrics that matter, for `print`."""
-        lines = (line for each in verdicts(self.rows, self.baseline) for line in each.lines)
-        return "\n".join([*lines, metric_frame(self.rows).to_string(index=False)])
-
-    def _repr_html_(self) -> str:
-        """Return the verdicts, the metrics that matter, and the trajectories of all vehicles, for notebooks."""
-        from unjam.reports.figures import data_uri
-
-        lines = ("<br>".join(map(escape, each.lines)) for each in verdicts(self.rows, self.baseline))
-        table = "".join(f"<p>{text}</p>" for text in lines) + metric_frame(self.rows).to_html(index=False, border=0)
-        if not self.plot_episodes:
-            return table
-        attributes = 'style="max-width: 100%" alt="every vehicle over time, dark is slow"'
-        return f'{table}<img {attributes} src="{data_uri(self.plot())}">'
-
-    def plot(self, kind: Literal["space-time", "time-series"] = "space-time") -> "Figure":
-        """Return a figure of an episode of each driver: positions and speeds of all vehicles, or quantities over time.
-
-        Raise `InputError` if all episodes failed, or for another `kind`.
-        """
-        from unjam.reports.figures import time_series_figure
-        from unjam.reports.space_time import space_time_figure
-
-        figures = {"space-time": space_time_figure, "time-series": time_series_figure}
-        if kind not in figures:
-            raise unknown_name("kind", kind, figures)
-        if not self.plot_episodes:
-            raise InputError("plot: all episodes failed; allowed: results with an episode")
-        return figures[kind]([to_plot_episode(label, each) for label, each in self.plot_episodes.items()])
-
-    def document(self) -> dict[str, Any]:
-        """Return the result as `unjam drive --json` prints it, with a document for each driver, also for one."""
-        feasible, effects = feasibility_by_driver(self.rows), effects_by_driver(self.rows)
-        baseline, documents = choose_baseline(self.rows, self.baseline), list[dict[str, Any]]()
-        for driver, rows in self.rows.items():
-            summary, effect, differences = self.summary(driver), effects.get(driver), None
-            if baseline and driver != baseline:
-                paired = {name: paired_difference(rows, self.rows[baseline], name) for name in METRICS}
-                differences = {name: [each.mean, each.low, each.high] for name, each in paired.items()}
-            effects_by_entry = {name: getattr(effect, name) for name in EFFECT_ENTRIES} if effect else {}
-            documents.append(
-                {
-                    "scenario": self.scenario,
-                    "backend": self.backend,
-                    "driver": driver,
-                    "feasibility": feasible[driver],
-                    "episodes": rows,
-                    "mean": {name: summary[name].mean for name in METRICS},
-                    "ci95": {name: [summary[name].low, summary[name].high] for name in METRICS},
-                    "effect": {name: [each.mean, each.low, each.high] for name, each in effects_by_entry.items()}
-                    or None,
-                    "early_ends": count_early_ends(rows),
-                    "notes": self.notes,
-                    "folder": str(self.folder) if self.folder else None,
-                    "report": str(self.report) if self.report else None,
-                    "baseline": baseline or None,
-                    "difference_to_baseline": differences,
-                }
-            )
-        return {"scenario": self.scenario, "drivers": documents}
-
-
 def rows_to_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":
     """Return a row per episode and driver: `driver`, `seed` as text, `status`, and every metric."""
     import pandas as pd
@@ -201,10 +85,11 @@ def evaluate(
     reward: RewardLike = "",
     progress: EvaluationProgress | None = None,
     backend: BackendLike = "sumo",
+    watch: FileWatch | None = None,
 ) -> Evaluation:
     """Run every driver on every seed, and measure."""
     setups = {label: (scenario, driver) for label, driver in drivers.items()}
-    return evaluate_on_roads(setups, seeds, workers, reward, progress, backend=backend)
+    return evaluate_on_roads(setups, seeds, workers, reward, progress, backend=backend, watch=watch)
 
 
 def evaluate_on_roads(
@@ -216,11 +101,17 @@ def evaluate_on_roads(
     with_plots: bool = True,
     backend: BackendLike = "sumo",
     watch: FileWatch | None = None,
+    skipped: Collection[DriverAndEpisode] = (),
+    on_row: Callable[[DriverAndEpisode, dict[str, Any]], None] = lambda pair, row: None,
 ) -> Evaluation:
-    """Run every driver, each on its own road, on every seed, and measure; `with_plots` keeps an episode of each."""
+    """Run every driver, each on its own road, on every seed, and measure; `with_plots` keeps an episode of each.
+
+    Episodes that are `skipped` do not run. `on_row` is called with each row when its episode ends, in several threads.
+    """
     settings: dict[str, Any] = {"reward": reward, "backend": backend}
     settings |= {"record_details": True, "stop_at_contact": False}
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
+    pairs = [pair for pair in pairs if pair not in skipped]
     tasks = {(label, index): EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs}
     remote = [pair for pair in pairs if tasks[pair].is_serializable]
     local = [pair for pair in pairs if not tasks[pair].is_serializable]
@@ -229,7 +120,8 @@ def evaluate_on_roads(
 
     def measure_task(pair: tuple[str, int], episode: Episode) -> tuple[dict[str, Any], Episode | None]:
         watch.check()
-        return measure(episode), episode if with_plots and pair[1] == 0 and episode.has_run else None
+        on_row(pair, row := measure(episode))
+        return row, episode if with_plots and pair[1] == 0 and episode.has_run else None
 
     measured = workers.run_and_map(
         [tasks[pair] for pair in remote],
@@ -241,17 +133,8 @@ def evaluate_on_roads(
         for pair in local:
             task = replace(tasks[pair], backend=opened)
             results[pair] = measure_task(pair, run_episode(**vars(task), on_progress=partial(on_progress, pair)))
-    rows = {label: [results[label, index][0] for index in range(len(seeds))] for label in drivers}
-    first_episodes = {label: results[label, 0][1] for label in drivers if seeds}
-    return Evaluation(rows, {label: each for label, each in first_episodes.items() if each is not None})
-
-
-def raise_failure(rows: Sequence[dict[str, Any]]) -> None:
-    """Raise the first failure among the rows of episodes, as the original kind of error."""
-    for row in rows:
-        if row["status"] == "failed":
-            seed = "" if row["error"] == InputError.__name__ else f" (seed {row['seed']})"
-            raise error_from_name(row["error"], f"{row['reason']}{seed}")
+    rows = {label: [results[pair][0] for pair in pairs if pair[0] == label] for label in drivers}
+    return Evaluation(rows, {label: each for (label, _), (_, each) in results.items() if each is not None})
 
 
 def raise_failures(result: Evaluation) -> None:
@@ -308,15 +191,16 @@ def evaluate_run(
     progress: EvaluationProgress | None = None,
     out: Path | None = None,
     notes: Sequence[str] = (),
+    watch: FileWatch | None = None,
 ) -> Evaluation:
     """Evaluate a run's controller and others on the same test seeds, and save the results in its folder or in `out`.
 
     `config.evaluation` may be another than that of the run. The `notes` are stored before all others.
     """
     scenario, drivers = config.make_scenario(), drivers_to_compare(config, folder)
-    hashes = _controller_hashes({TRAINED_LABEL: str(folder)})  # now: files may change while episodes run
+    hashes = controller_hashes({TRAINED_LABEL: str(folder)})  # now: files may change while episodes run
     seeds = held_out_seeds(config.evaluation.episodes)
-    evaluation = evaluate(scenario, drivers, seeds, workers, config.reward, progress, config.episode_backend)
+    evaluation = evaluate(scenario, drivers, seeds, workers, config.reward, progress, config.episode_backend, watch)
     metadata = {
         "scenario": Path(config.scenario).name,
         "reward": config.reward or scenario.reward,
@@ -326,6 +210,7 @@ def evaluate_run(
         "controllers": hashes,
         "notes": [
             *notes,
+            *filter(None, [duration_note(config)]),
             *episode_notes(evaluation.rows),
             *backend_notes(config.episode_backend, scenario),
             *scenario.notes,
@@ -341,6 +226,14 @@ def evaluate_run(
     return evaluation
 
 
+def duration_note(config: RunConfig) -> str:
+    """Return a text if episodes of a training last shorter or longer than the scenario's own; else an empty one."""
+    options = {name: value for name, value in config.scenario_options.items() if name != "horizon"}
+    scenarios = config.make_scenario(), replace(config, scenario_options=options).make_scenario()
+    seconds, usual = (each.horizon * each.control_step for each in scenarios)
+    return "" if seconds == usual else f"episodes of {seconds:g} s, where the scenario has {usual:g} s"
+
+
 def gain_over_expert(config: RunConfig, rows: RowsByDriver) -> Estimate | None:
     """Return the paired difference of return between the trained controller and its expert; None without one."""
     if config.expert == "none":
@@ -348,102 +241,6 @@ def gain_over_expert(config: RunConfig, rows: RowsByDriver) -> Estimate | None:
     return paired_difference(rows[TRAINED_LABEL], rows[config.make_expert().describe()], "return")
 
 
-def _lacks_acc(driver: Driver, scenario: Scenario) -> bool:
-    """Return whether a driver uses the speeds ahead to limit the ACC of CAVs on a road where they have none."""
-    road = scenario.interface
-    uses_lane_speeds = "lane_speeds" in driver.requirements(road).input_fields and "lane_speeds" in road.provided_fields
-    return uses_lane_speeds and scenario.actuation != "cruise"
-
-
-def _controller_hashes(controllers: dict[str, str]) -> dict[str, str]:
+def controller_hashes(controllers: dict[str, str]) -> dict[str, str]:
     """Return the hashes of the controller files by the label of the driver."""
     return {label: sha256 for label, text in controllers.items() if (sha256 := controller_hash(text))}
-
-
-def drive(
-    scenario: str = "ring",
-    driver: str | DriverLike | Sequence[str | DriverLike] = "pi",
-    episodes: int = 5,
-    seed: int = 0,
-    scenario_options: dict[str, Any] | None = None,
-    reward: RewardLike = "",
-    workers: int | None = None,
-    out: Path | str | None = None,
-    progress: Callable[[Any, int], None] | None = None,
-    test_seeds: bool = False,
-    backend: BackendLike = "sumo",
-    baseline: str = "",
-) -> DriveResult:
-    """Run episodes and measure them.
-
-    Args:
-        scenario: its name.
-        driver: a name (`pi`), with parameters (`pi:window=30`), your own (`path.py:name`), a run folder, a `.unjam`
-            file; a driver, a function of the state, an object with `act` and `initial_memory` or a class of such
-            objects, which run in this process; or a list of them, to be compared on the same traffic.
-        episodes: number for each driver; they have the seeds `seed`, `seed + 1`, ...
-        seed: of the first episode.
-        scenario_options: changes to the scenario, e.g. `{"length": 230}` or `{"length": (220, 270)}`.
-        reward: a name or `path.py:name`; a function of an `Outcome`, with which all episodes run in this process;
-            empty: the scenario's own.
-        workers: processes; all cores by default. The result does not depend on it.
-        out: folder for the results and a report.html; None: nothing is written.
-        progress: called repeatedly with ((driver, episode), control steps so far).
-        test_seeds: whether to use the test seeds instead of `seed` and the following ones.
-        backend: the simulator: `sumo`, `batch`, `path.py:name`, or an object, with which all episodes run in this
-            process.
-        baseline: label of the driver that the others are compared with; empty: human drivers, or else the best expert.
-
-    Raises:
-        InputError: an argument is wrong; nothing was started.
-    """
-    counts = ("episodes", episodes, 1), ("seed", seed, 0), ("workers", 1 if workers is None else workers, 1)
-    for name, number, minimum in counts:
-        check_integer(name, number, minimum)
-    if seed + episodes > TRAINING_SEED_LIMIT:
-        raise invalid_value("seed", seed, f"<= {TRAINING_SEED_LIMIT - episodes}: larger ones are reserved")
-    if test_seeds and seed:
-        raise invalid_value("seed", seed, "none with test seeds")
-    road = make_scenario(scenario, scenario_options)
-    drivers: dict[str, Driver] = {}
-    for entry in [driver] if isinstance(driver, str) or not isinstance(driver, Sequence) else driver:
-        if isinstance(entry, str):
-            drivers[entry] = make_driver(entry, road.control_step)
-        else:
-            made = as_driver(entry, road.control_step)
-            drivers[unique_label(made, drivers)] = made
-    hashes = _controller_hashes({label: label for label in drivers})  # now: files may change while episodes run
-    for name, one in drivers.items():
-        check_can_drive(one, road, f"driver {name}")
-    if not drivers:
-        raise invalid_value("driver", driver, driver_names())
-    if baseline and baseline not in drivers:
-        raise unknown_name("baseline", baseline, drivers)
-    make_reward(reward or road.reward)
-    with open_backend(backend) as simulator:
-        check_support(simulator, road)
-    folder, report = Path(out) if out is not None else None, None
-    seeds = held_out_seeds(episodes) if test_seeds else [(seed + index,) for index in range(episodes)]
-    pool = WorkerPool(min(workers or os.cpu_count() or 1, episodes * len(drivers)))
-    with lock_new_folder(folder) if folder is not None else nullcontext(), pool:
-        evaluation = evaluate(road, in_order(drivers), seeds, pool, reward, progress, backend)
-        notes = [
-            *episode_notes(evaluation.rows),
-            *controller_notes(scenario_recipe(road), drivers, evaluation.plot_episodes),
-            *(f"{name} {MISSING_ACC_NOTE}" for name, one in drivers.items() if _lacks_acc(one, road)),
-            *backend_notes(backend, road),
-            *road.notes,
-        ]
-        has_results = any(row["status"] != "failed" for rows in evaluation.rows.values() for row in rows)
-        if folder is not None and has_results:
-            name = reward_label(reward or road.reward)
-            metadata = {"scenario": Path(scenario).name, "reward": name, "backend": backend_label(backend)}
-            contents = {"manifest": manifest(), "controllers": hashes, "notes": notes, "baseline": baseline}
-            save_evaluation(folder, evaluation, {**metadata, **contents})
-            from unjam.reports.html import write_report_page  # imported late: it draws
-
-            report = write_report_page([folder], folder / "report.html")
-    used_folder = folder if has_results else None
-    made_by = scenario, backend_label(backend)
-    details = used_folder, report, notes, baseline, next(iter(drivers))
-    return DriveResult(evaluation.rows, evaluation.plot_episodes, *made_by, *details)

@@ -1,5 +1,6 @@
 """Controller files: those in run folders, and the export of controllers."""
 
+import logging
 import os
 from collections.abc import Sequence
 from contextlib import suppress
@@ -16,23 +17,25 @@ from unjam.drivers.local_state import LocalState
 from unjam.drivers.registry import driver_recipe, user_code_recipes
 from unjam.drivers.residual import ResidualDriver
 from unjam.drivers.wrappers import FilteredDriver
-from unjam.errors import InputError, import_optional, invalid_value
+from unjam.errors import InputError, import_optional, invalid_value, raise_failure
 from unjam.files import atomic_write, check_parent_folder, make_folder
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarize
 from unjam.processes import PrivateFolder
-from unjam.reports.results import EVALUATION_FILE, read_evaluation
+from unjam.reports.results import CONTROLLER_FILE, EVALUATION_FILE, is_outdated, read_evaluation
 from unjam.scenarios import example_scenario, make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_scenario import CODE_ENTRY, class_reference
 from unjam.seeds import held_out_seeds
-from unjam.training.evaluate import TRAINED_LABEL, raise_failure
+from unjam.training.evaluate import TRAINED_LABEL
 from unjam.training.run_folder import check_run_files, controller_origin, read_config
 from unjam.trust import check_trusted, expecting_code
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 if TYPE_CHECKING:
     from unjam.learners.algorithm import Tensors
+
+_LOG = logging.getLogger(__name__)
 
 ControllerKind = Literal["best", "latest"]
 
@@ -72,7 +75,7 @@ class ControllerStore:
     def _write(self, kind: ControllerKind) -> None:
         for folder, content in zip(self._folders, self._contents.get(kind, ()), strict=False):
             make_folder(folder)
-            atomic_write(folder / "controller.unjam", content)
+            atomic_write(folder / CONTROLLER_FILE, content)
 
 
 @dataclass(frozen=True)
@@ -249,10 +252,15 @@ def _read_scenario(file: Path, recipe: dict[str, Any] | None) -> Scenario:
 
 
 def _test_metrics(folder: Path) -> dict[str, Any] | None:
-    """Return the test metrics of a run's controller and expert; None before its evaluation."""
+    """Return the test metrics of a run's controller and expert; None before the evaluation of this controller."""
     if not (folder / EVALUATION_FILE).is_file():
         return None
     evaluation, rows_by_driver = read_evaluation(folder)
+    if is_outdated(folder, evaluation):
+        _LOG.warning(
+            "export: the metrics in %s are of an earlier controller: left out; unjam evaluate measures", folder
+        )
+        return None
     metrics: dict[str, Any] = {"reward": evaluation["reward"]}
     for label in (TRAINED_LABEL, evaluation["expert"]):
         if rows := rows_by_driver.get(label):

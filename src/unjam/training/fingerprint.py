@@ -23,6 +23,10 @@ from unjam.training.config import RunConfig
 _LOG = logging.getLogger(__name__)
 
 
+ABSENT = "absent"
+"""what stands for the value of a setting that is not there"""
+
+
 def fingerprint(config: RunConfig) -> dict[str, Any]:
     """Return everything that the result of a training depends on, as JSON.
 
@@ -51,10 +55,10 @@ def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
 def check_settings(
     stored: dict[str, Any], current: dict[str, Any], command: str, ignored_prefixes: tuple[str, ...] = ()
 ) -> None:
-    """Raise `InputError` if a setting has changed whose name begins with none of `ignored_prefixes`."""
+    """Raise `InputError` if a setting was changed, added or removed, unless it begins with an ignored prefix."""
     _check_form(stored, command)
-    for name, value in current["settings"].items():
-        before = stored["settings"].get(name, value)
+    for name in {**current["settings"], **stored["settings"]}:
+        before, value = (each["settings"].get(name, ABSENT) for each in (stored, current))
         if not name.startswith(ignored_prefixes) and _without_folders(before) != _without_folders(value):
             raise invalid_value(f"{command}: {name}", value, f"{before!r}, as in the checkpoint")
 

@@ -220,6 +220,7 @@ def resume_run_folder(folder: Path, config: RunConfig) -> None:
     done = max((row.get("environment_steps", 0) for row in progress), default=0)
     if config.steps < min(before.steps, done):
         raise invalid_value("steps", config.steps, f">= {done}, which are done")
+    check_run_files(folder, config, "resume", ignored_prefixes=())
     if config != before:  # names of files remain as they are
         changed = {**read_toml(folder / CONFIG_FILE), "steps": config.steps, "workers": config.workers}
         files.atomic_write(folder / CONFIG_FILE, tomli_w.dumps(changed))
@@ -320,7 +321,9 @@ def _valid_checkpoints(folder: Path) -> Iterator[tuple[Path, dict[str, Any], byt
                 yield path, dict(json.loads(header["__metadata__"]["state"])), data
 
 
-def check_run_files(folder: Path, config: RunConfig, command: str) -> None:
+def check_run_files(
+    folder: Path, config: RunConfig, command: str, ignored_prefixes: tuple[str, ...] = ("evaluation.",)
+) -> None:
     """Raise `InputError` if files or settings that a run was trained with have changed; not without a checkpoint.
 
     The folder of a task has the checkpoint of its run.
@@ -332,7 +335,7 @@ def check_run_files(folder: Path, config: RunConfig, command: str) -> None:
         check_run_files(parent, run, command)
         stored = fingerprint(run.task_configs()[name])
     if stored:
-        check_settings(stored, current, command, ignored_prefixes=("evaluation.",))
+        check_settings(stored, current, command, ignored_prefixes)
         check_file_hashes(stored, current, command)
 
 

@@ -9,10 +9,11 @@ from typing import Any, Literal
 
 from unjam.errors import InputError, UnjamError
 from unjam.files import INVALID_DATA_ERRORS, remove
+from unjam.measures.feasibility import RowsByDriver
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.parameters import flatten_keys
 from unjam.processes import check_not_locked, is_locked
-from unjam.reports.results import EVALUATION_FILE, damaged_results_error, read_evaluation, read_progress
+from unjam.reports.results import EVALUATION_FILE, damaged_results_error, is_outdated, read_evaluation, read_progress
 from unjam.training.config import CONFIG_FILE, MANIFEST_FILE, RunConfig
 from unjam.training.run_folder import read_config
 
@@ -83,20 +84,26 @@ def read_run(folder: Path, name: str = "") -> Run:
         raise InputError(f"run: {str(folder)!r} is not a run folder: it has no {MANIFEST_FILE}")
     try:
         steps = int(progress[-1]["environment_steps"]) if progress else 0
-        gains = {task: _test_gain(folder / task) for task in config.task_configs()}
+        evaluations = {task: _current_evaluation(folder / task) for task in config.task_configs()}
+        gains = {task: found and _test_gain(*found) for task, found in evaluations.items()}
     except INVALID_DATA_ERRORS as error:
         raise damaged_results_error(folder, error) from None
-    is_evaluated = all((folder / task / EVALUATION_FILE).is_file() for task in gains)
+    is_evaluated = all(evaluations.values())
     is_trained = steps >= config.steps or config.evaluation.should_stop_early(progress)
     state: RunState = "finished" if is_evaluated and is_trained else "stopped"
     return Run(name or str(folder), folder, config, "running" if is_locked(folder) else state, steps, gains)
 
 
-def _test_gain(folder: Path) -> Estimate | None:
-    """Return the return difference to the expert; None before the evaluation, or without an expert."""
+def _current_evaluation(folder: Path) -> tuple[dict[str, Any], RowsByDriver] | None:
+    """Return metadata and rows of the evaluation of the controller in a folder; None before it."""
     if not (folder / EVALUATION_FILE).is_file():
         return None
     metadata, rows = read_evaluation(folder)
+    return None if is_outdated(folder, metadata) else (metadata, rows)
+
+
+def _test_gain(metadata: dict[str, Any], rows: RowsByDriver) -> Estimate | None:
+    """Return the return difference to the expert; None without an expert."""
     expert = rows.get(metadata.get("expert", ""))
     return paired_difference(rows[metadata["trained"]], expert, "return") if expert else None
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from math import ceil, isfinite, log2
 from typing import Any, NamedTuple
 
+from unjam.errors import raise_failure
 from unjam.measures.effect import FLOW_METRIC, TIME_METRIC, Effect, describe_harm, effect_of, is_too_small
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.recommendation import MIN_VERDICT_SEEDS, AccResult, ControllerResult, required_seeds
 from unjam.measures.statistics import CONFIDENCE, Estimate, format_percent, paired_difference, relative_difference
 from unjam.seeds import held_out_seeds, selection_seeds
 from unjam.text import format_count, format_duration
-from unjam.training.evaluate import raise_failure
 from unjam.training.executors import MessageCallback
 
 MAX_SELECTION_SEEDS = 10
@@ -79,6 +79,11 @@ class EpisodeBudget:
         """Estimated time until the budget is spent [s]."""
         seconds = self.estimate_seconds(self.episodes - self.used_episodes)
         return seconds if self.minutes is None else min(seconds, max(0.0, 60.0 * self.minutes - self.elapsed_seconds))
+
+    def has_time_for(self, episodes: int) -> bool:
+        """Return whether more episodes probably end within the time."""
+        is_limited = self.minutes is not None and self._completed_rounds
+        return not is_limited or self.elapsed_seconds + self.estimate_seconds(episodes) <= 60.0 * (self.minutes or 0.0)
 
     def affordable_seeds(self, option_count: int, fraction: float = 1.0) -> int:
         """Return the number of seeds on which so many options can run within a fraction of the budget."""
@@ -185,13 +190,14 @@ def compare_on_test_seeds(
     budget: EpisodeBudget,
     precision: float,
     on_message: MessageCallback,
+    on_findings: Callable[[AssessmentFindings], None] = lambda findings: None,
 ) -> AssessmentFindings:
     """Compare human baseline, ACC vehicles and the selected controllers on test seeds.
 
     An option runs until its CIs are narrower than `precision`, a share of the baseline's travel time, or until more
     seeds within the budget can hardly lead to a recommendation; a good result ends none, so that CIs are not too
     narrow. CIs hold together for all penetration rates with 95 % (Bonferroni). ACC vehicles with all properties of the
-    vehicles that they replace run `with_unchanged_acc`, too.
+    vehicles that they replace run `with_unchanged_acc`, too. `on_findings` is called after each round but the last.
     """
     acc_options = [Option(rate, ACC_DRIVER) for rate in penetration_rates]
     unchanged = [Option(rate, UNCHANGED_ACC_DRIVER) for rate in penetration_rates if with_unchanged_acc]
@@ -229,6 +235,8 @@ def compare_on_test_seeds(
         verb = "remains" if len(active) == 1 else "remain"
         remaining = f"; {format_count(len(active), 'option')} {verb}, {_remaining_time_text(budget)}" if active else ""
         on_message(status + remaining)
+        if active:
+            on_findings(AssessmentFindings(rows, results, acc_results))
     for options in filter(None, (acc_options, finalists)):
         option_rows = [row for option in options for row in rows[option]]
         if all(row["status"] == "failed" for row in option_rows):

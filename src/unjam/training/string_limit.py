@@ -9,11 +9,11 @@ import numpy as np
 from unjam.controller.string_stability import GAIN_TOLERANCE, operating_speeds, string_gains
 from unjam.drivers.car_following import Human
 from unjam.drivers.driver import Driver
+from unjam.errors import raise_failure
 from unjam.measures.metrics import measure
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import tuning_seeds
-from unjam.training.evaluate import raise_failure
 from unjam.training.export import driver_with_filter, without_filter
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 

@@ -15,7 +15,7 @@ from unjam.controller import controller_bytes
 from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.user_driver import is_file_reference
-from unjam.errors import InputError, invalid_value
+from unjam.errors import InputError, invalid_value, raise_failure
 from unjam.files import UNREADABLE_ERRORS, FileWatch, append_line, atomic_write, make_folder, to_json
 from unjam.kernels import needs_new_process
 from unjam.learners.agent import AgentSpec, check_network, check_state, learner_class, reporting_user_errors
@@ -35,12 +35,12 @@ from unjam.measures.statistics import Estimate, format_ci
 from unjam.measures.verdict import metric_frame
 from unjam.processes import lock_folder
 from unjam.reports.html import write_report_page
-from unjam.reports.results import read_progress
+from unjam.reports.results import CONTROLLER_FILE, read_progress
 from unjam.seeds import VALIDATION_SEED
 from unjam.text import one_line
 from unjam.training import run_folder
 from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
-from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert, raise_failure
+from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert
 from unjam.training.executors import IterationCallback, train_in_subprocess
 from unjam.training.export import ControllerStore
 from unjam.training.fingerprint import check_file_hashes, code_hashes, fingerprint
@@ -92,7 +92,7 @@ class TrainResult:
     @property
     def controller(self) -> Path:
         """The trained controller with the best validation return."""
-        return self.folder / "controller.unjam"
+        return self.folder / CONTROLLER_FILE
 
     @property
     def report(self) -> Path:
@@ -168,11 +168,12 @@ def train_in_process(
             for task_folder in [folder / name for name in config.task_configs() if name]:
                 make_folder(task_folder)
                 locks.enter_context(lock_folder(task_folder))
-            Trainer(folder, config, workers, on_iteration).train()
+            trainer = Trainer(folder, config, workers, on_iteration)
+            trainer.train()
             rows: dict[str, RowsByDriver] = {}
             for name, task in config.task_configs().items():
                 task_progress = partial(_report_task_progress, progress, name) if progress else None
-                rows[name] = evaluate_run(folder / name, task, workers, task_progress).rows
+                rows[name] = evaluate_run(folder / name, task, workers, task_progress, watch=trainer.watch).rows
         if not no_facts_reason(folder, config):
             write_model_facts(folder, config)
         write_report_page([folder / name for name in rows], folder / "report.html")
@@ -196,7 +197,7 @@ class Trainer:
     ) -> None:
         self.folder, self.config, self.workers = folder, config, workers
         self.tasks = config.make_tasks()
-        self._watch = FileWatch(lambda: {file for task in self.tasks for file in task.scenario.user_files})
+        self.watch = FileWatch(lambda: {file for task in self.tasks for file in task.scenario.user_files})
         self.folders = [folder / task.name for task in self.tasks]
         string_gain = self._string_gain_function() if config.policy.max_string_gain else None
         self.spec = AgentSpec(self.tasks, config.policy, config.model, config.learner.gamma, config.seed, string_gain)
@@ -312,7 +313,7 @@ class Trainer:
             whole, *tasks = self._progress_rows(log, validation)
         now = self._fingerprint["files"] | code_hashes(self.config)
         check_file_hashes(self._fingerprint, {"files": now}, "train")  # an iteration of changed code is not stored
-        self._watch.check()
+        self.watch.check()
         for folder, row in [*zip(self.folders, tasks, strict=False), (self.folder, whole)]:
             append_line(folder / run_folder.PROGRESS_FILE, to_json(row))
         self._save_checkpoint()

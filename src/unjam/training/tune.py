@@ -20,7 +20,7 @@ from unjam.controller.file import SUFFIX, controller_bytes
 from unjam.drivers.driver import label_with_parameters
 from unjam.drivers.registry import driver_from_name
 from unjam.drivers.user_driver import is_file_reference
-from unjam.errors import InputError, UnjamError, invalid_value, unknown_name
+from unjam.errors import InputError, UnjamError, invalid_value, raise_failure, unknown_name
 from unjam.files import FileWatch, atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, overall_feasibility
@@ -29,7 +29,6 @@ from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import tuning_seeds
-from unjam.training.evaluate import raise_failure
 from unjam.training.fingerprint import file_hashes
 from unjam.training.run_folder import controller_origin
 from unjam.training.search_space import SearchSpace, tunable_parameters

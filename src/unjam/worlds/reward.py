@@ -327,12 +327,21 @@ def validate_reward_terms(
     """Return the terms in steps from `start` on; raise `InputError` unless each has a finite value per step."""
     label, terms = f"reward {object_label(reward)}", dict[str, Floats]()
     for name, answer in reward(outcome).items():
-        values = answer_as_array(answer, len(outcome.speeds), label, f"term {name!r}", "control step")
+        row = "control step" if row_name == "step" else row_name
+        values = answer_as_array(answer, len(outcome.speeds), label, f"term {name!r}", row)
         if not np.isfinite(values).all():
             row = int(np.argmax(~np.isfinite(values)))
             raise InputError(f"{label}: {row_name} {start + row}: term {name!r} is {values[row]}; allowed: finite")
         terms[name] = values
     return terms
+
+
+def check_tensor_terms(reward: Reward, terms: dict[str, Array]) -> None:
+    """Raise `InputError` unless all terms of a reward are torch tensors, as the `Outcome` that it had."""
+    for name, values in terms.items():
+        if namespace(values) is np or isinstance(values, float):
+            kind = f"a {type(values).__name__} is not allowed for the term {name!r}"
+            raise InputError(f"reward {object_label(reward)}: {kind}; allowed: a tensor, made of those of the Outcome")
 
 
 def step_reward_terms(reward: Reward, outcome: Outcome, step: int, needs_rows: bool) -> dict[str, float]:

@@ -11,6 +11,7 @@ import torch
 from tests.worlds.batch.test_world import assert_alike
 from unjam.controller import make_driver
 from unjam.drivers.safety import Actuator, SafetyFilter
+from unjam.measures.platoon_metrics import time_behind_leader
 from unjam.models.rollouts import to_device
 from unjam.scenarios import Recorded
 from unjam.worlds.batch.ring.recorded import RecordedBatch
@@ -64,6 +65,15 @@ def test_the_recorded_vehicle_repeats_its_recording(tmp_path: Path) -> None:
     expected = 12.0 + 6.0 * np.sin(0.1 * np.arange(401) / 6.0)
     np.testing.assert_allclose(episode.replayed_motion[:, 0, 1], expected, atol=1e-5)
     assert episode.vehicle_ids == ("human_5", "human_4", "human_3", "human_2", "human_1", "cav_0")
+
+
+def test_the_time_behind_the_recorded_vehicle_may_be_longer_than_the_episode(tmp_path: Path) -> None:
+    times = 0.1 * np.arange(201)
+    pd.DataFrame({"time": times, "speed": 12.0}).to_csv(tmp_path / "a.csv", index=False)
+    road = Recorded(recordings=str(tmp_path / "a.csv"), platoon="cav human*30", noise=0.0)
+    (episode,) = run_batches([EpisodeTask(road, make_driver("human", 0.1), (0,))])
+    distance = episode.replayed_motion[-1, 0, 0] - episode.positions[-1, 0]
+    assert time_behind_leader(episode) == pytest.approx(distance / 12.0, rel=1e-3) > 20.0
 
 
 def test_torch_gives_the_same_speeds() -> None:
