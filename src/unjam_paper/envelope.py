@@ -42,6 +42,7 @@ USUAL_CAR_ROADS: dict[str, str] = {
 """those that are evaluated in usual cars"""
 LANE_CONTROLLERS = ("unjam:on-ramp-tuned",)
 USUAL_CAR_CONTROLLERS = tuple(name for name, road in USUAL_CAR_ROADS.items() if road != "figure-eight")
+USUAL_CAR_PACERS = tuple(name for name, road in USUAL_CAR_ROADS.items() if road == "figure-eight")
 RING_CONTROLLERS = tuple(name for name, road in CONTROLLER_ROADS.items() if road != "figure-eight")
 RING_STEPS: dict[str, Any] = {"simulation_step": 0.1, "steps_per_control_step": 1}
 """those of the rings, which their controllers need on any road"""
@@ -85,10 +86,10 @@ def envelope_rings(**changes: Any) -> Iterator[tuple[str, Ring]]:
         yield name, Ring(**{"actuator": INSTANT_ACTUATOR, **size, **changes})
 
 
-def envelope_figure_eights() -> Iterator[tuple[str, FigureEight]]:
+def envelope_figure_eights(actuator: Actuator = INSTANT_ACTUATOR) -> Iterator[tuple[str, FigureEight]]:
     """Yield the figure eights by name."""
     for low, high in ((27, 29), (30, 31), (32, 35), (36, 40), (41, 50)):
-        yield f"radius {low} to {high} m", FigureEight(radius=(low, high), actuator=INSTANT_ACTUATOR)
+        yield f"radius {low} to {high} m", FigureEight(radius=(low, high), actuator=actuator)
 
 
 def envelope_lanes(**changes: Any) -> Iterator[tuple[str, Motorway]]:
@@ -116,6 +117,7 @@ def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart
     tests: tuple[tuple[str, Iterator[tuple[str, Scenario]], tuple[str, ...], int], ...] = (
         ("rings", envelope_rings(), closed, ENVELOPE_SEEDS),
         ("figure-eights", envelope_figure_eights(), closed, ENVELOPE_SEEDS),
+        ("figure-eights-usual-car", envelope_figure_eights(STANDARD_ACTUATOR), USUAL_CAR_PACERS, ENVELOPE_SEEDS),
         ("rings-raw-usual-car", envelope_rings(actuation="raw", **usual_cars), USUAL_CAR_CONTROLLERS, ENVELOPE_SEEDS),
         ("lanes-raw", envelope_lanes(), LANE_CONTROLLERS, RAW_ACTUATION_SEEDS),
         ("lanes-raw", envelope_lanes(**RING_STEPS), RING_CONTROLLERS, RAW_ACTUATION_SEEDS),
@@ -197,7 +199,7 @@ ENVELOPE = Study(
     minutes=30.0,
     tables={
         **{part: partial(worst_table, part) for part in (WORST_PART, USUAL_CAR_WORST_PART)},
-        **{part: partial(domain_table, part) for part in ("rings", "figure-eights")},
+        **{part: partial(domain_table, part) for part in ("rings", "figure-eights", "figure-eights-usual-car")},
         "rings-usual-car": partial(domain_table, "rings-raw-usual-car"),
         **{part: partial(contact_table, part) for part in ("rings-raw-usual-car", "lanes-raw")},
         **{part: partial(impaired_table, part) for part in ("impaired", "impaired-jammed")},

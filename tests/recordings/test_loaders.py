@@ -578,7 +578,7 @@ def test_reused_vehicle_number_is_another_driver(tmp_path: Path) -> None:
 
 def test_a_change_of_the_kind_within_a_pair_ends_a_trajectory(tmp_path: Path) -> None:
     kinds = np.where(np.arange(2 * SAMPLES) < SAMPLES // 2, "ACC", "human")
-    read = read_trajectories(write_table_file(tmp_path / "table.csv", kind=kinds), SHORT)
+    read = read_trajectories(write_table_file(tmp_path / "table.csv", kind=kinds), options=SHORT)
     assert [(each.kind, len(each.speed)) for each in read.trajectories] == [
         ("ACC", SAMPLES // 2),
         ("human", SAMPLES // 2),

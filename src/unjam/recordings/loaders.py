@@ -347,7 +347,7 @@ def split_trajectories(
 
 def _find_other_facts(rows: pd.DataFrame) -> NDArray[np.bool_]:
     """Return after which rows the driver, kind or split changes."""
-    facts = [rows[name].fillna("").to_numpy() for name in OPTIONAL_COLUMNS if name in rows]
+    facts = [rows[name].astype(object).fillna("").to_numpy() for name in OPTIONAL_COLUMNS if name in rows]
     changes = [each[1:] != each[:-1] for each in facts]
     return np.logical_or.reduce(changes) if changes else np.zeros(len(rows) - 1, bool)
 

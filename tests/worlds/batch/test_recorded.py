@@ -73,7 +73,8 @@ def test_the_time_behind_the_recorded_vehicle_may_be_longer_than_the_episode(tmp
     road = Recorded(recordings=str(tmp_path / "a.csv"), platoon="cav human*30", noise=0.0)
     (episode,) = run_batches([EpisodeTask(road, make_driver("human", 0.1), (0,))])
     distance = episode.replayed_motion[-1, 0, 0] - episode.positions[-1, 0]
-    assert time_behind_leader(episode) == pytest.approx(distance / 12.0, rel=1e-3) > 20.0
+    assert distance / 12.0 > 20.0
+    assert time_behind_leader(episode) == pytest.approx(distance / 12.0, rel=1e-3)
 
 
 def test_torch_gives_the_same_speeds() -> None:
