@@ -211,7 +211,7 @@ def _feasible_parts(variants: Mapping[str, str], study_folder: study.StudyFolder
 def feasible_table(road: str, folder: Path) -> pd.DataFrame:
     """Return for each driver the metrics over all sizes, and the differences to the tuned experts."""
     comparison, about = study.DriverComparison([*read_part(folder, road).values()]), FEASIBLE_ROADS[road]
-    gains: dict[str, float] = read_part(folder, f"{road}{GAINS_SUFFIX}") if about.gain_road else {}
+    gains: dict[str, float | None] = read_part(folder, f"{road}{GAINS_SUFFIX}") if about.gain_road else {}
     rows = []
     for label, group in comparison.groups({"training": "residual"}).items():
         row = {"driver": label, "return": comparison.mean(group, about.metric, 0)}
@@ -223,9 +223,10 @@ def feasible_table(road: str, folder: Path) -> pd.DataFrame:
         row["fuel [ml/km]"] = comparison.mean(group, "fuel_ml_per_km", 0)
         row["dissolved after [s]"] = _dissolution_text(comparison.values(group, "time_to_dissolve"))
         row["min time gap [s]"] = comparison.min_time_gap(group)
-        own_gains = [gains[each] for each in group if each in gains]
-        ends = sorted({min(own_gains), max(own_gains)}) if own_gains else []
+        known = [gains[each] for each in group if gains.get(each) is not None]
+        ends, behind = sorted({min(known), max(known)}) if known else [], len(set(group) & gains.keys()) - len(known)
         row["string gain"] = " to ".join(f"{gain:.2f}" for gain in ends) or study.NO_VALUE_TEXT
+        row["string gain"] += f"; {behind} fall behind their leader" if behind else ""
         rows.append({**row, "feasible": comparison.feasibility(group)})
     table = pd.DataFrame(rows)
     return table.loc[:, (table != study.NO_VALUE_TEXT).any()]

@@ -10,7 +10,13 @@ import pytest
 
 from unjam.controller import certificate as certificates
 from unjam.controller import string_stability
-from unjam.controller.certificate import OperatingDomain, certify_driver, describe_worst_cases, make_certificate
+from unjam.controller.certificate import (
+    OperatingDomain,
+    certify_driver,
+    describe_string_stability,
+    describe_worst_cases,
+    make_certificate,
+)
 from unjam.controller.domain import outside_domain_share
 from unjam.controller.file import (
     CERTIFICATE_PART,
@@ -108,9 +114,19 @@ def test_people_amplify_sway_exactly_where_the_idm_is_known_to_be_unstable(accel
     assert (human_gain(low, v, humans).max() <= 1.0 + 1e-6) == stable
 
 
-def test_who_stands_still_stabilises_any_number_of_people() -> None:
+def test_a_vehicle_that_stands_still_does_not_count_as_string_stable(tmp_path: Path) -> None:
     still = certify_driver(filter_driver(Constant(-1.0)), visited_states(), PAPER_IDM)
-    assert all(each.max_stable_followers == string_stability.MAX_FOLLOWERS for each in still.string_stability)
+    assert all(np.isnan(each.gains).all() and not each.max_stable_followers for each in still.string_stability)
+    file = written(tmp_path, filter_driver(Constant(-1.0)))
+    controller = read_controller(file)
+    certificate = make_certificate(controller)
+    verdict = describe_string_stability(certificate, filter_driver(Constant(-1.0)))
+    assert verdict.startswith("string stability is unknown, ")
+    assert verdict.endswith("m/s it falls behind its leader")
+    write_certificate_page("still", filter_driver(Constant(-1.0)), certificate, verdict, tmp_path / "page.html")
+    assert "it falls behind its leader: its string stability is unknown" in (tmp_path / "page.html").read_text()
+    add_certificate(file, controller, certificate)
+    verify_controller_file(file)
 
 
 def test_a_state_outside_of_the_domain_is_told_from_one_within() -> None:

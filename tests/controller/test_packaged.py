@@ -52,9 +52,7 @@ def test_there_is_one_for_each_preset_that_is_known_to_reach_furthest() -> None:
 
 @pytest.mark.parametrize("name", ["nothing", "", "../ring-best", "ring-best.unjam"])
 def test_another_name_lists_those_that_there_are(name: str) -> None:
-    with pytest.raises(
-        InputError, match="allowed: unjam:best, unjam:figure-eight-best, unjam:figure-eight-best-ideal"
-    ):
+    with pytest.raises(InputError, match="allowed: unjam:best, unjam:figure-eight-best, unjam:figure-eight-best-ideal"):
         make_driver(f"{PACKAGED_PREFIX}{name}", 0.1)
 
 

@@ -101,7 +101,12 @@ def certify_command(
     - unjam certify unjam:ring-tuned
     - unjam certify unjam:ring-best --set actuator.delay=0.4     (with the filter for this car)
     """
-    from unjam.controller.certificate import describe_string_stability, describe_worst_cases, make_certificate
+    from unjam.controller.certificate import (
+        describe_string_stability,
+        describe_worst_cases,
+        falls_behind,
+        make_certificate,
+    )
 
     if out is not None:
         check_page_path(out)
@@ -128,7 +133,8 @@ def certify_command(
         return
     console.print(verdict)
     for each in certificate["string_stability"]:
-        console.print(f"  at {each['speed']:g} m/s: gain {max(each['gains']):.3f} at {each['peak_frequency']:.3g} Hz")
+        gain = f"gain {max(each['gains']):.3f} at {each['peak_frequency']:.3g} Hz"
+        console.print(f"  at {each['speed']:g} m/s: {'falls behind its leader' if falls_behind(each) else gain}")
     console.print(describe_worst_cases(certificate, controller.driver))
     err_console.print(f"page: {target}")
 

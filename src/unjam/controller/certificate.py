@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from math import isnan
 from typing import Any
 
 import numpy as np
@@ -112,11 +113,18 @@ def describe_worst_cases(certificate: dict[str, Any], driver: FilteredDriver) ->
     )
 
 
+def falls_behind(result: dict[str, Any]) -> bool:
+    """Return whether a vehicle falls behind its leader in a test of string stability, so that it has no gain."""
+    return any(gain is None or isnan(gain) for gain in result["gains"])
+
+
 def describe_string_stability(certificate: dict[str, Any], driver: FilteredDriver) -> str:
     """Return in one line whether a controller amplifies oscillations of its leader, and in which vehicle."""
     results, vehicle = certificate["string_stability"], driver.actuator.describe()
     if not results:
         return f"string stability was not tested, {vehicle}"
+    if behind := [f"{each['speed']:g}" for each in results if falls_behind(each)]:
+        return f"string stability is unknown, {vehicle}: at {', '.join(behind)} m/s it falls behind its leader"
     if not any(each["amplified_band"] for each in results):
         return f"string stable, {vehicle}"
     gain = max(max(each["gains"]) for each in results)

@@ -18,6 +18,7 @@ SETTLING_SECONDS = 300.0  # time behind a leader with constant speed, before the
 GAIN_TOLERANCE = 0.02  # a vehicle counts as string stable with gains up to one plus this tolerance
 OPERATING_SPEED_RATIOS = (0.5, 1.0, 1.5)  # shares of the mean speed of CAVs on their road
 MIN_OPERATING_SPEED = 1.0  # [m/s]
+MIN_SPEED_SHARE = 0.9  # mean speed as a share of the leader's, below which a vehicle does not follow, but falls behind
 MAX_FOLLOWERS = 60  # human drivers behind a CAV
 
 
@@ -27,7 +28,8 @@ class StringStability:
 
     speed: float
     frequencies: tuple[float, ...]
-    gains: tuple[float, ...]  # amplitude of the CAV divided by that of the leader, at each frequency
+    gains: tuple[float, ...]
+    """amplitude of the CAV divided by that of the leader, at each frequency; NaN where it falls behind its leader"""
     human_gains: tuple[float, ...]  # gain of a human driver at each frequency, by the linearized IDM
     peak_frequency: float  # frequency of the CAV's largest gain
     amplified_band: tuple[float, ...]  # smallest and largest frequency beyond the tolerance; empty if there is none
@@ -61,7 +63,8 @@ def string_gains(
 ) -> Floats:
     """Return the gain at each speed [m/s] and each of the `OSCILLATION_FREQUENCIES`, shape (speeds, frequencies).
 
-    The filter, the limits and the actuator of the driver act, and the CAV starts with the gap of human drivers.
+    The filter, the limits and the actuator of the driver act, and the CAV starts with the gap of human drivers. The
+    gain is NaN where it falls behind its leader: a vehicle that stands still passes on no oscillation either.
     """
     if not speeds:
         return np.zeros((0, len(OSCILLATION_FREQUENCIES)))
@@ -78,7 +81,9 @@ def string_gains(
         [_amplitude(response, times, each) for response, each in zip(rows, OSCILLATION_FREQUENCIES, strict=True)]
         for rows in responses.transpose(1, 2, 0)
     ]
-    return np.array(amplitudes) / (OSCILLATION_AMPLITUDE * np.array(speeds)[:, None])
+    settled = responses[times > 0.5 * (SETTLING_SECONDS + times[-1])].mean(0)
+    gains = np.array(amplitudes) / (OSCILLATION_AMPLITUDE * np.array(speeds)[:, None])
+    return np.where(settled >= MIN_SPEED_SHARE * np.array(speeds)[:, None], gains, np.nan)
 
 
 def human_gain(frequencies: Floats, speed: float, humans: IDMParameters) -> Floats:

@@ -34,7 +34,7 @@ def write_certificate_page(
         cards=cards,
         verdict=verdict,
         notes=_certificate_notes(certificate),
-        string_stability=strings,
+        string_stability=[(each, _max_gain(each)) for each in strings],
         attack_figure=data_uri(_attack_figure(worst["attack"])),
         string_figure=data_uri(_string_figure(strings)),
         domain=[(label, certificate["domain"][key], unit) for label, key, unit in DOMAIN_QUANTITIES],
@@ -42,15 +42,22 @@ def write_certificate_page(
     atomic_write(target, text)
 
 
+def _max_gain(result: dict[str, Any]) -> float:
+    """Return the largest gain at a speed; NaN if the vehicle falls behind its leader there."""
+    return float(np.array(result["gains"], np.float64).max())
+
+
 def _certificate_notes(certificate: dict[str, Any]) -> list[str]:
     notes = []
     if not certificate["comfort"]["meets_iso_15622"]:
         notes.append("In its sample it brakes or accelerates harder than ISO 15622 allows for ACC.")
     for each in certificate["string_stability"]:
-        if each["amplified_band"]:
+        if np.isnan(_max_gain(each)):
+            notes.append(f"At {each['speed']:g} m/s it falls behind its leader: its string stability is unknown.")
+        elif each["amplified_band"]:
             low, high = each["amplified_band"]
             band = f"of {low:.3g} Hz" if low == high else f"between {low:.3g} and {high:.3g} Hz"
-            gain = f"by up to {max(each['gains']):.3f} times"
+            gain = f"by up to {_max_gain(each):.3f} times"
             notes.append(f"At {each['speed']:g} m/s it amplifies oscillations {band}, {gain}: it is not string stable.")
     return notes
 
@@ -70,7 +77,8 @@ def _string_figure(string_stability: list[dict[str, Any]]) -> Figure:
     panels = figure.subplots(1, max(1, len(string_stability)), sharey=True, squeeze=False)[0]
     for axes, each in zip(panels, string_stability, strict=False):
         axes.axhline(1.0, color=MUTED_COLOR, lw=0.8)
-        axes.semilogx(each["frequencies"], each["gains"], color=CAV_PLOT_COLOR, label="controller")
+        gains = np.array(each["gains"], np.float64)  # with NaN for null
+        axes.semilogx(each["frequencies"], gains, color=CAV_PLOT_COLOR, label="controller")
         human = {"color": LINE_COLORS[2], "ls": "--", "label": "human driver (IDM)"}
         axes.semilogx(each["frequencies"], each["human_gains"], **human)
         axes.set(xlabel="frequency [Hz]", title=f"{each['speed']:g} m/s")

@@ -34,10 +34,13 @@ class OperatingPoint:
     """speeds of the leader [m/s]"""
 
     def string_gain(self, driver: Driver) -> float:
-        """Return the largest gain at any speed and frequency, with filter and actuator of the road."""
+        """Return the largest gain at any speed and frequency, with filter and actuator of the road.
+
+        It is infinite for a driver that falls behind its leader.
+        """
         in_car = driver_with_filter(without_filter(driver), self.road)  # a file may have a filter for another car
         gains = string_gains(in_car, self.speeds, self.road.humans, self.loop_length)
-        return float(gains.max(initial=0.0))
+        return float(np.nan_to_num(gains, nan=np.inf).max(initial=0.0))
 
 
 def find_operating_points(roads: Mapping[str, Scenario], workers: WorkerPool) -> dict[str, OperatingPoint]:
