@@ -11,18 +11,18 @@ from unjam.measures.metric_table import estimate_cell
 from unjam.measures.statistics import paired_difference
 
 REASONS = {
-    "ring-best": "the largest return of the trained controllers from a standstill, with the smallest string gain",
+    "ring-best": "a return among the largest of ten trainings from a standstill, with the smallest string gain",
     "ring-best-ideal": "the controller of this name for ideal cars, the ablation",
     "ring-gap-tuned": "a tuned formula for a start; the expert of `ring-best`",
     "ring-tuned": "a formula of few parameters; for waves (`ring-jammed`), not for a start",
     "rings-tuned": "for many rings, the expert of `unjam:best`",
     "shared-rings-tuned": "for rings that several CAVs share; the expert of `unjam:best` there",
-    "ring-jammed-best": "the largest return in a developed wave",
+    "ring-jammed-best": "a larger return than its formula in a developed wave",
     "ring-jammed-best-ideal": "the controller of this name for ideal cars, the ablation",
-    "ring-jammed-tuned": "the largest return of a formula in a developed wave",
+    "ring-jammed-tuned": "the largest mean return of a formula in a developed wave; compared with that for ideal cars undecided",
     "ring-jammed-tuned-ideal": "the controller of this name for ideal cars, the ablation",
-    "figure-eight-best": "the fastest figure eight",
-    "figure-eight-best-ideal": "the controller of this name for ideal cars, the ablation",
+    "figure-eight-best": "the largest return by Eq. 16; its queue sometimes breaks in cars that respond at once",
+    "figure-eight-best-ideal": "the residual for ideal cars, which holds its queue in both",
     "figure-eight-tuned": "the largest return of a formula by Eq. 16",
     "figure-eight-tuned-ideal": "the controller of this name for ideal cars, the ablation",
 }

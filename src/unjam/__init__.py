@@ -57,7 +57,7 @@ _LAZY_IMPORTS = {
     **{"measure": "unjam.measures.metrics", "DifferentiableRings": "unjam.models.differentiable_rings"},
     **{"benchmark": "unjam.benchmarks.run", "verify_controller": "unjam.resource_limits"},
     **{"write_report": "unjam.resource_limits", "held_out_seeds": "unjam.seeds"},
-    **{"load_config": "unjam.training.config", "drive": "unjam.training.evaluate"},
+    **{"load_config": "unjam.training.config", "drive": "unjam.training.drive"},
     **{"export_controller": "unjam.training.export", "load_world_model": "unjam.training.learned_model"},
     **{"list_runs": "unjam.training.runs", "train": "unjam.training.train", "trusting_code": "unjam.trust"},
     **{"run_episode": "unjam.worlds.episode"},

@@ -225,8 +225,9 @@ def feasible_table(road: str, folder: Path) -> pd.DataFrame:
         row["min time gap [s]"] = comparison.min_time_gap(group)
         known = [gains[each] for each in group if gains.get(each) is not None]
         ends, behind = sorted({min(known), max(known)}) if known else [], len(set(group) & gains.keys()) - len(known)
-        row["string gain"] = " to ".join(f"{gain:.2f}" for gain in ends) or study.NO_VALUE_TEXT
-        row["string gain"] += f"; {behind} fall behind their leader" if behind else ""
+        texts = [" to ".join(f"{gain:.2f}" for gain in ends)] if ends else []
+        texts += [f"{behind} of {len(group)} fall behind their leaders"] if behind else []
+        row["string gain"] = "; ".join(texts) or study.NO_VALUE_TEXT
         rows.append({**row, "feasible": comparison.feasibility(group)})
     table = pd.DataFrame(rows)
     return table.loc[:, (table != study.NO_VALUE_TEXT).any()]
