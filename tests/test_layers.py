@@ -337,7 +337,7 @@ CHANGES_THE_PROCESS = {
     "training/speed": "in the command line",
     "following/networks": "in the command line",
     "unjam_paper/theory": "in the command line",
-    "adapters/onnx_export": "while a network is written, and restored",
+    "onnx_models": "while a network is written, and restored",
     "worlds/worker": "in a worker",
     "worlds/episode": "for the length of an episode, under a lock, and restored",
     "worlds/messages": "in a worker, or in a process that runs SUMO",

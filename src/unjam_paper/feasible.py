@@ -223,7 +223,7 @@ def feasible_table(road: str, folder: Path) -> pd.DataFrame:
         row["fuel [ml/km]"] = comparison.mean(group, "fuel_ml_per_km", 0)
         row["dissolved after [s]"] = _dissolution_text(comparison.values(group, "time_to_dissolve"))
         row["min time gap [s]"] = comparison.min_time_gap(group)
-        known = [gains[each] for each in group if gains.get(each) is not None]
+        known = [gain for each in group if (gain := gains.get(each)) is not None]
         ends, behind = sorted({min(known), max(known)}) if known else [], len(set(group) & gains.keys()) - len(known)
         texts = [" to ".join(f"{gain:.2f}" for gain in ends)] if ends else []
         texts += [f"{behind} of {len(group)} fall behind their leaders"] if behind else []
