@@ -42,7 +42,7 @@ class AssessmentRequest:
     penetration_rates: tuple[float, ...]
     episodes: int
     minutes: float | None
-    """time budget, checked between batches"""
+    """time budget; beyond the fewest seeds of an answer, none begins that probably does not fit into it"""
     precision: float
     """target half-width of the CI of travel time, as a share of the baseline's travel time"""
 
