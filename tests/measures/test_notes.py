@@ -34,6 +34,16 @@ def test_note_has_driver_count_and_reasons_of_early_ends() -> None:
     ]
 
 
+@pytest.mark.parametrize(("own", "unfinished", "has_note"), [(2400.0, 0, True), (2390.0, 0, False), (2400.0, 1, False)])
+def test_flow_that_is_the_demand_with_all_drivers_is_noted(own: float, unfinished: int, has_note: bool) -> None:
+    arrived = {"delay_share_at_end": 0.0}
+    human = rows_of(2, outflow_veh_per_h=2400.0, unfinished_trips=0, **arrived)
+    driven = rows_of(2, outflow_veh_per_h=own, unfinished_trips=unfinished, **arrived)
+    notes = episode_notes({"human": human, "acc": driven})
+    assert [note.startswith("flow: that of the demand") for note in notes] == [True] * has_note
+    assert episode_notes({"human": human}) == []
+
+
 def test_note_counts_drives_that_episodes_repeat() -> None:
     def drives(*files: int, begin: float = 0.0) -> list[dict[str, Any]]:
         return [{**row, "file": file, "part": 0, "begin": begin} for row, file in zip(rows_of(9), files, strict=False)]

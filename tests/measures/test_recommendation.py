@@ -174,6 +174,13 @@ def test_controller_that_changes_nothing_is_reported() -> None:
             "with 4 test seeds, where a verdict needs 10, "
             "the difference of travel time to ACC vehicles alone is +0.0 [-1.0, +1.0] s",
         ),
+        (
+            replace(
+                OPEN, difference_to_acc=between(0.7, 4.7, 4), effect=replace(GOOD, travel_time=between(-7.0, 13.0))
+            ),
+            "with 4 test seeds, where a verdict needs 10, "
+            "the difference of travel time to ACC vehicles alone is +2.7 [+0.7, +4.7] s, so far longer",
+        ),
     ],
 )
 def test_open_question_names_its_comparison(result: ControllerResult, question: str) -> None:

@@ -13,6 +13,7 @@ from unjam.reports.summary import (
     baseline_differences,
     command_differences,
     common_baseline,
+    compare_alternative,
     csv_text,
     first_alternative,
     format_difference,
@@ -349,6 +350,12 @@ def test_two_configurations_of_a_network_are_compared_on_the_same_seeds() -> Non
     plain = drive_results("runs/plain", "a.sumocfg", human=rows_of([1.0, 2.0]))
     limited = drive_results("runs/limited", "b.sumocfg", human=rows_of([5.0, 7.0]))
     assert first_alternative([plain, limited]) == "plain: human"
+    assert mismatch_warning([plain, limited]).endswith("so compare travel times.")
+    _, column = report_columns([plain, limited])
+    verdict = compare_alternative(column, plain.rows["human"]).verdict
+    assert verdict is not None
+    assert verdict.driver == "limited: human"
+    assert "human drivers of the first network, 2 paired seeds" in verdict.comparison
     others = {
         "other seeds": drive_results("runs/c", "c.sumocfg", human=rows_of([1.0])),
         "no humans": drive_results("d", "d.sumocfg", pi=[]),

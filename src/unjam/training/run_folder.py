@@ -329,12 +329,13 @@ def check_run_files(
     The folder of a task has the checkpoint of its run.
     """
     newest = next((state for _, state, _ in _valid_checkpoints(folder / "checkpoint")), {})
-    stored, current = newest.get("fingerprint"), fingerprint(config)
+    stored = newest.get("fingerprint")
     if not stored and (name := folder.absolute().name) in _task_names(parent := folder.absolute().parent):
         run = read_config(parent)
         check_run_files(parent, run, command)
         stored = fingerprint(run.task_configs()[name])
     if stored:
+        current = fingerprint(config)
         check_settings(stored, current, command, ignored_prefixes)
         check_file_hashes(stored, current, command)
 
