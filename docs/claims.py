@@ -42,7 +42,7 @@ steps each; rows with `paper-exact` have the 4,000,000 of its authors' code (1,0
   state its size.
 - *In validation*: the same trainings without exploration, on the seeds that select the checkpoint.
 
-Verdicts are about the two to ten trainings that they name, with these settings, and not about methods; they are not
+Verdicts are about the three to ten trainings that they name, with these settings, and not about methods; they are not
 corrected for their number, and many share trainings: Tables 1 and 2 and Figures 9 and 10 have the same ones of TRPO and
 of the method, and the rows with ten trainings contain them. Numbers are means over trainings, in Figure 5 and rows on
 collisions interquartile means, as in [tables and figures](docs/results.md).
