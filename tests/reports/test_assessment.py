@@ -218,16 +218,22 @@ def test_names_of_drivers_have_no_hidden_characters(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rates", "drivers", "is_kept"),
-    [([0.1], {"pi": {"window": 30.0}}, False), ([0.2], {"pi": {"window": 30.0}}, True), ([0.1], {"pi": {}}, True)],
+    ("rates", "drivers", "seeds", "is_kept"),
+    [
+        ([0.1], {"pi": {"window": 30.0}}, 10, False),
+        ([0.1], {"pi": {"window": 30.0}}, 9, True),
+        ([0.2], {"pi": {"window": 30.0}}, 10, True),
+        ([0.1], {"pi": {}}, 10, True),
+    ],
 )
-def test_the_answer_to_another_question_is_kept(
-    rates: list[float], drivers: dict[str, Any], is_kept: bool, tmp_path: Path
+def test_the_answer_to_another_question_or_with_more_seeds_is_kept(
+    rates: list[float], drivers: dict[str, Any], seeds: int, is_kept: bool, tmp_path: Path
 ) -> None:
-    (tmp_path / "assessment.json").write_text('{"penetration_rates": [0.1], "drivers": {"pi": {"window": 30.0}}}')
+    stored = {"penetration_rates": [0.1], "drivers": {"pi": {"window": 30.0}}, "seeds": {"test": 10}}
+    (tmp_path / "assessment.json").write_text(json.dumps(stored))
     (tmp_path / "assessment.html").write_text("page")
     (tmp_path / "assessment-1.html").write_text("of an interrupted call")
-    kept = keep_earlier_answer(tmp_path, rates, drivers)
+    kept = keep_earlier_answer(tmp_path, rates, drivers, seeds)
     assert kept == (tmp_path / "assessment-2.html" if is_kept else None)
     names = {path.name for path in tmp_path.iterdir()} - {"assessment-1.html"}
     assert names == {f"assessment{'-2' if is_kept else ''}.{suffix}" for suffix in ("json", "html")}

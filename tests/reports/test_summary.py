@@ -305,6 +305,8 @@ def test_a_comparison_names_the_options_in_which_the_commands_differ() -> None:
     ]
     assert command_differences([first, result("b", "-d", "pi", "--length", "230", "-n", "2")])[0] == ("a", "")
     assert command_differences([first, result("b", "-d", "pi", "--length", "230", "--out", "b")]) == []
+    assert command_differences([result("a", "--all", "x"), result("b", "--all", "y")]) == [("a", "x"), ("b", "y")]
+    assert command_differences([first, Results(Path("b"), {}, {}, {})]) == [], "it is unknown"
 
 
 def test_title_without_an_expert_names_no_residual() -> None:
@@ -363,6 +365,8 @@ def test_two_configurations_of_a_network_are_compared_on_the_same_seeds() -> Non
     }
     assert [first_alternative([plain, each]) for each in others.values()] == [""] * 3
     assert first_alternative([plain]) == ""
+    same = drive_results("runs/limited", "b.sumocfg", human=rows_of([1.0, 2.0]))
+    assert first_alternative([plain, same]) == "", "the same human traffic"
 
 
 def test_the_baseline_of_several_folders_ran_the_same_episodes() -> None:

@@ -292,7 +292,7 @@ def test_an_assessment_continues_with_other_controllers_and_more_episodes(file: 
         lower = make_request(file, [0.4], 20, 0.02, None, ["acc"], HELD)
         assess(lower, folder, workers, on_message=messages.append)
         assert (folder / "assessment-1.json").read_text() == document
-        assert f"the answer to the earlier question is now in {folder / 'assessment-1.html'}" in messages
+        assert f"the earlier answer is now in {folder / 'assessment-1.html'}" in messages
         assert json.loads((folder / "assessment.json").read_text())["penetration_rates"] == [0.4]
         other = make_request(file, [0.5], 20, 0.02, None, ["acc"], {**HELD, "horizon": 140})
         with pytest.raises(InputError, match=r"other settings \(scenario\.horizon: 150 there, 140 now\)"):

@@ -1,16 +1,17 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 import tomli_w
 
 import unjam
 from unjam.errors import InputError
-from unjam.files import append_line, sha256_of, to_json
+from unjam.files import append_line, to_json
 from unjam.measures.metrics import METRICS
 from unjam.processes import lock_folder
-from unjam.reports.results import CONTROLLER_FILE
+from unjam.reports.results import CONTROLLER_FILE, weights_id
 from unjam.training.config import RunConfig, load_config
 from unjam.training.run_folder import create_run_folder
 from unjam.training.runs import config_differences, read_run, remove_run
@@ -61,10 +62,17 @@ def test_runs_are_listed_with_state_and_steps(under: Path) -> None:
 
 def test_an_evaluation_of_an_earlier_controller_does_not_count(under: Path) -> None:
     folder = under / "ring-001"
-    (folder / CONTROLLER_FILE).write_bytes(b"newer")
+    older = None
+    for content in ("older", "newer"):
+        with ZipFile(folder / CONTROLLER_FILE, "w") as archive:
+            archive.writestr("weights.safetensors", content)
+        if content == "older":
+            older = weights_id(folder / CONTROLLER_FILE)
+    with ZipFile(folder / CONTROLLER_FILE, "a") as archive:
+        archive.writestr("signature.json", "{}")  # of the maker, which changes the file
     about = json.loads((folder / "evaluation.json").read_text())
-    for content, state in ((b"newer", "finished"), (b"older", "stopped")):
-        (folder / "evaluation.json").write_text(json.dumps(about | {"controllers": {"trained": sha256_of(content)}}))
+    for weights, state in ((weights_id(folder / CONTROLLER_FILE), "finished"), (older, "stopped")):
+        (folder / "evaluation.json").write_text(json.dumps(about | {"weights": weights}))
         (found,) = (run for run in unjam.list_runs(under) if run.name == "ring-001")
         assert (found.state, found.gains[""] is None) == (state, state == "stopped")
 

@@ -123,12 +123,12 @@ def describe_string_stability(certificate: dict[str, Any], driver: FilteredDrive
     results, vehicle = certificate["string_stability"], driver.actuator.describe()
     if not results:
         return f"string stability was not tested, {vehicle}"
+    if any(each["amplified_band"] for each in results):
+        gain = max(gain for each in results for gain in each["gains"] if gain is not None and not isnan(gain))
+        return f"not string stable, {vehicle}: amplifies oscillations up to {gain:.3g} times"
     if behind := [f"{each['speed']:g}" for each in results if falls_behind(each)]:
         return f"string stability is unknown, {vehicle}: at {', '.join(behind)} m/s it falls behind its leader"
-    if not any(each["amplified_band"] for each in results):
-        return f"string stable, {vehicle}"
-    gain = max(max(each["gains"]) for each in results)
-    return f"not string stable, {vehicle}: amplifies oscillations up to {gain:.3g} times"
+    return f"string stable, {vehicle}"
 
 
 FollowingSimulator = Callable[[FollowingState, Floats], FollowingState]

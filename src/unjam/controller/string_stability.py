@@ -18,7 +18,9 @@ SETTLING_SECONDS = 300.0  # time behind a leader with constant speed, before the
 GAIN_TOLERANCE = 0.02  # a vehicle counts as string stable with gains up to one plus this tolerance
 OPERATING_SPEED_RATIOS = (0.5, 1.0, 1.5)  # shares of the mean speed of CAVs on their road
 MIN_OPERATING_SPEED = 1.0  # [m/s]
-MIN_SPEED_SHARE = 0.9  # mean speed as a share of the leader's, below which a vehicle does not follow, but falls behind
+MIN_SPEED_SHARE = (
+    0.975  # mean speed as a share of the leader's, below which a vehicle does not follow, but falls behind
+)
 MAX_FOLLOWERS = 60  # human drivers behind a CAV
 
 
@@ -81,7 +83,7 @@ def string_gains(
         [_amplitude(response, times, each) for response, each in zip(rows, OSCILLATION_FREQUENCIES, strict=True)]
         for rows in responses.transpose(1, 2, 0)
     ]
-    settled = responses[times > 0.5 * (SETTLING_SECONDS + times[-1])].mean(0)
+    settled = responses[times > SETTLING_SECONDS].mean(0)  # one period of the slowest oscillation
     gains = np.array(amplitudes) / (OSCILLATION_AMPLITUDE * np.array(speeds)[:, None])
     return np.where(settled >= MIN_SPEED_SHARE * np.array(speeds)[:, None], gains, np.nan)
 

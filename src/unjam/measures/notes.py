@@ -2,6 +2,7 @@
 
 import re
 from collections import Counter
+from math import isnan, nan
 
 from unjam.errors import InputError
 from unjam.measures.effect import FLOW_METRIC
@@ -123,9 +124,12 @@ def _entrance_notes(rows_by_driver: RowsByDriver) -> list[str]:
 def _flow_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note if flow is the demand with every driver, since all vehicles arrive before the end."""
     all_rows = [rows for rows in rows_by_driver.values() if rows]
-    flows = {tuple(row.get(FLOW_METRIC) for row in rows if row["status"] == "completed") for rows in all_rows}
+    flows = dict[str, set[float]]()
+    for row in (row for rows in all_rows for row in rows if row["status"] == "completed"):
+        flows.setdefault(str(row["seed"]), set()).add(row.get(FLOW_METRIC, nan))
+    is_demand = bool(flows) and all(len(each) == 1 and not isnan(*each) for each in flows.values())
     have_arrived = all(row.get("unfinished_trips", 1) == 0 for rows in all_rows for row in rows)
-    if len(all_rows) < 2 or len(flows) > 1 or not have_arrived:
+    if len(all_rows) < 2 or not is_demand or not have_arrived:
         return []
     return ["flow: that of the demand with all drivers, since all vehicles arrive before the end: it says nothing here"]
 

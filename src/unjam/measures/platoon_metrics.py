@@ -70,7 +70,7 @@ def time_behind_leader(episode: Episode) -> float:
     """Time by which the last vehicle is behind the recorded one at the end [s]; NaN on other roads.
 
     What it is longer than with human drivers is time that the platoon has lost. Where the last vehicle has not reached
-    the point at which the recording begins, the recorded vehicle is taken to have driven there with its first speed;
+    the point at which the recording begins, the recorded vehicle is taken to have driven there with its mean speed;
     NaN if that is zero.
     """
     if not episode.has_recorded_leader:
@@ -78,8 +78,8 @@ def time_behind_leader(episode: Episode) -> float:
     leader, last = episode.replayed_motion[:, 0, 0], float(episode.positions[-1, 0])
     passed = float(np.interp(last, leader, np.arange(len(episode.speeds))))
     if last < leader[0]:
-        first_speed = float(episode.replayed_motion[0, 0, 1])
-        passed = (last - float(leader[0])) / (first_speed * episode.control_step) if first_speed > 0.0 else nan
+        step_length = float(leader[-1] - leader[0]) / (len(leader) - 1)
+        passed = (last - float(leader[0])) / step_length if step_length > 0.0 else nan
     return (episode.control_steps - passed) * episode.control_step
 
 

@@ -42,17 +42,22 @@ ACC_DIFFERENCES = "difference_to_acc", "flow_difference_to_acc"
 MISSING = Estimate(nan, nan, nan, 0)
 
 
-def keep_earlier_answer(folder: Path, rates: Sequence[float], drivers: dict[str, Any]) -> Path | None:
-    """Rename page and document of another question in a folder; return the new path of one, None without any.
+def count_answered_seeds(folder: Path, rates: Sequence[float], drivers: dict[str, Any]) -> int:
+    """Return the number of test seeds of the answer to a question in a folder; 0 without it.
 
     The question is the penetration rates and `drivers`, recipes by name.
     """
-    if not (folder / ASSESSMENT_FILE).is_file():
-        return None
     with suppress(InputError, *INVALID_DATA_ERRORS):
         earlier = parse_json((folder / ASSESSMENT_FILE).read_bytes())
         if (earlier["penetration_rates"], earlier["drivers"]) == ([*rates], json.loads(to_json(drivers))):
-            return None
+            return int(earlier["seeds"]["test"])
+    return 0
+
+
+def keep_earlier_answer(folder: Path, rates: Sequence[float], drivers: dict[str, Any], seeds: int) -> Path | None:
+    """Rename page and document of another question, or with more than these test seeds; return the new path of one."""
+    if not (folder / ASSESSMENT_FILE).is_file() or 0 < count_answered_seeds(folder, rates, drivers) <= seeds:
+        return None
     with open_folder(folder) as opened:
         stems = (f"{Path(ASSESSMENT_FILE).stem}-{number}" for number in count(1))
         stem = next(each for each in stems if not opened.mode(f"{each}.json") and not opened.mode(f"{each}.html"))

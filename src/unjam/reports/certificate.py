@@ -43,8 +43,8 @@ def write_certificate_page(
 
 
 def _max_gain(result: dict[str, Any]) -> float:
-    """Return the largest gain at a speed; NaN if the vehicle falls behind its leader there."""
-    return float(np.array(result["gains"], np.float64).max())
+    """Return the largest gain at a speed, of frequencies at which the vehicle follows; NaN if there are none."""
+    return float(np.fmax.reduce(np.array(result["gains"], np.float64)))
 
 
 def _certificate_notes(certificate: dict[str, Any]) -> list[str]:
@@ -52,9 +52,9 @@ def _certificate_notes(certificate: dict[str, Any]) -> list[str]:
     if not certificate["comfort"]["meets_iso_15622"]:
         notes.append("In its sample it brakes or accelerates harder than ISO 15622 allows for ACC.")
     for each in certificate["string_stability"]:
-        if np.isnan(_max_gain(each)):
+        if np.isnan(np.array(each["gains"], np.float64)).any():
             notes.append(f"At {each['speed']:g} m/s it falls behind its leader: its string stability is unknown.")
-        elif each["amplified_band"]:
+        if each["amplified_band"]:
             low, high = each["amplified_band"]
             band = f"of {low:.3g} Hz" if low == high else f"between {low:.3g} and {high:.3g} Hz"
             gain = f"by up to {_max_gain(each):.3f} times"

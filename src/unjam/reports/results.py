@@ -3,17 +3,19 @@
 import json
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load
 
 from unjam.errors import InputError, resume_hint
-from unjam.files import INVALID_DATA_ERRORS, read_json_lines, sha256_of, sha256_of_file
+from unjam.files import INVALID_DATA_ERRORS, read_json_lines, sha256_of
 from unjam.folders import reject_unsafe_files
 from unjam.measures.metric_table import driver_rank
 from unjam.measures.metrics import METRICS
@@ -22,7 +24,7 @@ from unjam.worlds.record import Episode
 Float32s = NDArray[np.float32]
 
 EVALUATION_FILE = "evaluation.json"  # metrics of each driver
-CONTROLLER_FILE = "controller.unjam"  # the controller of a run
+CONTROLLER_FILE, _WEIGHTS_PART = "controller.unjam", "weights.safetensors"  # the controller of a run, its weights
 PLOT_EPISODES_FILE = "plot_episodes.safetensors"  # arrays of the episodes that figures show
 PLOT_EPISODES_HASH = "plot_episodes_sha256"  # entry of the evaluation with the hash of that file
 MODEL_FILE = "model.json"  # facts about the learned model of a run
@@ -160,8 +162,16 @@ def read_results(folder: Path) -> Results:
 
 def is_outdated(folder: Path, metadata: dict[str, Any]) -> bool:
     """Return whether an evaluation is of an earlier controller than the one in its folder."""
-    known, controller = metadata.get("controllers", {}).get(metadata.get("trained")), folder / CONTROLLER_FILE
-    return known is not None and controller.is_file() and sha256_of_file(controller) != known
+    known, current = metadata.get("weights"), weights_id(folder / CONTROLLER_FILE)
+    return known is not None and current is not None and current != known
+
+
+def weights_id(controller: Path) -> str | None:
+    """Return checksum and size of a controller's weights, which stay when it is signed or certified; None without."""
+    with suppress(BadZipFile, KeyError, OSError), ZipFile(controller) as archive:
+        weights = archive.getinfo(_WEIGHTS_PART)
+        return f"{weights.CRC:08x}-{weights.file_size}"
+    return None
 
 
 def damaged_results_error(folder: Path, error: Exception) -> InputError:

@@ -26,8 +26,8 @@ from unjam.reports.results import PlotEpisode, Results, is_outdated, kept_row, o
 from unjam.text import format_count, printable
 
 CLOSE_TIME_GAP = 1.0  # time gap below which the report has a note [s]; the paper's h_max
-IRRELEVANT_OPTIONS = ("--out", "--workers", "--json", "--all")
-"""options of a command on which its results do not depend"""
+IRRELEVANT_OPTIONS, IRRELEVANT_FLAGS = ("--out", "--workers"), ("--json", "--all")
+"""options of a command on which its results do not depend, with a value and without"""
 FORMULA_STARTS = {*"=+-@\t\r\n"}  # first letters of a cell that a spreadsheet takes for a formula
 MAX_LIMIT_RATIO = 1.01  # ratio of mean speed to the limit above which the report has a note
 COMPARED_METRICS = (
@@ -82,7 +82,8 @@ def first_alternative(results: Sequence[Results]) -> str:
     seeds = {str([row["seed"] for row in result.rows.get(HUMAN_LABEL, [])]) for result in results}
     has_humans = all(HUMAN_LABEL in result.rows and result.trained_label is None for result in results)
     are_networks = all(result.metadata["scenario"].endswith(".sumocfg") for result in results)
-    is_comparison = len(results) > 1 and has_humans and are_networks and len(seeds) == 1
+    differs = has_humans and len({str(_episode_keys(result.rows[HUMAN_LABEL])) for result in results}) > 1
+    is_comparison = len(results) > 1 and differs and are_networks and len(seeds) == 1
     return f"{folder_names(results)[0]}: {HUMAN_LABEL}" if is_comparison else ""
 
 
@@ -129,11 +130,6 @@ def mismatch_warning(results: Sequence[Results]) -> str:
     parents = {result.folder.resolve().parent for result in results}
     if len(parents) == 1 and (parents.pop() / "config.toml").is_file():
         return ""
-    if first := first_alternative(results):
-        return (
-            f"Human drivers of these networks are compared with {first}, on the same seeds. Delay is the time lost to "
-            "the speed that is allowed at each moment: a speed limit hides its own cost, so compare travel times."
-        )
     episodes = [next(iter(result.plot_episodes.values()), None) for result in results]
     known = [each for each in episodes if each is not None and not each.has_recorded_leader]
     kinds = {
@@ -143,6 +139,11 @@ def mismatch_warning(results: Sequence[Results]) -> str:
         "durations": [str(each.times[-1]) for each in known if each.status == "completed"],
     }
     different = [kind for kind, values in kinds.items() if len(set(values)) > 1]
+    if (first := first_alternative(results)) and "durations" not in different:
+        return (
+            f"Human drivers of these networks are compared with {first}, on the same seeds. Delay is the time lost to "
+            "the speed that is allowed at each moment: a speed limit hides its own cost, so compare travel times."
+        )
     if not different:
         return ""
     listed = ", ".join(different)
@@ -155,6 +156,8 @@ def command_differences(results: Sequence[Results]) -> list[tuple[str, str]]:
     Empty where no command is known to differ, apart from the folder for its results and the number of workers.
     """
     commands = [_command_options(result) for result in results]
+    if not all(commands):
+        return []
     shared = set.intersection(*map(set, commands))
     texts = ["; ".join(each for each in command if each not in shared) for command in commands]
     return [*zip(folder_names(results), texts, strict=True)] if any(texts) else []
@@ -163,7 +166,7 @@ def command_differences(results: Sequence[Results]) -> list[tuple[str, str]]:
 def _command_options(result: Results) -> list[str]:
     """Return the arguments of the command that wrote a folder, each option with its value."""
     options = list[str]()
-    for word in shlex.split(original_command(result))[1:]:
+    for word in (word for word in shlex.split(original_command(result))[1:] if word not in IRRELEVANT_FLAGS):
         is_value = options and options[-1].startswith("-") and " " not in options[-1] and not word.startswith("-")
         options = [*options[:-1], f"{options[-1]} {word}"] if is_value else [*options, word]
     return [each for each in options if not each.startswith(IRRELEVANT_OPTIONS)]

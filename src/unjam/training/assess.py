@@ -29,7 +29,13 @@ from unjam.measures.recommendation import (
     road_verdict,
 )
 from unjam.measures.statistics import metric_estimate
-from unjam.reports.assessment import ASSESSMENT_FILE, ASSESSMENT_PAGE, keep_earlier_answer, write_assessment
+from unjam.reports.assessment import (
+    ASSESSMENT_FILE,
+    ASSESSMENT_PAGE,
+    count_answered_seeds,
+    keep_earlier_answer,
+    write_assessment,
+)
 from unjam.scenarios import scenario_recipe
 from unjam.seeds import held_out_seeds
 from unjam.text import format_count, format_duration
@@ -141,15 +147,15 @@ def assess(
         done = list[EpisodeSeed]()
         # With a limit of time one seed after another: an answer needs all options on the same seeds.
         for part in [[seed] for seed in seeds] if request.minutes else [seeds]:
-            absent = [(option, seed) for option, seed in missing if seed in part]
+            absent = {(option, seed) for option, seed in missing if seed in part}
             if part[0][-1] >= FEWEST_SEEDS[kind] and absent and not budget.has_time_for(len(absent)):
                 break
-            known = [
+            known = {
                 (option.label, index)
                 for option in options
                 for index, seed in enumerate(part)
                 if (option, seed) not in absent
-            ]
+            }
             evaluate_options(options, part, known)
             budget.spend(len(options) * len(part), len(absent))
             new_episodes.update(absent)
@@ -195,14 +201,16 @@ def assess(
         }
         save_evaluation(folder / SELECTION_FOLDER, Evaluation(selection_rows, {}), metadata)
         save_evaluation(folder, Evaluation(test_rows, pictures), metadata)
-        if kept_page := keep_earlier_answer(folder, request.penetration_rates, document["drivers"]):
-            on_message(f"the answer to the earlier question is now in {kept_page}")
+        seeds = len(findings.rows[HUMAN_BASELINE])
+        if kept_page := keep_earlier_answer(folder, request.penetration_rates, document["drivers"], seeds):
+            on_message(f"the earlier answer is now in {kept_page}")
         atomic_write(folder / ASSESSMENT_FILE, to_json(document, indent=1))
         page = write_assessment(folder, folder / ASSESSMENT_PAGE)
         return Assessment(findings.controller_results, findings.acc_results, json.loads(to_json(document)), page)
 
     def write_interim_answer(findings: AssessmentFindings) -> None:
-        if new_episodes:  # else the folder may have a better answer
+        known = count_answered_seeds(folder, request.penetration_rates, _driver_recipes(request))
+        if new_episodes and len(findings.rows[HUMAN_BASELINE]) > known:
             on_message(f"the answer so far is in {write_answer(findings, first.plot_episodes, False).page}")
 
     findings = compare_on_test_seeds(
@@ -287,6 +295,13 @@ def sensing_notes(request: AssessmentRequest) -> list[str]:
     return [f"{', '.join(readers)}: assumed to know {known}; roadside.latency, smoothing_time and loss_rate change it"]
 
 
+def _driver_recipes(request: AssessmentRequest) -> dict[str, Any]:
+    return {
+        name: driver_recipe(driver)[0] if is_serializable(driver) else {"policy": driver.describe()}
+        for name, driver in request.drivers.items()
+    }
+
+
 def _range_text(low: int, high: int) -> str:
     return f"{low:,} to {high:,}" if low < high else f"about {high:,}"
 
@@ -334,10 +349,7 @@ def _assessment_document(
         "baseline": {name: asdict(metric_estimate(baseline_rows, name)) for name in BASELINE_METRICS},
         "road": {**scenario_recipe(request.network), "file": request.file},
         "human_drivers": request.network.human_description,
-        "drivers": {
-            name: driver_recipe(driver)[0] if is_serializable(driver) else {"policy": driver.describe()}
-            for name, driver in request.drivers.items()
-        },
+        "drivers": _driver_recipes(request),
         "penetration_rates": request.penetration_rates,
         "precision": request.precision,
         "budget": {"episodes": request.episodes, "minutes": request.minutes},

@@ -4,7 +4,7 @@ The controller of a run is compared with others on test seeds.
 """
 
 from collections.abc import Callable, Collection, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from safetensors.numpy import save
 from unjam.controller import PACKAGED_PREFIX, controller_hash, make_driver
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import unique_label
-from unjam.errors import raise_failure
+from unjam.errors import InputError, raise_failure
 from unjam.files import FileWatch, atomic_write, make_folder, remove_leftovers, sha256_of, to_json
 from unjam.manifest import manifest
 from unjam.measures.metric_table import RowsByDriver, in_order
@@ -23,12 +23,14 @@ from unjam.measures.metrics import measure
 from unjam.measures.notes import episode_notes
 from unjam.measures.statistics import Estimate, paired_difference, summarize
 from unjam.reports.results import (
+    CONTROLLER_FILE,
     EPISODE_ENTRIES,
     EVALUATION_FILE,
     PLOT_EPISODES_FILE,
     PLOT_EPISODES_HASH,
     pack_episode,
     to_plot_episode,
+    weights_id,
 )
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
@@ -199,6 +201,7 @@ def evaluate_run(
     """
     scenario, drivers = config.make_scenario(), drivers_to_compare(config, folder)
     hashes = controller_hashes({TRAINED_LABEL: str(folder)})  # now: files may change while episodes run
+    weights = weights_id(folder / CONTROLLER_FILE)
     seeds = held_out_seeds(config.evaluation.episodes)
     evaluation = evaluate(scenario, drivers, seeds, workers, config.reward, progress, config.episode_backend, watch)
     metadata = {
@@ -208,6 +211,7 @@ def evaluate_run(
         "trained": TRAINED_LABEL,
         "expert": config.make_expert().describe() if config.expert != "none" else "none",
         "controllers": hashes,
+        "weights": weights,
         "notes": [
             *notes,
             *filter(None, [duration_note(config)]),
@@ -229,9 +233,11 @@ def evaluate_run(
 def duration_note(config: RunConfig) -> str:
     """Return a text if episodes of a training last shorter or longer than the scenario's own; else an empty one."""
     options = {name: value for name, value in config.scenario_options.items() if name != "horizon"}
-    scenarios = config.make_scenario(), replace(config, scenario_options=options).make_scenario()
-    seconds, usual = (each.horizon * each.control_step for each in scenarios)
-    return "" if seconds == usual else f"episodes of {seconds:g} s, where the scenario has {usual:g} s"
+    with suppress(InputError):  # of a network that needs the horizon
+        scenarios = config.make_scenario(), replace(config, scenario_options=options).make_scenario()
+        seconds, usual = (each.max_episode_steps * each.control_step for each in scenarios)
+        return "" if seconds == usual else f"episodes of {seconds:g} s, where the scenario has {usual:g} s"
+    return ""
 
 
 def gain_over_expert(config: RunConfig, rows: RowsByDriver) -> Estimate | None:

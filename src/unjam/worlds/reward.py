@@ -339,7 +339,7 @@ def validate_reward_terms(
 def check_tensor_terms(reward: Reward, terms: dict[str, Array]) -> None:
     """Raise `InputError` unless all terms of a reward are torch tensors, as the `Outcome` that it had."""
     for name, values in terms.items():
-        if namespace(values) is np or isinstance(values, float):
+        if namespace(values) is np or isinstance(values, float | int):
             kind = f"a {type(values).__name__} is not allowed for the term {name!r}"
             raise InputError(f"reward {object_label(reward)}: {kind}; allowed: a tensor, made of those of the Outcome")
 
