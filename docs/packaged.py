@@ -19,7 +19,7 @@ REASONS = {
     "shared-rings-tuned": "for rings that several CAVs share; the expert of `unjam:best` there",
     "ring-jammed-best": "a larger return than its formula in a developed wave",
     "ring-jammed-best-ideal": "the controller of this name for ideal cars, the ablation",
-    "ring-jammed-tuned": "the largest mean return of a formula in a developed wave (over that for ideal cars undecided)",
+    "ring-jammed-tuned": "the largest mean return of a formula in a wave (over that for ideal cars undecided)",
     "ring-jammed-tuned-ideal": "the controller of this name for ideal cars, the ablation",
     "figure-eight-best": "the largest return by Eq. 16; its queue sometimes breaks in cars that respond at once",
     "figure-eight-best-ideal": "the residual for ideal cars, which holds its queue in both",
