@@ -22,7 +22,7 @@ from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import estimate_cell, with_no_break_spaces
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, estimate, estimate_on_shared_seeds, estimate_over_trainings, format_ci
-from unjam.reports.results import EVALUATION_FILE, read_progress, read_rows
+from unjam.reports.results import CONTROLLER_FILE, EVALUATION_FILE, read_progress, read_rows
 from unjam.road_family import NO_LATENCY
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
@@ -132,7 +132,7 @@ class StudyFolder:
         """Copy the controllers of trainings into the folder of a study, as controllers/VARIANT-SEED.unjam."""
         make_folder(study / CONTROLLERS)
         for run in runs:
-            content = (self.controller_folder(run) / "controller.unjam").read_bytes()
+            content = (self.controller_folder(run) / CONTROLLER_FILE).read_bytes()
             atomic_write(study / CONTROLLERS / f"{run.variant}-{run.seed}.unjam", content)
 
     def reference_folder(self, road: str) -> Path:

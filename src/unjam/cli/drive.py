@@ -198,7 +198,7 @@ def assess_command(
     ] = "0.05,0.1,0.2",
     episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Maximum number of episodes.")] = 240,
     minutes: Annotated[
-        float | None, Option(help="Maximum time; no seed begins that does not fit, but those of an answer.")
+        float | None, Option(help="Maximum time; after the fewest seeds of an answer, none begins that does not fit.")
     ] = None,
     precision: Annotated[
         float, Option(help="Sufficient half-width of the confidence interval of travel time, relative to it.")

@@ -5,7 +5,7 @@ These are human drivers alone, and ACC vehicles without a controller.
 
 import json
 import shlex
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from math import ceil, isfinite
@@ -113,27 +113,15 @@ def assess(
     budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
     new_episodes = set[tuple[Option, EpisodeSeed]]()
 
-    def evaluate_options(
-        options: Sequence[Option],
-        seeds: Sequence[EpisodeSeed],
-        skipped: Collection[DriverAndEpisode] = (),
-        with_plots: bool = False,
-    ) -> Evaluation:
+    def evaluate_options(options: Sequence[Option], seeds: Sequence[EpisodeSeed], **settings: Any) -> Evaluation:
         setups = {option.label: request.make_setup(option) for option in options}
-        hashes = {label: log.setup_hash(*setup) for label, setup in setups.items()}
         batch = budget.used_episodes
 
         def report_progress(episode: DriverAndEpisode, steps: int) -> None:
             if progress is not None:
                 progress((batch, *episode), steps)
 
-        def store(episode: DriverAndEpisode, row: dict[str, Any]) -> None:
-            label, index = episode
-            if not with_plots:
-                log.add(hashes[label], seeds[index], row)
-
-        settings: dict[str, Any] = {"with_plots": with_plots, "watch": watch, "skipped": skipped, "on_row": store}
-        return evaluate_on_roads(setups, seeds, workers, progress=report_progress, **settings)
+        return evaluate_on_roads(setups, seeds, workers, progress=report_progress, watch=watch, **settings)
 
     def run_options(kind: str, options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
         """Return rows of the seeds, or of the first of them if the time ends."""
@@ -144,7 +132,12 @@ def assess(
             numbers = f"seeds {first} to {last}" if first < last else f"seed {first}"
             names = format_count(len({option for option, _ in missing}), "option")
             on_stage(f"simulating {kind} {numbers} of {names}", request.network.horizon * len(missing))
-        done = list[EpisodeSeed]()
+        done, hash_by_label = list[EpisodeSeed](), {option.label: sha256 for option, sha256 in hashes.items()}
+
+        def store(seeds: Sequence[EpisodeSeed], episode: DriverAndEpisode, row: dict[str, Any]) -> None:
+            label, index = episode
+            log.add(hash_by_label[label], seeds[index], row)
+
         # With a limit of time one seed after another: an answer needs all options on the same seeds.
         for part in [[seed] for seed in seeds] if request.minutes else [seeds]:
             absent = {(option, seed) for option, seed in missing if seed in part}
@@ -156,7 +149,7 @@ def assess(
                 for index, seed in enumerate(part)
                 if (option, seed) not in absent
             }
-            evaluate_options(options, part, known)
+            evaluate_options(options, part, skipped=known, on_row=partial(store, part), with_plots=False)
             budget.spend(len(options) * len(part), len(absent))
             new_episodes.update(absent)
             done += part
@@ -176,7 +169,7 @@ def assess(
     def drive_for_pictures(stage: str, option: Option) -> Evaluation:
         on_stage(f"simulating {stage}", request.network.horizon)
         budget.spend(1)
-        return evaluate_options([option], held_out_seeds(1), with_plots=True)
+        return evaluate_options([option], held_out_seeds(1))
 
     first = drive_for_pictures("the human baseline, seed 1 of 1", HUMAN_BASELINE)
     raise_failure(first.rows[HUMAN_BASELINE.label])
