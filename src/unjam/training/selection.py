@@ -212,6 +212,8 @@ def compare_on_test_seeds(
         if not count:
             break
         _extend_rows(rows, run_options([HUMAN_BASELINE, *active], held_out_seeds(count, seeds)))
+        if len(rows[HUMAN_BASELINE]) == seeds:  # the time has ended
+            break
         results = [_controller_result(option, rows, confidence, precision) for option in finalists]
         acc_results = [_acc_result(option, rows, confidence, precision) for option in acc_options]
         max_seeds = len(rows[HUMAN_BASELINE]) + budget.affordable_seeds(1 + len(active))
