@@ -88,9 +88,9 @@ def tune_command(
 
     changes = opt.merge_settings(changes, opt.parse_settings(settings))
     if scenario in ROAD_GROUPS:
-        if changes or reward:
-            raise InputError(f"scenario: with {scenario} neither changes nor a reward are allowed")
-        roads = family_scenarios(scenario, "training")
+        if reward:
+            raise InputError(f"reward: with {scenario} no reward is allowed; the objective is the mean normalized gain")
+        roads = family_scenarios(scenario, "training", changes=changes)
     else:
         roads = {scenario: make_scenario(scenario, changes)}
     first = next(iter(roads.values()))

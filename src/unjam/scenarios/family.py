@@ -1,5 +1,7 @@
 """Groups of roads of the family, as scenarios."""
 
+from typing import Any
+
 from unjam import road_family
 from unjam.drivers.wrappers import MIN_SHARED_PENETRATION_RATE
 from unjam.scenarios import make_scenario
@@ -16,7 +18,9 @@ def family_roads(group: str) -> dict[str, road_family.FamilyRoad]:
     return {name: road for name, road in road_family.FAMILY.items() if group in groups[name]}
 
 
-def family_scenarios(group: str, *parts: road_family.FamilyPart) -> dict[str, Scenario]:
-    """Return the scenarios of some parts of a group, one of `ROAD_GROUPS`, by name."""
+def family_scenarios(
+    group: str, *parts: road_family.FamilyPart, changes: dict[str, Any] | None = None
+) -> dict[str, Scenario]:
+    """Return the scenarios of some parts of a group, one of `ROAD_GROUPS`, by name, each with the same changes."""
     names = (name for name, road in family_roads(group).items() if road.part in parts)
-    return {name: make_scenario(f"{road_family.FAMILY_PREFIX}{name}") for name in names}
+    return {name: make_scenario(f"{road_family.FAMILY_PREFIX}{name}", changes) for name in names}
