@@ -59,6 +59,9 @@ DRIVE_SETTINGS: dict[str, dict[str, Any]] = {
     "CAV with a delay of 0.4 s and a lag of 0.6 s": {"actuator": Actuator(delay=0.4, lag=0.6)},
 }
 """assumptions on which the saving may depend, each changed alone"""
+PLATOONS = {cavs: " ".join([f"cav human*{24 // cavs - 1}"] * cavs) for cavs in (1, 2, 4)}
+"""platoons of 24 vehicles, by their number of CAVs"""
+PLATOONS_PART = "several CAVs"
 WAVE_METRICS = ("amplification_long", "amplification_medium", "amplification_short")
 RECORDED_STUDY = "recorded-roads"
 RECORDINGS_FOLDER = "recordings/i24"
@@ -108,6 +111,7 @@ PLAN_LABEL = "plan that knows the recording"
 RING_DRIVER = "pi"
 """driver of the paper's rings, compared behind the drives alone"""
 DRIVES_PARTS = {TRAINING_DRIVES_PART: TRAINING_MONTH, TEST_DRIVES_PART: TEST_MONTH}
+PLATOON_METRICS = (*WAVE_METRICS, "fuel_by_power", "outflow_veh_per_h")
 SETTING_METRICS = "fuel_by_power", "cav_mean_gap", "min_time_gap", "feasibility"
 SUMO_METRICS = ("fuel_ml_per_km", "fuel_by_power")
 
@@ -185,6 +189,15 @@ def measure_driver(folder: str, month: str, setting: str, name: str, workers: in
     return _drive_rows(name, scenarios, rows, metrics)
 
 
+def measure_platoon(folder: str, cavs: int, name: str, workers: int) -> Table:
+    """Return the waves, fuel and flow of a platoon with several CAVs behind each training drive."""
+    scenarios = [replace(each, platoon=PLATOONS[cavs]) for each in recorded_drives(Path(folder))]
+    driver = compared_driver(Path(folder), name)
+    rows = [measure(episode) for episode in run_batches([EpisodeTask(each, driver, (0,)) for each in scenarios])]
+    raise_failure(rows)
+    return [{"cavs": cavs, **row} for row in _drive_rows(name, scenarios, rows, PLATOON_METRICS)]
+
+
 def measure_fuel_in_sumo(folder: str, month: str, name: str, workers: int) -> Table:
     """Return the fuel of the platoon by SUMO's emission model behind each drive of a month."""
     scenarios, driver = recorded_drives(Path(folder), month), compared_driver(Path(folder), name)
@@ -231,6 +244,8 @@ def make_recorded_parts(study_folder: StudyFolder, seeds: int) -> dict[str, Stud
     drivers = (*names, RING_DRIVER, PLAN_LABEL, *(str(run.controller) for run in runs))
     for (part, month), name in product(DRIVES_PARTS.items(), drivers):
         parts[f"{part}/{_entry(name)}"] = measure_driver, (root, month, STANDARD_SETTING, name)
+    for cavs, name in product(PLATOONS, (HUMAN_LABEL, tuned[0])):
+        parts[f"{PLATOONS_PART}/{cavs}-{_entry(name)}"] = measure_platoon, (root, cavs, name)
     for name in names:
         parts[f"{SUMO_FUEL_PART}/{_entry(name)}"] = measure_fuel_in_sumo, (root, TEST_MONTH, name)
         for setting in (each for each in DRIVE_SETTINGS if each != STANDARD_SETTING):
@@ -315,6 +330,21 @@ def waves_table(folder: Path) -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
+def platoons_table(folder: Path) -> pd.DataFrame:
+    """Return the waves at the end of platoons with several CAVs, and their change of fuel and flow."""
+    rows, table = read_part(folder, PLATOONS_PART), list[dict[str, Any]]()
+    for cavs in PLATOONS:
+        results = DriveResults([row for row in rows if row["cavs"] == cavs])
+        tuned = next(label for label in results.groups() if label != HUMAN_LABEL)
+        cells: dict[str, Any] = {"CAVs among 24 vehicles": cavs}
+        for name in WAVE_METRICS:
+            before, after = (results.values(label, name).mean() for label in (HUMAN_LABEL, tuned))
+            cells[METRICS[name].label] = f"{before:.2f} → {after:.2f}"
+        cells["fuel of the platoon [%]"] = results.change_text(tuned, "fuel_by_power")
+        table.append({**cells, "flow [%]": results.change_text(tuned, "outflow_veh_per_h")})
+    return pd.DataFrame(table)
+
+
 def assumptions_table(folder: Path) -> pd.DataFrame:
     """Return the change of fuel by each driver under other assumptions, and by SUMO's emission model."""
     in_sumo = DriveResults(read_part(folder, SUMO_FUEL_PART))
@@ -352,5 +382,6 @@ RECORDED_ROADS = Study(
         "test": partial(drivers_table, TEST_DRIVES_PART),
         **{"waves": waves_table, "assumptions": assumptions_table, "search": search_table},
         "residuals": residuals_table,
+        "platoons": platoons_table,
     },
 )

@@ -42,7 +42,7 @@ def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         monkeypatch.setattr(envelope, name, 1)
     short = Ring(length=(60, 60), vehicles=5, horizon=60)
     for name in ("envelope_rings", "envelope_figure_eights"):
-        monkeypatch.setattr(envelope, name, lambda **changes: iter([("a short ring", short)]))
+        monkeypatch.setattr(envelope, name, lambda *_, **changes: iter([("a short ring", short)]))
     monkeypatch.setattr(envelope, "LANE_SECONDS", 60.0)
     monkeypatch.setattr(envelope, "impaired_rings", lambda warmup: iter([("late", short)]))
     monkeypatch.setattr(certificate, "ATTACK_GENERATIONS", 1)
