@@ -20,6 +20,8 @@ from unjam_paper.variants import VARIANTS
 PRESETS = {"default": "", "`paper`": "paper", "`paper-exact`": "paper-exact"}
 """presets by their heading; the studies of tables and figures use `paper`"""
 NOT_MEASURED = "not measured"
+LENGTHS, SEEDS_PER_LENGTH = 6, 10
+"""lengths of the ring and test seeds of the studies of feasible driving"""
 
 
 @dataclass(frozen=True)
@@ -84,9 +86,11 @@ def expert_effect() -> str:
     for road, part in parts.items():
         comparison = DriverComparison([*results_part(part).values()])
         paper, default = (comparison.values([label], "return") for label in ("PI (paper)", "PI"))
-        difference = asdict(estimate((paper - default).ravel().tolist()))
-        texts.append(f"{interval_text(difference, 0, '+,')} {road}")
-    source = "60 episodes each, `results/feasible-ring-ideal.json`, `results/feasible-ring.json`"
+        by_length = (paper - default).reshape(-1, LENGTHS, SEEDS_PER_LENGTH).mean((0, 2))
+        by_seed = (paper - default).reshape(-1, LENGTHS, SEEDS_PER_LENGTH).mean((0, 1))
+        lengths = f"({by_length.min():+,.0f} to {by_length.max():+,.0f} by length)"
+        texts.append(f"{interval_text(asdict(estimate(by_seed.tolist())), 0, '+,')} {lengths} {road}")
+    source = "ten seeds of six lengths, `results/feasible-ring-ideal.json`, `results/feasible-ring.json`"
     return f"return of the paper's PI, difference to the default one: {', '.join(texts)} ({source})"
 
 

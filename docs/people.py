@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ MODELS = {
     "IDM, personal time headway": "calibrated IDM, personal time headway",
     "IDM, all parameters personal": "IDM, all parameters personal",
 }
+
+FEW_DATA = (0.01, 0.1)
 
 
 def rows_of(name: str) -> pd.DataFrame:
@@ -136,13 +139,14 @@ def people_claims() -> pd.DataFrame:
         "substantially lower loss (here: by at least 10 %)": _final_loss("training_loss", least=10.0),
         "lower loss in validation": _final_loss("validation_loss"),
         "lower error at every size of the data": _errors("other", lambda errors: errors),
+        "the same with few data, in other settings": _other_settings(),
         "the same with data of the very IDM in the model (it does not say of which driver)": _errors(
             "same", lambda errors: errors
         ),
         "smaller spread at every size (here: distance of the error from the median of its repeats)": _errors(
             "other", lambda errors: abs(errors - errors.median())
         ),
-        "it captures what real drivers do": _one_step(),
+        "it captures what real drivers do (here: better than without IDM)": _one_step(),
         "the residual improves on IDM": _gap_in_simulation(),
     }
     return pd.DataFrame(
@@ -190,6 +194,22 @@ def _errors(driver: str, statistic: Callable[[pd.Series], pd.Series]) -> Finding
         sizes.setdefault(verdict, []).append(f"{100 * size:g} %")
         numbers.append(f"{100 * size:g} %: {text}")
     verdict = "; ".join(f"{verdict} at {', '.join(found)}" for verdict, found in sizes.items())
+    return verdict, f"[m/s²] {'. '.join(numbers)}"
+
+
+def _other_settings() -> Finding:
+    """Judge the errors with few data for other splits of the data, and with as many gradient steps as with 30 %."""
+    settings = {"split by rows": ("rows", False), "the authors' split": ("released", False)}
+    settings["more gradient steps"] = "trajectories", True
+    numbers, verdicts = list[str](), dict[str, list[str]]()
+    for (what, (split, is_long)), size in product(settings.items(), FEW_DATA):
+        networks = _networks(figure_6(driver="other", split=split, is_long=is_long, size=size))
+        values = {label: found["driver_error"].to_numpy() for label, found in networks.items()}
+        if all(len(each) > 1 for each in values.values()):
+            verdict, text = compare(values, "with IDM", larger=False, digits=4, unit="repeats")
+            verdicts.setdefault(verdict, []).append(f"{100 * size:g} % {what}")
+            numbers.append(f"{100 * size:g} % {what}: {text}")
+    verdict = "; ".join(f"{verdict} at {', '.join(found)}" for verdict, found in verdicts.items())
     return verdict, f"[m/s²] {'. '.join(numbers)}"
 
 

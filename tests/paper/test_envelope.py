@@ -36,7 +36,7 @@ def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     one = "unjam:ring-gap-tuned"
     for name in ("CONTROLLER_ROADS", "USUAL_CAR_ROADS"):
         monkeypatch.setattr(envelope, name, {one: "ring"})
-    for name in ("IMPAIRED_DRIVERS", "RING_CONTROLLERS", "USUAL_CAR_CONTROLLERS"):
+    for name in ("IMPAIRED_DRIVERS", "RING_CONTROLLERS", "USUAL_CAR_CONTROLLERS", "USUAL_CAR_PACERS"):
         monkeypatch.setattr(envelope, name, (one,))
     for name in ("ENVELOPE_SEEDS", "RAW_ACTUATION_SEEDS", "IMPAIRED_SEEDS"):
         monkeypatch.setattr(envelope, name, 1)
