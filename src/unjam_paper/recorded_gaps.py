@@ -1,6 +1,8 @@
 """Fuel that two laws with equal limits save behind recorded vehicles, each tuned for several mean gaps.
 
 The laws are tuned on the drives of March 2021, as in `unjam_paper.recorded_roads`, and measured on those of April.
+Which part of a saving is due to the opening of the gap, to kinetic energy and to the lower mean speed is measured on
+the drives of March.
 """
 
 from dataclasses import replace
@@ -8,12 +10,20 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from optuna.distributions import FloatDistribution
 
+from unjam.controller import make_driver
 from unjam.drivers.smooth_acc import SmoothACC
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import METRICS
+from unjam.measures.platoon_metrics import cav_mean_gap
+from unjam.measures.statistics import estimate
+from unjam.physics.fuel import fuel_rate, kinetic_fuel_rate
+from unjam.worlds.batch.run import run_batches
+from unjam.worlds.record import Episode
+from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.fuel_optimal_plan import PlanLimits
 from unjam_paper.parameter_search import SearchBudget, search_parameters
 from unjam_paper.recorded_roads import (
@@ -30,7 +40,7 @@ from unjam_paper.recorded_roads import (
     recorded_drives,
 )
 from unjam_paper.results_file import StudyPart, read_part
-from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table
+from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, estimate_text
 
 GAPS_STUDY = "recorded-gaps"
 MEAN_GAPS = (73.0, 60.0, 50.0, 40.0)
@@ -40,6 +50,26 @@ AVERAGING, LIMITED = "smooth-acc", "acc with the limits of smooth-acc"
 FIXED_BY_LAW: dict[str, dict[str, float]] = {AVERAGING: {}, LIMITED: {"averaging_time": 0.0, "leader_weight": 1.0}}
 """the law is the same: without averaging it follows the present speed of its leader, as an ACC does"""
 GAPS_BUDGET = SearchBudget(generations=14, size=24)
+
+START_SECONDS = 60.0
+"""time in which controllers open their gaps, at the start of each episode"""
+SOURCES_PART = "sources"
+LONG_HEADWAY, PLAIN_ACC = "human driver with a time headway of 2.4 s", "acc, tuned"
+SOURCE_DRIVERS = {
+    HUMAN_LABEL: HUMAN_LABEL,
+    "smooth-acc, tuned": "unjam:recorded-tuned",
+    PLAIN_ACC: "acc:set_speed=45,time_gap=2.4496,gap_gain=0.0044,speed_gain=0.2017",
+    "acc with default gains, 2.4 s": "acc:set_speed=45,time_gap=2.4",
+    LONG_HEADWAY: "idm:desired_speed=45,time_headway=2.4",
+}
+SOURCES = {
+    "whole": "whole drives [%]",
+    "later": "from the second minute [%]",
+    "net": "without the change of kinetic energy [%]",
+    "steady": "of steady driving with the mean speeds [%]",
+    "gap": "mean gap [m]",
+}
+"""headings of the fuel of the platoon, each relative to human drivers, and of the mean gap"""
 
 
 def gap_limits(mean_gap: float) -> PlanLimits:
@@ -75,6 +105,38 @@ def measure_law(folder: str, label: str, name: str, workers: int) -> Table:
     return [{**row, "driver": label} for row in measure_driver(folder, TEST_MONTH, STANDARD_SETTING, name, workers)]
 
 
+def measure_sources(folder: str, label: str, workers: int) -> Table:
+    """Return the `SOURCES` of a driver behind each training drive, fuel in ml/km."""
+    scenarios, driver = recorded_drives(Path(folder)), make_driver(SOURCE_DRIVERS[label], TIME_STEP)
+    episodes = run_batches([EpisodeTask(each, driver, (0,)) for each in scenarios])
+    return [{"driver": label, **_fuel_sources(episode), "gap": cav_mean_gap(episode)} for episode in episodes]
+
+
+def _fuel_sources(episode: Episode) -> dict[str, float]:
+    step, start = episode.control_step, round(START_SECONDS / episode.control_step)
+    speeds, accelerations = episode.speeds[1:], np.diff(episode.speeds, axis=0) / step
+    fuel, kinetic = fuel_rate(speeds, accelerations), kinetic_fuel_rate(speeds, accelerations)
+    mean = float(speeds.mean())
+    return {
+        "whole": float(1000.0 * fuel.sum() / speeds.sum()),
+        "later": float(1000.0 * fuel[start:].sum() / speeds[start:].sum()),
+        "net": float(1000.0 * (fuel - kinetic).sum() / speeds.sum()),
+        "steady": float(1000.0 * fuel_rate(np.array(mean), np.array(0.0)) / mean),
+    }
+
+
+def sources_table(folder: Path) -> pd.DataFrame:
+    """Return which part of the fuel that drivers save is due to the start, to kinetic energy and to the mean speed."""
+    rows, table = read_part(folder, SOURCES_PART), list[dict[str, str]]()
+    values = {label: pd.DataFrame([row for row in rows if row["driver"] == label]) for label in SOURCE_DRIVERS}
+    for label in (each for each in values if each != HUMAN_LABEL):
+        own, human = values[label], values[HUMAN_LABEL]
+        changes = {name: 100.0 * (own[name] - human[name]) / human[name] for name in SOURCES if name != "gap"}
+        cells = {SOURCES[name]: estimate_text(estimate(each.tolist()), 2, "+") for name, each in changes.items()}
+        table.append({"driver": label, **cells, SOURCES["gap"]: f"{own['gap'].mean():.0f}"})
+    return pd.DataFrame(table)
+
+
 def make_gap_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     """Return a search for each law and mean gap, and then the test drives."""
     root, folder = str(study_folder.folder), study_folder.folder / GAPS_STUDY
@@ -82,6 +144,7 @@ def make_gap_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart
         f"{SEARCH_PART}/{_label(law, gap)}": (tune_law, (root, law, gap))
         for law, gap in product(FIXED_BY_LAW, MEAN_GAPS)
     }
+    parts |= {f"{SOURCES_PART}/{label}": (measure_sources, (root, label)) for label in SOURCE_DRIVERS}
     if not (folder / f"{SEARCH_PART}.json").is_file():
         return parts
     drivers = {name: name for name in (HUMAN_LABEL, *PUBLISHED_FILES)}
@@ -117,5 +180,5 @@ RECORDED_GAPS = Study(
     title="fuel that laws with equal limits save behind recorded vehicles, by their mean gap",
     make_parts=make_gap_parts,
     minutes=30.0,
-    tables={"gaps": gaps_table},
+    tables={"gaps": gaps_table, "sources": sources_table},
 )

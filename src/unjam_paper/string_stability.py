@@ -21,9 +21,11 @@ from unjam.drivers.registry import driver_from_name
 from unjam.drivers.safety import INSTANT_ACTUATOR, STANDARD_ACTUATOR
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL
-from unjam.measures.statistics import metric_estimate, paired_difference
+from unjam.measures.statistics import estimate, metric_estimate, paired_difference
 from unjam.reports.figures import LINE_COLORS, new_figure
+from unjam.road_family import FAMILY, FAMILY_PREFIX, IDEAL_VEHICLES, SHARED_RINGS_GROUP
 from unjam.scenarios import make_scenario
+from unjam.scenarios.family import family_roads
 from unjam.scenarios.scenario import Scenario
 from unjam.training.search_space import SearchSpace, default_search_space
 from unjam.training.string_limit import MAX_STRING_GAIN, find_operating_points
@@ -37,6 +39,7 @@ from unjam_paper.study import (
     Table,
     estimate_text,
     evaluate_drivers,
+    evaluate_in_batches,
     make_drivers,
     number_text,
 )
@@ -72,6 +75,19 @@ SMOOTH_ACC_SPACE: SearchSpace = {
 }
 TUNING_STEPS = {"ring": 3_000_000, "ring-jammed": 3_000_000, "figure-eight": 1_500_000}
 """control steps of each tuning: 113 settings"""
+FAMILY_SEEDS = 10
+"""test seeds of each road of the family"""
+FAMILY_METRIC = "mean_speed_steady"
+FAMILY_CONTROLLER = "unjam:best"
+RETUNED = {
+    "rings": "pi-from-gap:window=41.13,catch_up_speed=0.8373,gap_lower=3.455,gap_upper=23.68,time_constant=2.431,"
+    "safe_gap=3.192,fade_time=79.28,history_factor=0.2589,human_time_headway=1.154",
+    "shared-rings": "pi-from-gap:window=26.6,catch_up_speed=0.6622,gap_lower=3.143,gap_upper=16.74,safe_gap=10.73,"
+    "time_constant=4.2,first_command=zero,human_time_headway=1.186,human_standstill_gap=1.397,fade_time=97.99,"
+    "history_factor=0.8567",
+}
+"""experts of `unjam:best`, tuned again for usual cars (results/tuned.json), by the group of their roads"""
+FAMILY_PART = "family"
 STORED_METRICS = ("seed", "return", "mean_speed", "speed_std_fleet_steady", "min_time_gap", "feasibility")
 
 
@@ -115,6 +131,28 @@ def measure_car(road: str, car: str, workers: int) -> Table:
         driver = make_driver(name, scenario.control_step)
         gain = None if name == "unjam:best" else point.string_gain(driver)  # it selects its controller on the road
         rows.append({"car": car, "driver": name, "gain": gain, "episodes": measure_episodes(scenario, name, workers)})
+    return rows
+
+
+def family_groups() -> dict[str, list[str]]:
+    """Return the closed roads of the family that have ideal cars, by the expert of `unjam:best` on them."""
+    shared, groups = family_roads(SHARED_RINGS_GROUP), dict[str, list[str]]()
+    for group in ("rings", SHARED_RINGS_GROUP, "figure-eights"):
+        names = (name for name in family_roads(group) if group != "rings" or name not in shared)
+        groups[group] = [name for name in names if FAMILY[name].options["actuator"] == IDEAL_VEHICLES["actuator"]]
+    return groups
+
+
+def measure_family(group: str, name: str, workers: int) -> Table:
+    """Return the speeds of human drivers, `unjam:best` with both cars, and the retuned expert, on a family road."""
+    road, rows = make_scenario(f"{FAMILY_PREFIX}{name}"), list[dict[str, Any]]()
+    drivers = {FAMILY_CONTROLLER: FAMILY_CONTROLLER, HUMAN_LABEL: HUMAN_LABEL}
+    drivers |= {"retuned": RETUNED[group]} if group in RETUNED else {}
+    for (car, actuator), (label, driver) in product(CARS.items(), drivers.items()):
+        scenario = replace(road, actuator=actuator)
+        measured = evaluate_in_batches(scenario, {label: driver}, FAMILY_SEEDS, (FAMILY_METRIC,), workers)[label]
+        speeds = [row[FAMILY_METRIC] for row in measured["episodes"]]
+        rows.append({"group": group, "road": name, "car": car, "driver": label, "speeds": speeds})
     return rows
 
 
@@ -173,6 +211,25 @@ def _mean_cells(episodes: Table, baselines: Mapping[str, Table | None]) -> dict[
     return cells | {"feasible episodes": NO_VALUE_TEXT if is_human else f"{feasible} of {len(episodes)}"}
 
 
+def family_table(folder: Path) -> pd.DataFrame:
+    """Return what `unjam:best` and the retuned experts gain over human drivers, with both cars, by kind of road."""
+    rows, table = read_part(folder, FAMILY_PART), list[dict[str, Any]]()
+    speed = {(row["road"], row["car"], row["driver"]): np.mean(row["speeds"]) for row in rows}
+    for group, roads in family_groups().items():
+
+        def difference(car: str, driver: str, other: tuple[str, str], roads: list[str] = roads) -> str:
+            values = [speed[road, car, driver] - speed[(road, *other)] for road in roads]
+            return estimate_text(estimate(values), 2, "+")
+
+        best, human = FAMILY_CONTROLLER, HUMAN_LABEL
+        cells = {"roads": f"{len(roads)} {group}"}
+        cells |= {f"{best}, {car} cars": difference(car, best, (car, human)) for car in CARS}
+        cells["usual to ideal cars"] = difference("usual", best, ("ideal", best))
+        retuned = difference("usual", "retuned", ("usual", best)) if group in RETUNED else NO_VALUE_TEXT
+        table.append({**cells, f"retuned expert to {best}, usual cars": retuned})
+    return pd.DataFrame(table)
+
+
 def string_figure(folder: Path) -> Figure:
     """Draw the mean speed of all vehicles over the string gain of the tuned experts, for each road."""
     figure = new_figure(3.0)
@@ -204,12 +261,18 @@ STRING_STABILITY = Study(
             for limit in limits
         },
         **{f"packaged-{road}/{car}": (measure_car, (road, car)) for road, car in product(PACKAGED, CARS)},
+        **{
+            f"{FAMILY_PART}/{name}": (measure_family, (group, name))
+            for group, roads in family_groups().items()
+            for name in roads
+        },
         **{f"{road}/{expert} 0": (measure_tuned, (road, expert, 0.0)) for road, expert in OTHER_EXPERT.items()},
     },
     minutes=70.0,
     tables={
         **{road: partial(string_table, road) for road in STRING_ROADS},
         **{f"packaged-{road}": partial(car_table, road) for road in PACKAGED},
+        "family": family_table,
     },
     figures={"trade-off": string_figure},
 )
