@@ -24,6 +24,7 @@ from unjam.training.selection import (
     OptionRows,
     compare_on_test_seeds,
     min_episodes,
+    seeds_at_once,
     select_controllers,
     verdict_episodes,
 )
@@ -271,3 +272,10 @@ def test_each_round_has_a_line_with_the_remaining_time() -> None:
     assert lines[0] == "5 tuning seeds: 1 of 2 options remain; at most 4 min more"
     assert lines[1].startswith("3 test seeds: CI of travel time at most ±")
     assert "; 2 options remain, at most " in lines[1]
+
+
+@pytest.mark.parametrize(("option_count", "workers", "seeds"), [(3, 1, 1), (3, 2, 1), (3, 6, 2), (4, 15, 3)])
+def test_with_a_limit_of_time_as_many_seeds_run_at_once_as_workers_have_options_for(
+    option_count: int, workers: int, seeds: int
+) -> None:
+    assert seeds_at_once(option_count, workers) == seeds

@@ -55,6 +55,7 @@ from unjam.training.selection import (
     Selection,
     compare_on_test_seeds,
     min_episodes,
+    seeds_at_once,
     select_controllers,
     verdict_episodes,
 )
@@ -138,8 +139,9 @@ def assess(
             label, index = episode
             log.add(hash_by_label[label], seeds[index], row)
 
-        # With a limit of time one seed after another: an answer needs all options on the same seeds.
-        for part in [[seed] for seed in seeds] if request.minutes else [seeds]:
+        # With a limit of time only some seeds at once: an answer needs all options on the same seeds.
+        count = seeds_at_once(len(options), workers.count) if request.minutes else len(seeds)
+        for part in (seeds[first : first + count] for first in range(0, len(seeds), count)):
             absent = {(option, seed) for option, seed in missing if seed in part}
             if part[0][-1] >= FEWEST_SEEDS[kind] and absent and not budget.has_time_for(len(absent)):
                 break

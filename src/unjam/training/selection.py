@@ -94,6 +94,11 @@ class EpisodeBudget:
         return max(0, episodes // option_count)
 
 
+def seeds_at_once(option_count: int, workers: int) -> int:
+    """Return the number of seeds on which so many options keep all workers busy, at least one."""
+    return max(1, workers // option_count)
+
+
 @dataclass(frozen=True)
 class Selection:
     """Result of the selection seeds."""
