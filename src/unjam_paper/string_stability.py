@@ -40,6 +40,7 @@ from unjam_paper.study import (
     estimate_text,
     evaluate_drivers,
     evaluate_in_batches,
+    evaluate_metrics,
     make_drivers,
     number_text,
 )
@@ -146,13 +147,14 @@ def family_groups() -> dict[str, list[str]]:
 def measure_family(group: str, name: str, workers: int) -> Table:
     """Return the speeds of human drivers, `unjam:best` with both cars, and the retuned expert, on a family road."""
     road, rows = make_scenario(f"{FAMILY_PREFIX}{name}"), list[dict[str, Any]]()
-    drivers = {FAMILY_CONTROLLER: FAMILY_CONTROLLER, HUMAN_LABEL: HUMAN_LABEL}
-    drivers |= {"retuned": RETUNED[group]} if group in RETUNED else {}
-    for (car, actuator), (label, driver) in product(CARS.items(), drivers.items()):
-        scenario = replace(road, actuator=actuator)
-        measured = evaluate_in_batches(scenario, {label: driver}, FAMILY_SEEDS, (FAMILY_METRIC,), workers)[label]
-        speeds = [row[FAMILY_METRIC] for row in measured["episodes"]]
-        rows.append({"group": group, "road": name, "car": car, "driver": label, "speeds": speeds})
+    usual = {FAMILY_CONTROLLER: FAMILY_CONTROLLER, HUMAN_LABEL: HUMAN_LABEL}
+    usual |= {"retuned": RETUNED[group]} if group in RETUNED else {}
+    evaluate_road = evaluate_in_batches if group in RETUNED else evaluate_metrics  # figure eights run in SUMO
+    for car, drivers in {"ideal": {FAMILY_CONTROLLER: FAMILY_CONTROLLER}, "usual": usual}.items():
+        scenario = replace(road, actuator=CARS[car])
+        for label, measured in evaluate_road(scenario, drivers, FAMILY_SEEDS, (FAMILY_METRIC,), workers).items():
+            speeds = [row[FAMILY_METRIC] for row in measured["episodes"]]
+            rows.append({"group": group, "road": name, "car": car, "driver": label, "speeds": speeds})
     return rows
 
 
@@ -223,7 +225,7 @@ def family_table(folder: Path) -> pd.DataFrame:
 
         best, human = FAMILY_CONTROLLER, HUMAN_LABEL
         cells = {"roads": f"{len(roads)} {group}"}
-        cells |= {f"{best}, {car} cars": difference(car, best, (car, human)) for car in CARS}
+        cells |= {f"{best}, {car} cars": difference(car, best, ("usual", human)) for car in CARS}
         cells["usual to ideal cars"] = difference("usual", best, ("ideal", best))
         retuned = difference("usual", "retuned", ("usual", best)) if group in RETUNED else NO_VALUE_TEXT
         table.append({**cells, f"retuned expert to {best}, usual cars": retuned})
