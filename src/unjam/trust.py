@@ -3,7 +3,7 @@
 import json
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import platformdirs
 
 from unjam.errors import InputError, UnjamError
-from unjam.files import atomic_write, make_folder, sha256_of
+from unjam.files import atomic_write, changed_file_error, make_folder, sha256_of
 from unjam.text import one_line
 from unjam.user_code import UserCode, read_code
 
@@ -27,6 +27,8 @@ _checked_files: dict[str, str]
 """resolved paths by the absolute names that a configuration was checked with: a link can change meanwhile"""
 _expected_hashes: dict[str, str]  # hashes by resolved path; empty: there was no file
 _checked_files, _expected_hashes = json.loads(os.environ.get(EXPECTED_CODE_VARIABLE, "[{}, {}]"))
+_sent_hashes: dict[str, str] = {}
+"""hashes by resolved path that another process has sent with its request"""
 
 
 @contextmanager
@@ -82,10 +84,17 @@ def resolve_code_path(name: str) -> Path:
 
 
 def check_code_unchanged(code: UserCode) -> None:
-    """Raise `InputError` if code has changed since the check of the configuration that names it."""
+    """Raise `InputError` if code has changed since a configuration that names it was checked, or a request was made."""
+    if _sent_hashes.get(str(code.path), code.sha256) != code.sha256:
+        raise changed_file_error(code.path.name)
     if _expected_hashes.get(str(code.path), code.sha256) != code.sha256 and not is_all_code_trusted():
         allowed = f"allowed: as it was then, or {TRUST_CODE_OPTION}"
         raise InputError(f"{code.path.name}: has changed since the configuration was checked; {allowed}")
+
+
+def expect_code(hashes: Mapping[str, str]) -> None:
+    """Refuse other code than that with these hashes, by resolved path, in the rest of this process."""
+    _sent_hashes.update(hashes)
 
 
 def expected_code_environment() -> dict[str, str]:

@@ -461,10 +461,30 @@ def test_an_expert_accelerates_exactly_as_in_an_episode() -> None:
 @pytest.mark.parametrize("backend", ["sumo", "batch"])
 def test_environments_are_copied_before_the_first_reset_only(backend: str) -> None:
     with closing(RoadEnv("ring", backend=backend, horizon=5)) as environment:
-        other = copy.deepcopy(environment)
+        other = copy.copy(environment)
         observation, _ = environment.reset(seed=3)
-        for make_copy in (copy.deepcopy, pickle.dumps):
+        for make_copy in (copy.copy, copy.deepcopy, pickle.dumps):
             with pytest.raises(InputError, match="a copy after reset is not allowed"):
                 make_copy(environment)
     with closing(other):
         np.testing.assert_array_equal(other.reset(seed=3)[0], observation)
+
+
+@pytest.mark.parametrize("options", [None, {"horizon": 50}])
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("road.toml", 'kind = "ring"\nvehicles = 22\n'),
+        ("road.py", "from unjam.scenarios import Ring\n\nroad = Ring(vehicles=22)\n"),
+    ],
+)
+def test_an_environment_of_a_road_whose_file_has_changed_is_not_reset(
+    name: str, text: str, options: dict[str, Any] | None, tmp_path: Path
+) -> None:
+    file = tmp_path / name
+    file.write_text(text)
+    with closing(RoadEnv(f"{file}:road" if name.endswith("py") else str(file))) as environment:
+        environment.reset(seed=0, options=options)
+        file.write_text(text.replace("22", "12"))
+        with pytest.raises(InputError, match=f"{name}: has changed since the start"):
+            environment.reset(seed=0, options=options)

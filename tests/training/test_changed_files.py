@@ -9,8 +9,9 @@ from optuna.distributions import FloatDistribution
 from tests.training.test_assess import FLOW, HELD
 from tests.training.test_run import small_config
 from tests.worlds.sumo.user_networks import straight
+from unjam.controller import make_driver
 from unjam.errors import InputError
-from unjam.scenarios import make_scenario
+from unjam.scenarios import Ring, make_scenario
 from unjam.training.assess import assess
 from unjam.training.assessment_request import make_request
 from unjam.training.calibrate import FACTOR_RANGES, calibrate, load_corridor
@@ -19,9 +20,11 @@ from unjam.training.search_space import SearchSpace
 from unjam.training.train import Trainer, train, train_in_process
 from unjam.training.tune import tune
 from unjam.worlds.sumo.detectors import DetectorPool
-from unjam.worlds.worker_pool import WorkerPool
+from unjam.worlds.record import Episode
+from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 DETECTORS = "edge,position,begin,end,flow_veh_per_h,speed\nroad,100,0,30,1800,10\n"
+SHORT = {"horizon": 60}
 CommandRunner = Callable[[str, Path, Callable[[], None]], object]
 """runs a command on a network with results in a folder, and calls the function while it runs"""
 
@@ -67,6 +70,59 @@ def test_command_ends_if_a_file_of_the_network_changes(run: CommandRunner, tmp_p
     with pytest.raises(InputError, match=r"^demand\.rou\.xml: has changed since the start; allowed"):
         run(str(file), tmp_path / "out", change)
     assert 'period="9"' in demand.read_text()
+
+
+def drive_with_reward(reward: str, out: Path, change: Callable[[], None]) -> None:
+    drive("ring", "pi", 2, scenario_options=SHORT, reward=reward, out=out, workers=1, progress=lambda *_: change())
+
+
+def tune_with_reward(reward: str, out: Path, change: Callable[[], None]) -> None:
+    space: SearchSpace = {"time_constant": FloatDistribution(1.0, 2.0)}
+    with WorkerPool(1) as workers:
+        tune({"ring": Ring(**SHORT)}, "pi", space, 9000, out, workers, reward, on_message=lambda _: change())
+
+
+def train_with_reward(reward: str, out: Path, change: Callable[[], None]) -> None:
+    config = small_config(scenario_options=SHORT, reward=reward, model__model_ratio=0.0)
+    train(config, out, on_iteration=lambda _: change() is None)
+
+
+def write_reward(folder: Path, value: float) -> Path:
+    file = folder / "reward.py"
+    file.write_text(f"def constant(outcome):\n    return 0.0 * outcome.speeds.mean(-1) + {value}\n")
+    return file
+
+
+@pytest.mark.parametrize("run", [drive_with_reward, tune_with_reward, train_with_reward])
+def test_command_ends_if_the_code_of_a_reward_changes(run: CommandRunner, tmp_path: Path) -> None:
+    file = write_reward(tmp_path, 1.0)
+    with pytest.raises(InputError, match=r"^(train: .*)?reward\.py.* has changed since"):
+        run(f"{file}:constant", tmp_path / "out", lambda: write_reward(tmp_path, 7.0) and None)
+    assert not (tmp_path / "out" / "evaluation.json").exists()
+
+
+def test_tuning_ends_if_the_code_of_its_expert_changes(tmp_path: Path) -> None:
+    file, text = tmp_path / "own.py", "class Follower:\n    def __init__(self, gain=1.0): self.gain = gain\n"
+    act = "    def act(self, state, memory): return self.gain * (state.leader_speed - state.speed), memory\n"
+    file.write_text(text + act + "    def initial_memory(self, n): return {}\n")
+    space: SearchSpace = {"gain": FloatDistribution(0.1, 0.5)}
+    with WorkerPool(1) as workers, pytest.raises(InputError, match=r"own\.py.* has changed since"):
+        change = lambda _: file.write_text(file.read_text() + "\n# changed\n")  # noqa: E731
+        tune({"ring": Ring(**SHORT)}, f"{file}:Follower", space, 9000, tmp_path / "out", workers, on_message=change)
+
+
+def test_code_that_changes_for_a_moment_is_refused_by_the_worker_that_reads_it(tmp_path: Path) -> None:
+    reward = f"{write_reward(tmp_path, 1.0)}:constant"
+    tasks = [EpisodeTask(Ring(**SHORT), make_driver("pi", 0.1), (seed,), reward) for seed in range(3)]
+
+    def change(index: int, episode: Episode) -> Episode:
+        write_reward(tmp_path, 7.0 if index == 0 else 1.0)
+        return episode
+
+    with WorkerPool(1) as workers:
+        first, second, third = workers.run_and_map(tasks, change)
+    assert [first.error, third.error] == ["", ""]
+    assert "reward.py: has changed since the start" in second.reason
 
 
 def test_command_goes_on_if_the_content_is_the_same(tmp_path: Path) -> None:

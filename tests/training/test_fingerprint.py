@@ -177,3 +177,21 @@ def test_longer_run_resumes_with_the_best_scheduled_controller(ended: bool, cont
     ControllerStore([tmp_path]).restore(tensors, ended)
     assert (tmp_path / "controller.unjam").read_bytes() == content
     assert tensors.keys() == {"weight"}
+
+
+def test_files_of_equal_names_that_are_exchanged_between_tasks_are_refused(tmp_path: Path) -> None:
+    rewards = [tmp_path / folder / "reward.py" for folder in "ab"]
+    for number, file in enumerate(rewards):
+        file.parent.mkdir()
+        file.write_text(f"def constant(outcome):\n    return 0.0 * outcome.speeds.mean(-1) + {number}\n")
+    tasks = [{"name": f"task-{number}", "reward": f"{file}:constant"} for number, file in enumerate(rewards)]
+    config_file = tmp_path / "mix.toml"
+    text = "".join(f"[[tasks]]\nname = '{task['name']}'\nreward = '{task['reward']}'\n" for task in tasks)
+    config_file.write_text(to_toml(small_config()).replace("tasks = []\n", "") + text)
+    config = load_config(config_file)
+    with_checkpoint(tmp_path / "run", config)
+    check_fingerprint(fingerprint(config), fingerprint(config))
+    first, second = (file.read_text() for file in rewards)
+    rewards[0].write_text(second)
+    rewards[1].write_text(first)
+    assert "reward.py has changed since the checkpoint" in refusal_message(tmp_path / "run", config)

@@ -3,10 +3,9 @@
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from copy import copy
-from functools import partial, wraps
+from copy import copy, deepcopy
+from functools import wraps
 from math import isfinite
-from operator import attrgetter
 from threading import RLock
 from typing import Any, ClassVar, Concatenate, NamedTuple, ParamSpec, Self, TypeVar
 
@@ -23,12 +22,12 @@ from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features,
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
-from unjam.files import FileWatch
 from unjam.measures.step_metrics import StepMetricMeans
 from unjam.parameters import check_integer, merge_changes, nest_keys
 from unjam.physics.arrays import clip
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
+from unjam.scenarios.file_watch import watch_files
 from unjam.scenarios.road import OrderedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import warn_of_reserved_seed
@@ -126,7 +125,7 @@ class RoadStepper:
         self._base, self._changes = scenario, changes
         self.scenario = self.episode_scenario = made
         """that of the constructor; `episode_scenario` is that of the last reset, with its options"""
-        self._watch = FileWatch(partial(attrgetter("user_files"), made))
+        self._watch = watch_files([made], scenario, backend)
         reward = reward or self.scenario.reward
         self.reward, self.has_user_reward = make_reward(reward), not is_packaged_reward(reward)
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
@@ -359,6 +358,10 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         check_single_cav(self._road.scenario)
         self.observation_space = self._road.observation_space
         self.action_space = self._road.action_space
+
+    def __copy__(self) -> Self:
+        """Return an independent copy, as `copy.deepcopy` does."""
+        return deepcopy(self)
 
     @synchronized
     def reset(self, *, seed: int | None = None, options: ResetOptions = None) -> tuple[Observations, dict[str, Any]]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from gymnasium import spaces
@@ -21,6 +21,10 @@ class RoadAgents(ParallelEnv[str, Any, Any]):
         self.possible_agents, self.agents = list(possible_agents), []
         self.observation_spaces = {agent: deepcopy(road.observation_space) for agent in self.possible_agents}
         self.action_spaces = {agent: deepcopy(road.action_space) for agent in self.possible_agents}
+
+    def __copy__(self) -> Self:
+        """Return an independent copy, as `copy.deepcopy` does."""
+        return deepcopy(self)
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Return the observation space of an agent: that of one CAV; raise `InputError` for an unknown agent."""

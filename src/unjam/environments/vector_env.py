@@ -3,9 +3,10 @@
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from copy import deepcopy
 from functools import partial
 from operator import index
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from gymnasium import spaces
@@ -181,6 +182,10 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         self._episodes: Episodes | None = None
         self._prepared: dict[int, tuple[Episodes, int]] = {}  # next episode by environment: a row of started episodes
         self._ended_rows: list[int] = []  # environments whose episode ended in the last step
+
+    def __copy__(self) -> Self:
+        """Return an independent copy, as `copy.deepcopy` does."""
+        return deepcopy(self)
 
     def _unsupported_reason(self, scenario: Scenario) -> str:
         """Return why this class has no environment of a scenario that batches simulate; empty if it has one."""

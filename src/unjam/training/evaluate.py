@@ -32,6 +32,7 @@ from unjam.reports.results import (
     to_plot_episode,
     weights_id,
 )
+from unjam.scenarios.file_watch import watch_files
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig
@@ -117,7 +118,7 @@ def evaluate_on_roads(
     tasks = {(label, index): EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs}
     remote = [pair for pair in pairs if tasks[pair].is_serializable]
     local = [pair for pair in pairs if not tasks[pair].is_serializable]
-    watch = watch or FileWatch(lambda: {file for scenario, _ in drivers.values() for file in scenario.user_files})
+    watch = watch or watch_files((scenario for scenario, _ in drivers.values()), reward, backend)
     on_progress = progress or (lambda pair, steps: None)
 
     def measure_task(pair: tuple[str, int], episode: Episode) -> tuple[dict[str, Any], Episode | None]:

@@ -32,7 +32,7 @@ def fingerprint(config: RunConfig) -> dict[str, Any]:
 
     These are all settings but steps and workers, hashes of experts and user files, packages and kernels.
     """
-    files = code_hashes(config)
+    files = file_hashes(code_names(config))
     for each, task in zip(config.task_configs().values(), config.make_tasks(), strict=True):
         recipe, arrays = driver_recipe(task.expert)
         weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
@@ -63,11 +63,10 @@ def check_settings(
             raise invalid_value(f"{command}: {name}", value, f"{before!r}, as in the checkpoint")
 
 
-def code_hashes(config: RunConfig) -> dict[str, str]:
-    """Return hashes of the code of the user's agent, backend, features, rewards and roads, by path."""
-    tasks = config.task_configs().values()
-    names = [name for task in tasks for name in (task.scenario, task.reward)]
-    return file_hashes([config.agent, config.backend, *config.policy.inputs, *names])
+def code_names(config: RunConfig) -> list[str]:
+    """Return the names of agent, backend, features, rewards and roads, which can be files of the user."""
+    names = [name for task in config.task_configs().values() for name in (task.scenario, task.reward)]
+    return [config.agent, config.backend, *config.policy.inputs, *names]
 
 
 def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: str) -> None:
@@ -77,7 +76,9 @@ def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: 
         {(_without_folders(name.removeprefix("expert ")), sha256): name for name, sha256 in each["files"].items()}
         for each in (stored, current)
     )
-    if changed := before.keys() ^ now.keys():
+    # Files of equal names in several folders are compared in the order of their tasks: the folders can have moved.
+    changed = before.keys() ^ now.keys() or {one for one, other in zip(before, now, strict=True) if one != other}
+    if changed:
         name = {**now, **before}[min(changed)]
         raise InputError(f"{command}: {name} has changed since the checkpoint; allowed: as it was then")
 

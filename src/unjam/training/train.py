@@ -16,7 +16,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.network import Network
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import InputError, invalid_value, raise_failure
-from unjam.files import UNREADABLE_ERRORS, FileWatch, append_line, atomic_write, make_folder, to_json
+from unjam.files import UNREADABLE_ERRORS, append_line, atomic_write, make_folder, to_json
 from unjam.kernels import needs_new_process
 from unjam.learners.agent import AgentSpec, check_network, check_state, learner_class, reporting_user_errors
 from unjam.learners.algorithm import (
@@ -36,6 +36,7 @@ from unjam.measures.verdict import metric_frame
 from unjam.processes import lock_folder
 from unjam.reports.html import write_report_page
 from unjam.reports.results import CONTROLLER_FILE, read_progress
+from unjam.scenarios.file_watch import watch_files
 from unjam.seeds import VALIDATION_SEED
 from unjam.text import one_line
 from unjam.training import run_folder
@@ -43,7 +44,7 @@ from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
 from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert
 from unjam.training.executors import IterationCallback, train_in_subprocess
 from unjam.training.export import ControllerStore
-from unjam.training.fingerprint import check_file_hashes, code_hashes, fingerprint
+from unjam.training.fingerprint import check_file_hashes, code_names, file_hashes, fingerprint
 from unjam.training.model_facts import no_facts_reason, write_model_facts
 from unjam.training.random_state import exclusive_random_state
 from unjam.training.string_limit import find_operating_points
@@ -197,7 +198,7 @@ class Trainer:
     ) -> None:
         self.folder, self.config, self.workers = folder, config, workers
         self.tasks = config.make_tasks()
-        self.watch = FileWatch(lambda: {file for task in self.tasks for file in task.scenario.user_files})
+        self.watch = watch_files((task.scenario for task in self.tasks), *code_names(config))
         self.folders = [folder / task.name for task in self.tasks]
         string_gain = self._string_gain_function() if config.policy.max_string_gain else None
         self.spec = AgentSpec(self.tasks, config.policy, config.model, config.learner.gamma, config.seed, string_gain)
@@ -311,7 +312,7 @@ class Trainer:
             started, validation = time.perf_counter(), self.validate(has_ended=True)
             seconds["validation"] += time.perf_counter() - started
             whole, *tasks = self._progress_rows(log, validation)
-        now = self._fingerprint["files"] | code_hashes(self.config)
+        now = self._fingerprint["files"] | file_hashes(code_names(self.config))
         check_file_hashes(self._fingerprint, {"files": now}, "train")  # an iteration of changed code is not stored
         self.watch.check()
         for folder, row in [*zip(self.folders, tasks, strict=False), (self.folder, whole)]:

@@ -21,12 +21,13 @@ from unjam.drivers.driver import label_with_parameters
 from unjam.drivers.registry import driver_from_name
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import InputError, UnjamError, invalid_value, raise_failure, unknown_name
-from unjam.files import FileWatch, atomic_write, to_json
+from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, overall_feasibility
 from unjam.measures.gain import MEAN_GAIN, EpisodeRows, normalized_gain, performance_bound
 from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
+from unjam.scenarios.file_watch import watch_files
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import tuning_seeds
 from unjam.training.fingerprint import file_hashes
@@ -195,7 +196,7 @@ def tune(
     request |= {"files": files} if files else {}
     request |= {"max_string_gain": max_string_gain} if max_string_gain else {}
     log = TrialLog(folder, request | {"seed": seed, "screen": bool(screened), "backend": backend})
-    watch = FileWatch(lambda: {file for road in roads.values() for file in road.user_files})
+    watch = watch_files(roads.values(), expert, reward, backend)
     points = find_operating_points(roads, workers) if max_string_gain else {}
     sumo_runners = dict.fromkeys(roads, partial(_run_in_sumo, workers))
     trial_runners = sumo_runners | dict.fromkeys(screened, _run_in_batch)

@@ -13,6 +13,7 @@ from unjam.errors import as_unjam_error
 from unjam.scenarios import scenario_from_recipe
 from unjam.sumo_files import take_answer
 from unjam.tree import Arrays, pack
+from unjam.trust import expect_code
 from unjam.worlds.backend import Backend, open_backend
 from unjam.worlds.episode import run_episode, seeded_generators
 from unjam.worlds.messages import answer_requests, open_answer_pipe, write_message
@@ -40,6 +41,7 @@ def _answer(open_once: Callable[[str], Backend], output: IO[bytes], request: dic
     try:
         if "files" in request:  # what the parent has read of the files; changed files are read again
             take_answer(request["scenario"]["file"], request["files"])
+        expect_code(request["code"])
         with seeded_generators(request["seed"]):  # a user's file or class may draw from them, too
             scenario = scenario_from_recipe(request["scenario"])
             if scenario.reads_user_files:

@@ -9,12 +9,15 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable
+from unjam.drivers.user_driver import FileReference, is_file_reference
 from unjam.errors import EpisodeError, SumoInputError
+from unjam.parameters import split_parameters
 from unjam.processes import PrivateFolder, check_owner, remove_stale_private_folders
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
@@ -65,6 +68,12 @@ class EpisodeTask:
         content |= {"seed": list(self.seed), "scenario": scenario_recipe(self.scenario), "driver": recipe}
         return content, arrays
 
+    def code_hashes(self) -> dict[str, str]:
+        """Return hashes of the files of reward and backend by path; drivers and scenarios have those of their own."""
+        reward, _ = split_parameters(str(self.reward or self.scenario.reward))
+        names = (name for name in (reward, str(self.backend)) if is_file_reference(name))
+        return {str(code.path): code.sha256 for code in (FileReference.parse(name).read_code() for name in names)}
+
 
 class WorkerPool(AbstractContextManager["WorkerPool"]):
     """A fixed number of worker processes, started when first needed, and replaced when they die or hang.
@@ -80,6 +89,7 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
         self._temporary_folder = PrivateFolder()  # of all workers, so that a killed one leaves no files
         self._idle_workers: queue.LifoQueue[_Worker] = queue.LifoQueue()
         self._workers = [_Worker(timeout, self._temporary_folder.name) for _ in range(count)]
+        self._code_hashes = dict[str, str]()
         self._thread_pool = ThreadPoolExecutor(count, thread_name_prefix="unjam-worker")
         for worker in self._workers:
             self._idle_workers.put(worker)
@@ -102,6 +112,8 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
         Raise `SumoInputError` if SUMO refuses the files of the very first task, and so would refuse those of others.
         """
         check_owner(self._owner, "worker pool: it")
+        for task in {(each.reward, each.scenario.reward, each.backend): each for each in tasks}.values():
+            self._code_hashes = task.code_hashes() | self._code_hashes  # code stays what it was at first
         is_first, self._is_first = self._is_first, False
 
         def run_one(index: int, task: EpisodeTask) -> ResultT:
@@ -122,7 +134,8 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
         try:
             for _ in range(self._max_attempts):
                 try:
-                    episode = worker.run(task, lambda steps: on_progress and on_progress(index, steps))
+                    report_steps = partial(on_progress, index) if on_progress else lambda steps: None
+                    episode = worker.run(task, self._code_hashes, report_steps)
                     if on_progress is not None:
                         on_progress(index, episode.control_steps)
                     return episode
@@ -169,8 +182,8 @@ class _Worker:
         threading.Thread(target=_forward_messages, args=(process, self._messages), daemon=True).start()
         return process
 
-    def run(self, task: EpisodeTask, on_progress: Callable[[int], object]) -> Episode:
-        """Return the episode of a task; raise `_WorkerLostError` if the process dies or does not answer."""
+    def run(self, task: EpisodeTask, code: dict[str, str], on_progress: Callable[[int], object]) -> Episode:
+        """Return the episode of a task, with hashes of its code; raise `_WorkerLostError` if the process is lost."""
         was_sandboxed, self._is_sandboxed = self._is_sandboxed, task.scenario.reads_user_files
         if was_sandboxed and not self._is_sandboxed:  # a process cannot leave its sandbox
             self._kill()
@@ -181,7 +194,8 @@ class _Worker:
         # The process reads and loads a user's network before its first message.
         timeout = self._timeout + (MAX_READER_TIME if self._is_sandboxed else 0.0)
         try:
-            self._send(process, *task.message())
+            content, arrays = task.message()
+            self._send(process, {**content, "code": code}, arrays)
             while (message := self._next_message(process, timeout)) is not None:
                 timeout = self._timeout
                 content, arrays = message
