@@ -19,8 +19,8 @@ from unjam.training.drive import drive
 from unjam.training.search_space import SearchSpace
 from unjam.training.train import Trainer, train, train_in_process
 from unjam.training.tune import tune
-from unjam.worlds.sumo.detectors import DetectorPool
 from unjam.worlds.record import Episode
+from unjam.worlds.sumo.detectors import DetectorPool
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 DETECTORS = "edge,position,begin,end,flow_veh_per_h,speed\nroad,100,0,30,1800,10\n"
