@@ -106,8 +106,11 @@ def test_tuning_ends_if_the_code_of_its_expert_changes(tmp_path: Path) -> None:
     act = "    def act(self, state, memory): return self.gain * (state.leader_speed - state.speed), memory\n"
     file.write_text(text + act + "    def initial_memory(self, n): return {}\n")
     space: SearchSpace = {"gain": FloatDistribution(0.1, 0.5)}
+
+    def change(message: str) -> None:
+        file.write_text(file.read_text() + "\n# changed\n")
+
     with WorkerPool(1) as workers, pytest.raises(InputError, match=r"own\.py.* has changed since"):
-        change = lambda _: file.write_text(file.read_text() + "\n# changed\n")  # noqa: E731
         tune({"ring": Ring(**SHORT)}, f"{file}:Follower", space, 9000, tmp_path / "out", workers, on_message=change)
 
 
