@@ -113,6 +113,15 @@ def test_the_horizon_truncates_and_does_not_terminate(name: str) -> None:
     assert ends[-1] == (False, True)
 
 
+def test_a_recorded_road_can_be_drawn_after_its_metrics_are_measured() -> None:
+    with closing(RoadEnv("recorded", horizon=5, render_mode="rgb_array")) as environment:
+        environment.reset(seed=1)
+        *_, info = [environment.step(np.zeros(1)) for _ in range(5)][-1]
+        assert info["episode_metrics"]["cav_fuel_by_power"] > 0.0
+        assert environment.render().shape == (640, 640, 3)
+        environment.reset()
+
+
 @pytest.mark.parametrize("expert", ["", "pi"])
 def test_on_the_merge_the_episode_ends_when_the_cav_leaves(expert: str) -> None:
     environment = RoadEnv("merge", horizon=200, expert=expert)  # one CAV by default

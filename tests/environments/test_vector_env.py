@@ -18,7 +18,7 @@ from unjam.drivers.safety import INSTANT_ACTUATOR
 from unjam.environments.gymnasium_env import RoadEnv
 from unjam.environments.vector_env import RoadVectorEnv
 from unjam.errors import InputError, MissingPartError, UnjamError
-from unjam.measures.metrics import METRICS
+from unjam.measures.metrics import METRICS, RECORDED_ROAD_METRICS
 from unjam.scenarios import make_scenario
 from unjam.worlds.batch.noise import draw_single_normal
 from unjam.worlds.episode import run_episode
@@ -115,34 +115,43 @@ def test_roads_end_with_their_recordings(tmp_path: Path) -> None:
         speeds = pd.DataFrame({"time": times, "speed": 12.0 + np.sin(times + seconds)})
         speeds.to_csv(tmp_path / f"{seconds}.csv", index=False)
     arguments: dict[str, Any] = {"scenario": "recorded", "recordings": str(tmp_path)}
-    environment = RoadVectorEnv(8, **arguments)
+    environment, road = RoadVectorEnv(8, **arguments), make_scenario("recorded", {"recordings": str(tmp_path)})
     files = [environment.reset(seed=0)[1]["drawn_values"]["file"]]
-    lengths, ages = [], np.zeros(8, int)
+    lengths, ages, counts = [], np.zeros(8, int), np.zeros(8, int)
     for _ in range(450):
         *_, truncated, info = environment.step(np.zeros((8, 1)))
         ages += 1
-        lengths += [(files[-1][row], ages[row]) for row in np.flatnonzero(truncated)]
+        for row in np.flatnonzero(truncated).tolist():
+            lengths.append((files[-1][row], ages[row]))
+            seed = (row, int(counts[row])) if counts[row] else (row,)
+            episode = run_episode(road, Constant(), seed, backend="batch")
+            for name in RECORDED_ROAD_METRICS:  # of episodes that began at different times
+                expected = pytest.approx(METRICS[name].function(episode), abs=1e-9, nan_ok=True)
+                assert info["episode_metrics"][name][row] == expected
+        counts += truncated
         if "drawn_values" in info:
             files.append(np.where(info["_drawn_values"], info["drawn_values"]["file"], files[-1]))
             ages[info["_drawn_values"]] = 0
     assert set(lengths) == {(0.0, 200), (1.0, 210), (2.0, 225)}
-    expected = [run_episode(make_scenario("recorded", {"recordings": str(tmp_path)}), Constant(), (0,)).control_steps]
-    assert expected[0] == dict(lengths)[files[0][0]]
+    assert run_episode(road, Constant(), (0,)).control_steps == dict(lengths)[files[0][0]]
 
 
-@pytest.mark.parametrize("scenario", ["ring", "recorded"])
-def test_the_metrics_of_an_episode_are_in_the_info_of_its_last_step(scenario: str) -> None:
-    environment = RoadVectorEnv(2, scenario, horizon=60)
+@pytest.mark.parametrize(("scenario", "steps"), [("ring", 60), ("recorded", 700)])
+def test_the_metrics_of_an_episode_are_in_the_info_of_its_last_step(scenario: str, steps: int) -> None:
+    environment = RoadVectorEnv(2, scenario, horizon=steps)
     environment.reset(seed=3)
-    infos = [environment.step(np.full((2, 1), 0.1))[-1] for _ in range(60)]
+    infos = [environment.step(np.full((2, 1), 0.1))[-1] for _ in range(steps)]
     assert not any("episode_metrics" in info for info in infos[:-1])
     metrics = infos[-1]["episode_metrics"]
     assert infos[-1]["_episode_metrics"].all()
     for row in range(2):
-        episode = run_episode(make_scenario(scenario, {"horizon": 60}), Constant(acceleration=0.1), (3 + row,))
-        for name in ("return", "mean_speed", "speed_std_fleet", "cav_mean_speed", "mean_abs_accel"):
-            assert metrics[name][row] == pytest.approx(METRICS[name].function(episode), abs=1e-6)
-        assert metrics["steps"][row] == 60
+        episode = run_episode(make_scenario(scenario, {"horizon": steps}), Constant(acceleration=0.1), (3 + row,))
+        names = ("return", "mean_speed", "speed_std_fleet", "cav_mean_speed", "mean_abs_accel")
+        for name in (*names, *(RECORDED_ROAD_METRICS if scenario == "recorded" else ())):
+            assert metrics[name][row] == pytest.approx(METRICS[name].function(episode), abs=1e-6, nan_ok=True)
+        assert {*metrics} >= {*RECORDED_ROAD_METRICS} if scenario == "recorded" else "fuel_by_power" not in metrics
+        assert metrics["steps"][row] == steps
+        assert scenario == "ring" or np.isfinite(metrics["amplification"][row])
         terms = {name: sum(info["reward_terms"][name][row] for info in infos) for name in episode.reward_terms}
         assert terms == pytest.approx({name: values.sum() for name, values in episode.reward_terms.items()})
 
@@ -163,7 +172,9 @@ def test_single_environments_give_the_same_metrics_in_the_last_step(name: str, m
                 *_, found = single.step([action(step, 0, CASES[name])])
                 step += 1
         names = [each for each in expected if not each.startswith("_")]
-        assert found["episode_metrics"] == pytest.approx({each: expected[each][row] for each in names}, abs=1e-9)
+        assert found["episode_metrics"] == pytest.approx(
+            {each: expected[each][row] for each in names}, abs=1e-9, nan_ok=True
+        )
 
 
 @pytest.mark.parametrize("exact", [True, False])

@@ -48,7 +48,10 @@ def test_note_counts_drives_that_episodes_repeat() -> None:
     def drives(*files: int, begin: float = 0.0) -> list[dict[str, Any]]:
         return [{**row, "file": file, "part": 0, "begin": begin} for row, file in zip(rows_of(9), files, strict=False)]
 
-    alike = "those of the same drive differ in the noise of human drivers alone, and intervals are too narrow"
+    alike = (
+        "those of the same drive differ in the noise of human drivers alone: in paired differences they count as one, "
+        "and intervals of single drivers are too narrow"
+    )
     assert episode_notes({"human": drives(0, 1, 0), "pi": drives(0, 1)}) == [
         f"3 episodes of 2 recorded drives: {alike}"
     ]

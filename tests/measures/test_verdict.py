@@ -7,7 +7,15 @@ import pytest
 
 from tests.measures.test_effect import USUAL
 from unjam.measures.metrics import METRICS
-from unjam.measures.verdict import CLOSED_ROAD, OPEN_ROAD, RECORDED_ROAD, road_metrics, short_table_metrics, verdicts
+from unjam.measures.verdict import (
+    CLOSED_ROAD,
+    OPEN_ROAD,
+    RECORDED_ROAD,
+    Verdict,
+    road_metrics,
+    short_table_metrics,
+    verdicts,
+)
 
 ROW: dict[str, Any] = {"speed_std_fleet_steady": 1.0, "fuel_by_power": 60.0, "cav_mean_gap": 20.0, **USUAL}
 ROADS = {"closed": {"travel_time": nan}, "open": {}, "recorded": {"travel_time": nan, "time_behind_leader": 10.0}}
@@ -83,7 +91,27 @@ def test_more_teleports_are_the_price_of_a_better_metric() -> None:
 
 def test_few_seeds_decide_nothing() -> None:
     verdict = lines_of(human=episodes(count=1), pi=episodes(count=1, mean_speed=30.0))[0]
-    assert verdict == "pi: feasible; mean speed undecided compared with human drivers, 1 paired seed, which are too few"
+    assert verdict == "pi: feasible; mean speed undecided compared with human drivers, 1 paired seed, which is too few"
+
+
+def test_a_verdict_counts_different_recordings() -> None:
+    def behind(files: list[int], fuel: float) -> list[dict[str, Any]]:
+        rows = episodes("recorded", len(files), fuel_by_power=fuel)
+        return [{**row, "file": file, "part": 0, "begin": 0.0} for row, file in zip(rows, files, strict=True)]
+
+    def verdict_of(*files: int) -> Verdict:
+        (verdict,) = verdicts({"human": behind([*files], 60.0), "pi": behind([*files], 58.0)})
+        return verdict
+
+    alike, two, three = verdict_of(3, 3, 3, 3, 3), verdict_of(3, 3, 5, 5), verdict_of(3, 3, 5, 5, 6)
+    assert [each.is_better for each in (alike, two, three)] == [None, None, True]
+    assert alike.comparison == "fuel by power undecided compared with human drivers, 1 recording, which is too few"
+    assert alike.differences[0].text == "-2.0 ml/km (-3.3 %)"
+    assert two.comparison.endswith(", 2 recordings, which are too few")
+    assert three.comparison == "fuel by power better than that of human drivers, 3 recordings"
+    *others, part = behind([3, 3, 3], 58.0)
+    rows = {"human": behind([3, 3, 3], 60.0), "pi": [*others, {**part, "part": 1}]}
+    assert verdicts(rows)[0].comparison.endswith(", 2 recordings, which are too few")
 
 
 def test_without_human_drivers_or_common_episodes_there_is_no_comparison() -> None:

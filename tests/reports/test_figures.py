@@ -27,6 +27,7 @@ from unjam.reports.figures import (
     MAX_PLOT_TIMES,
     color_table,
     data_uri,
+    last_vehicle_figure,
     learning_curve_figure,
     png_bytes,
     svg_bytes,
@@ -86,6 +87,21 @@ def drawn_lines(axes: Axes) -> list[Line2D]:
     return [line for line in axes.lines if len(np.asarray(line.get_xdata()))]
 
 
+def behind_recording(driver: str, scale: float, base: float = 20.0) -> PlotEpisode:
+    """A platoon of two vehicles whose last one has `scale` times the wave of the recorded vehicle."""
+    wave = np.sin(2.0 * np.pi * np.arange(601) / 300.0)[:, None]
+    speeds, recorded = base + wave * [scale, 1.0], base + 2.0 * wave
+    positions, ahead = np.cumsum(speeds, axis=0) * 0.1 + [0.0, 30.0], np.cumsum(recorded, axis=0) * 0.1 + 60.0
+    road: dict[str, Any] = {"outline": np.zeros((0, 3)), "loop_length": float("nan"), "limit_speed": float("nan")}
+    road |= {"lane_lines": np.array([[-60.0, 0.0], [0.0, 0.0]]), "poses": np.zeros((601, 2, 3))}
+    motion: dict[str, Any] = {
+        "speeds": speeds,
+        "positions": positions,
+        "replayed_motion": np.stack([ahead, recorded], -1),
+    }
+    return make_episode(driver, vehicles=2, steps=600, **road, **motion)
+
+
 def drivers(count: int) -> list[PlotEpisode]:
     return [make_episode(f"driver {number}", 2.0 + number) for number in range(count)]
 
@@ -120,6 +136,14 @@ def test_speed_scale_starts_at_zero_and_is_never_empty() -> None:
     absent = make_episode(speeds=np.array([[2.5, np.nan]], np.float32))
     assert speed_scale([absent]).vmax == 3.0
     assert speed_scale([make_episode(speeds=np.full((10, 5), np.nan, np.float32))]).vmax == 1.0
+
+
+def test_speed_scale_behind_recordings_starts_at_the_smallest_speed_of_all_panels() -> None:
+    panels = [behind_recording("human", 2.0), behind_recording("pi", 1.0), behind_recording("acc", 1.0, 25.0)]
+    assert (speed_scale(panels[:2]).vmin, speed_scale(panels[2:]).vmin) == (18.0, 23.0)
+    fields = [field for axes in panels_of(trajectory_figure(panels)) for field in fields_of(axes)]
+    assert {field.norm.vmin for field in fields} == {18.0}
+    assert speed_scale([*panels, make_episode()]).vmin == 0.0
 
 
 def test_a_few_fast_vehicles_do_not_stretch_the_speed_scale() -> None:
@@ -242,6 +266,19 @@ def test_time_series_have_drivers_and_limit_in_the_legend() -> None:
     assert set(np.asarray(limit.get_ydata())) == {6.5}
 
 
+def test_last_vehicles_are_drawn_with_the_recorded_vehicle_and_its_amplification() -> None:
+    panels = [behind_recording("human", 2.0), behind_recording("pi", 1.0)]
+    figure = last_vehicle_figure([make_episode("ring"), *panels])
+    (axes,), [legend] = panels_of(figure), figure.legends
+    last, damped, recorded = (np.asarray(line.get_ydata()) for line in drawn_lines(axes))
+    np.testing.assert_allclose([np.ptp(last), np.ptp(damped), np.ptp(recorded)], [4.0, 2.0, 4.0], rtol=1e-3)
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "human: amplification 1.00, of waves of 20 to 60 s 1.00",
+        "pi: amplification 0.50, of waves of 20 to 60 s 0.50",
+        "recorded vehicle",
+    ]
+
+
 def row(number: int, validation: float | None = None, **changes: Any) -> dict[str, Any]:
     usual = {"iteration": number, "environment_steps": 12_000 * number, "return_mean": 90.0 + number}
     usual |= {"return_expert": 100.0, "return_validation": validation}
@@ -337,6 +374,7 @@ def content(uri: str) -> tuple[str, bytes]:
 FIGURES: Sequence[Callable[[], Figure]] = (
     lambda: trajectory_figure(drivers(2)),
     lambda: time_series_figure(drivers(2)),
+    lambda: last_vehicle_figure([behind_recording("pi", 1.0)]),
     lambda: learning_curve_figure({"ring-001": RUN}, {"pi": 100.0}, {"pi": estimate([9.0, 10.0, 12.0])}),
     lambda: training_time_figure(RUN),
 )

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from tests.reports.open_roads import merge_episode, plot_episode_of, user_episode
+from tests.reports.test_figures import behind_recording
 from unjam.reports.html import REPLAY_NAN, REPLAY_STEP, _encode_array, replay_data
 from unjam.reports.results import PlotEpisode
 from unjam.reports.space_time import speed_scale
@@ -134,6 +135,12 @@ def test_a_replay_marks_the_places_where_ramps_join() -> None:
     assert place == pytest.approx(merge.poses.reshape(-1, 3)[at_merge, :2].tolist(), abs=0.1)
     far = replace(merge, merge_positions=(5000.0,))
     assert replay_data([far])["drivers"][0]["merges"] == []
+
+
+def test_a_replay_has_the_scale_of_the_figures() -> None:
+    panels = [behind_recording("human", 2.0), behind_recording("pi", 1.0)]
+    data, scale = replay_data(panels), speed_scale(panels)
+    assert (data["min_speed"], data["max_speed"]) == (scale.vmin, scale.vmax) == (18.0, 22.0)
 
 
 def test_a_replay_without_episodes_is_empty() -> None:

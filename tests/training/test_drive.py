@@ -351,6 +351,19 @@ def test_drivers_with_equal_descriptions_are_both_run(my_drivers: Path) -> None:
     assert len(drive("ring", drivers, 1, scenario_options=ROAD, workers=1).rows) == 2
 
 
+def test_a_set_speed_below_recorded_speeds_is_noted(tmp_path: Path) -> None:
+    times = np.arange(0.0, 30.1, 0.1)
+    pd.DataFrame({"time": times, "speed_ms": 30.0 + 4.7 * np.sin(times / 5.0)}).to_csv(tmp_path / "fast.csv")
+    road, names = {"recordings": str(tmp_path), "window": 3.0}, ["human", "acc", "acc:set_speed=31", "acc:set_speed=36"]
+    result = drive("recorded", names, 1, scenario_options=road, workers=1, backend="batch", out=tmp_path / "out")
+    other = "is below the recorded 34.7 m/s: name another, as in acc:set_speed=45"
+    expected = [f"acc: its set speed of 30 m/s {other}", f"acc:set_speed=31: its set speed of 31 m/s {other}"]
+    assert [note for note in result.notes if "set speed" in note] == expected
+    assert all(note in (tmp_path / "out" / "report.html").read_text() for note in expected)
+    artificial = drive("recorded", "acc", 1, scenario_options={"horizon": 5}, workers=1, backend="batch")
+    assert "set speed" not in str(artificial.notes)
+
+
 def test_failed_drive_leaves_no_folder(tmp_path: Path, my_drivers: Path) -> None:
     road = {"horizon": 20}
     result = drive("ring", f"{my_drivers}:broken", 1, scenario_options=road, workers=1, out=tmp_path / "drive")

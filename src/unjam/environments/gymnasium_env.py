@@ -22,13 +22,14 @@ from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike, as_features,
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
 from unjam.errors import EpisodeError, InputError, MissingPartError, UnjamError, invalid_value, unknown_name
+from unjam.measures.metrics import METRICS, RECORDED_ROAD_METRICS
 from unjam.measures.step_metrics import StepMetricMeans
 from unjam.parameters import check_integer, merge_changes, nest_keys
 from unjam.physics.arrays import clip
 from unjam.processes import has_display
 from unjam.scenarios import make_scenario
 from unjam.scenarios.file_watch import watch_files
-from unjam.scenarios.road import OrderedRoad
+from unjam.scenarios.road import OrderedRoad, RecordedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import warn_of_reserved_seed
 from unjam.text import one_line
@@ -234,11 +235,14 @@ class RoadStepper:
         return RoadStepResult(list(world.cav_ids), self._observe(), departed, reward, terms, terminated, truncated)
 
     def step_info(self, result: RoadStepResult, has_ended: bool) -> dict[str, Any]:
-        """Return `reward_terms` and, at the end, `episode_metrics`; on open roads only `return` and `steps`."""
+        """Return `reward_terms` and, at the end, `episode_metrics`; where vehicles enter only `return` and `steps`."""
         if not has_ended:
             return {"reward_terms": result.reward_terms}
         means = {} if self._metric_means is None else self._metric_means.means()
         metrics = {"return": self._return, "steps": self._steps, **means}
+        if isinstance(self.world.road, RecordedRoad):
+            episode = self.world.record_so_far()
+            metrics |= {name: METRICS[name].function(episode) for name in RECORDED_ROAD_METRICS}
         return {"reward_terms": result.reward_terms, "episode_metrics": metrics}
 
     def _wait_for_cav(self) -> None:

@@ -1,6 +1,6 @@
 """Many roads of a batch as a Gymnasium vector environment, with NumPy arrays or torch tensors."""
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
@@ -21,6 +21,7 @@ from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
 from unjam.environments.gymnasium_env import RoadStepper, check_single_cav, episode_seed
 from unjam.errors import InputError, MissingPartError, UnjamError, import_optional, invalid_value
+from unjam.measures.metrics import METRICS, RECORDED_ROAD_METRICS
 from unjam.measures.step_metrics import step_metrics
 from unjam.parameters import check_integer
 from unjam.physics.arrays import Array, clip, copy_array, namespace, replace_entries
@@ -31,6 +32,7 @@ from unjam.text import format_count
 from unjam.tree import map_leaves
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal, draw_single_normal
 from unjam.worlds.batch.ring.record import as_numpy
+from unjam.worlds.batch.ring.recorded import RecordedBatch
 from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.batch.support import required_batch_kind, statistically_unsupported_reason
@@ -119,7 +121,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
                       the first observation of the next episode with reward 0. ``reset(options={"reset_mask": mask})``
                       restarts some environments
     ``info``          ``reward_terms``; at the end of an episode ``episode_metrics``: ``return``, ``steps``, and metrics
-                      of ``unjam drive`` that are means over time; at its start ``drawn_values``
+                      of ``unjam drive`` that are means over time, on recorded roads also those of fuel, gaps, flow and
+                      waves; at its start ``drawn_values``
     ================  ==============================================================================================
     """
 
@@ -181,6 +184,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         self._episode_counts = [0] * num_envs  # episodes of each environment since that seed, prepared ones included
         self._episodes: Episodes | None = None
         self._prepared: dict[int, tuple[Episodes, int]] = {}  # next episode by environment: a row of started episodes
+        self._motions = deque[Array](maxlen=made.max_episode_steps + 1)
+        """motion in the last control steps, on recorded roads alone"""
         self._ended_rows: list[int] = []  # environments whose episode ended in the last step
 
     def __copy__(self) -> Self:
@@ -225,6 +230,8 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             self._zeros = self._kind.to_array(np.zeros(self.num_envs))
             self._totals: defaultdict[str, Array] = defaultdict(lambda: self._zeros)
             """sums of the reward and of the metrics over the current episodes, by name, shape (W,)"""
+            self._motions.clear()
+            self._record_motion()
         else:
             self._restart(rows)
         self._ended_rows = [row for row in self._ended_rows if row not in set(rows)]
@@ -285,6 +292,14 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
             self._running_episodes.replace(own, source, others)
         for name, total in self._totals.items():
             self._totals[name] = replace_entries(total, rows, self._zeros, rows)
+        if self._motions:
+            self._motions.pop()  # the new episodes start now
+            self._record_motion()
+
+    def _record_motion(self) -> None:
+        if isinstance(world := self._running_episodes.world, RecordedBatch):
+            with self._kind.no_gradient():
+                self._motions.append(world.motion)
 
     def _check_open(self) -> None:
         if self.closed:
@@ -306,6 +321,7 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         episodes, restarted = self._running_episodes, self._ended_rows
         outcome = episodes.advance(self._as_actions(actions))
         episodes.observe()
+        self._record_motion()
         terms, has_stepped = self._reward_terms(outcome), ~self._mask(restarted)
         rewards = sum(terms.values())
         if restarted:
@@ -370,11 +386,22 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         steps = self._running_episodes.world.control_step_counts
         sums = {name: total for name, total in self._totals.items() if name != "return"}
         metrics = {"return": self._totals["return"], "steps": steps, **self._episode_metrics(sums, outcome, steps)}
+        if self._motions:
+            metrics |= self._recorded_road_metrics(self._ended_rows)
         return {name: namespace(values).where(ended, values, 0.0) for name, values in metrics.items()}
 
     def _episode_metrics(self, sums: dict[str, Array], outcome: Outcome, steps: Array) -> dict[str, Array]:
         """Return metrics of episodes, given the sums over their control steps, and the outcome of the last one."""
         return {name: total / steps for name, total in sums.items()}
+
+    def _recorded_road_metrics(self, rows: list[int]) -> dict[str, Array]:
+        """Return the metrics of episodes that have ended behind recorded vehicles, zeros for others."""
+        world, values = self._running_episodes.world, np.zeros((len(RECORDED_ROAD_METRICS), self.num_envs))
+        for row in rows:
+            motions = [each[row] for each in [*self._motions][-1 - int(world.control_step_counts[row]) :]]
+            episode = world.episode_of(row, as_numpy(namespace(motions[0]).stack(motions)))
+            values[:, row] = [METRICS[name].function(episode) for name in RECORDED_ROAD_METRICS]
+        return dict(zip(RECORDED_ROAD_METRICS, map(self._kind.to_array, values), strict=True))
 
     def _mask(self, rows: list[int]) -> Array:
         """Return which environments are among `rows`, shape (W,)."""

@@ -11,10 +11,10 @@ from unjam.measures.feasibility import RowsByDriver, feasibility_by_driver
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import (
     Estimate,
+    count_units,
     display_digits,
     format_ci,
     metric_estimate,
-    pair_rows,
     paired_difference,
     paired_differences,
     probability_of_improvement,
@@ -105,8 +105,8 @@ def metric_table(
             continue  # it is not defined on this road
         cells = [estimate_cell(each, metric.digits, episodes) for each, episodes in estimates]
         for rows in compared.values():
-            difference, pairs = paired_difference(rows, reference, name), len(pair_rows(rows, reference))
-            cells.append(estimate_cell(difference, metric.digits, pairs, "+"))
+            difference, units = paired_difference(rows, reference, name), count_units(rows, reference)
+            cells.append(estimate_cell(difference, metric.digits, units, "+"))
         table.append(TableRow(metric.label, metric.unit, " ".join((metric.function.__doc__ or "").split()), cells))
     return headings, table
 

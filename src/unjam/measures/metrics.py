@@ -407,6 +407,13 @@ METRICS: dict[str, Metric] = {
     "insertion_backlog_veh": Metric(insertion_backlog_veh, "insertion backlog", "", 0),
 }
 
+RECORDED_ROAD_METRICS = (
+    *("fuel_by_power", "cav_fuel_by_power", "human_fuel_by_power", "cav_mean_gap", "cav_gap_95", "cav_max_gap"),
+    *("min_time_gap", "time_behind_leader", "outflow_veh_per_h"),
+    *("amplification", "amplification_long", "amplification_medium", "amplification_short"),
+)
+"""what environments measure of an episode behind a recorded vehicle"""
+
 
 def measure(episode: Episode) -> dict[str, Any]:
     """Return the row of an episode: its seeds, status, steps, drawn values, all metrics, and the feasibility.

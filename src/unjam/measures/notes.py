@@ -70,7 +70,10 @@ def _repeated_drive_notes(rows_by_driver: RowsByDriver) -> list[str]:
     drives = {tuple(row[name] for name in ("file", "part", "begin")) for row in rows if "part" in row}
     if not drives or len(drives) == len(rows):
         return []
-    alike = "those of the same drive differ in the noise of human drivers alone, and intervals are too narrow"
+    alike = (
+        "those of the same drive differ in the noise of human drivers alone: in paired differences they count as one, "
+        "and intervals of single drivers are too narrow"
+    )
     return [f"{format_count(len(rows), 'episode')} of {format_count(len(drives), 'recorded drive')}: {alike}"]
 
 

@@ -4,7 +4,8 @@ A CI is that of Student's t, which has a coverage of 95 % for three values or mo
 values has 84 %. Where no CI has the stated coverage, texts show the range of the values instead.
 """
 
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from math import isnan, nan, sqrt
 from statistics import NormalDist
@@ -14,6 +15,7 @@ import numpy as np
 
 from unjam.measures.feasibility import EpisodeRows
 from unjam.measures.metrics import METRICS, UNBOUNDED
+from unjam.text import format_count
 
 CONFIDENCE = 0.95
 MIN_INTERVAL_VALUES = 3  # minimum number of values for a CI; that of two is thirteen times as wide as their distance
@@ -123,10 +125,39 @@ def pair_rows(rows: EpisodeRows, others: EpisodeRows) -> list[tuple[dict[str, An
     return [(row, by_seed[str(row["seed"])]) for row in rows if str(row["seed"]) in by_seed]
 
 
+def _independent_units(rows: EpisodeRows, others: EpisodeRows) -> list[Hashable]:
+    """Return the unit of each pair of rows: its recording, or else the pair itself.
+
+    Episodes behind one recording differ in the noise of human drivers alone, and count as one.
+    """
+    pairs = enumerate(pair_rows(rows, others))
+    return [(row["file"], row["part"]) if "part" in row else number for number, (row, _) in pairs]
+
+
+def count_units(rows: EpisodeRows, others: EpisodeRows) -> int:
+    """Return the largest possible count of a paired difference: the number of pairs, or that of their recordings."""
+    return len({*_independent_units(rows, others)})
+
+
+def format_units(rows: EpisodeRows, count: int, noun: str) -> str:
+    """Return a count of paired differences with its noun, which is `recording` behind recorded vehicles."""
+    return format_count(count, "recording" if any("part" in row for row in rows) else noun)
+
+
+def _paired_values(rows: EpisodeRows, others: EpisodeRows, name: str) -> Any:
+    """Return a metric in both sets of rows, shape (units, 2): means over the pairs of each unit with both values."""
+    values = defaultdict[Hashable, list[list[float]]](list)
+    for unit, pair in zip(_independent_units(rows, others), pair_rows(rows, others), strict=True):
+        both = [metric_value(row, name) for row in pair]
+        if np.isfinite(both).all():
+            values[unit].append(both)
+    return np.array([np.mean(each, axis=0) for each in values.values()], float).reshape(-1, 2)
+
+
 def paired_difference(rows: EpisodeRows, others: EpisodeRows, name: str, confidence: float = CONFIDENCE) -> Estimate:
-    """Return the estimate of the paired difference of a metric between two sets of rows."""
-    differences = [metric_value(row, name) - metric_value(other, name) for row, other in pair_rows(rows, others)]
-    return estimate(differences, confidence=confidence)
+    """Return the estimate of the paired difference of a metric between two sets of rows; a recording is one value."""
+    values = _paired_values(rows, others, name)
+    return estimate((values[:, 0] - values[:, 1]).tolist(), confidence=confidence)
 
 
 def linearized_ratio(numerators: Any, denominators: Any) -> Any:
@@ -144,9 +175,7 @@ def relative_difference(rows: EpisodeRows, others: EpisodeRows, name: str) -> Es
 
     Only seeds with both values are used, as for the difference itself. It is unknown where all other values are zero.
     """
-    pairs = [[metric_value(row, name) for row in pair] for pair in pair_rows(rows, others)]
-    values = np.array(pairs, float).reshape(-1, 2)
-    values = values[np.isfinite(values).all(1)]
+    values = _paired_values(rows, others, name)
     if not values[:, 1].any():
         return estimate([])
     return estimate(linearized_ratio(values[:, 0] - values[:, 1], values[:, 1]).tolist())

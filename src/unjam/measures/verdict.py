@@ -5,10 +5,17 @@ from math import isfinite
 from typing import TYPE_CHECKING
 
 from unjam.measures.effect import FLOW_METRIC, FUEL_METRIC, LAG_METRIC, POWER_FUEL_METRIC, TIME_METRIC, is_measured
-from unjam.measures.feasibility import FEASIBLE, RowsByDriver, feasibility_by_driver
+from unjam.measures.feasibility import FEASIBLE, EpisodeRows, RowsByDriver, feasibility_by_driver
 from unjam.measures.metric_table import HUMAN_LABEL, estimate_cell, metric_table
 from unjam.measures.metrics import METRICS
-from unjam.measures.statistics import Estimate, count_teleports, pair_rows, paired_difference, relative_difference
+from unjam.measures.statistics import (
+    Estimate,
+    count_teleports,
+    format_units,
+    pair_rows,
+    paired_difference,
+    relative_difference,
+)
 from unjam.text import format_count
 
 if TYPE_CHECKING:  # imported late, so that commands start quickly
@@ -17,7 +24,7 @@ if TYPE_CHECKING:  # imported late, so that commands start quickly
 HIGHER_IS_BETTER = {"mean_speed", "mean_speed_steady", "outflow_veh_per_h", "min_ttc"}
 """metrics that are compared with the baseline, of which lower values are worse; of the others they are better"""
 MAX_RELATIVE_CHANGE = 10.0  # change from which it is not shown as a share of the baseline, which is nearly zero then
-FEW_SEEDS = 10  # number of seeds from which a verdict rarely changes with more of them
+FEW_SEEDS = 10  # number of seeds, or recordings, from which a verdict rarely changes with more of them
 NEITHER_IS_BETTER = {"cav_mean_gap"}
 """metrics of which neither direction is better: a larger gap can dissolve a wave, and lets vehicles cut in"""
 
@@ -82,7 +89,7 @@ class DifferenceText:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is shown of a driver compared with the baseline on the same seeds."""
+    """What is shown of a driver compared with the baseline on the same seeds; seeds of one recording count as one."""
 
     driver: str
     feasibility: str  # `FEASIBLE`, the first reason against it, or empty
@@ -115,8 +122,7 @@ def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible:
     name_of_others = "human drivers" if reference == HUMAN_LABEL else reference
     checked = (*names, FUEL_METRIC) if names[0] == POWER_FUEL_METRIC else names
     differences = {name: paired_difference(rows, others, name) for name in checked}
-    pairs = max(each.count for each in differences.values())
-    if not pairs:
+    if not any(each.count for each in differences.values()):
         return Verdict(label, "", f"no episode can be compared with {name_of_others}", None)
     changes = {name: is_better(name, difference) for name, difference in differences.items()}
     texts = list[DifferenceText]()
@@ -129,25 +135,30 @@ def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible:
     own, paired = zip(*pair_rows(rows, others), strict=True)
     if (teleports := count_teleports(own) - count_teleports(paired)) > 0:
         prices.append(f"{format_count(teleports, 'more vehicle')} teleported or removed")
-    comparison = _comparison(differences, changes, pairs, name_of_others, " and ".join(prices))
+    comparison = _comparison(differences, changes, rows, name_of_others, " and ".join(prices))
     # A vehicle that SUMO moves on, or takes off the road, makes traffic look better.
     verdict = None if changes[names[0]] and teleports > 0 else changes[names[0]]
     return Verdict(label, feasible, comparison, verdict, (*texts,))
 
 
 def _comparison(
-    differences: dict[str, Estimate], changes: dict[str, bool | None], pairs: int, name_of_others: str, price: str
+    differences: dict[str, Estimate],
+    changes: dict[str, bool | None],
+    rows: EpisodeRows,
+    name_of_others: str,
+    price: str,
 ) -> str:
     """Return whether the first metric is shown to be better or worse, and the price of what is better."""
     first = next(iter(differences))
-    label, seeds = METRICS[first].label.partition(",")[0], format_count(pairs, "paired seed")
+    label, units = METRICS[first].label.partition(",")[0], max(each.count for each in differences.values())
+    counted = format_units(rows, units, "paired seed")
     if changes[first] is None:
-        too_few = "; more may decide" if isfinite(differences[first].low) else ", which are too few"
-        reason = too_few if pairs < FEW_SEEDS else ""
-        return f"{label} undecided compared with {name_of_others}, {seeds}{reason}"
+        too_few = f", which {'is' if units == 1 else 'are'} too few"
+        reason = "; more may decide" if isfinite(differences[first].low) else too_few
+        return f"{label} undecided compared with {name_of_others}, {counted}{reason if units < FEW_SEEDS else ''}"
     if not changes[first]:
-        return f"{label} worse than that of {name_of_others}, {seeds}"
-    return f"{label} better than that of {name_of_others}{price and f', but {price}'}, {seeds}"
+        return f"{label} worse than that of {name_of_others}, {counted}"
+    return f"{label} better than that of {name_of_others}{price and f', but {price}'}, {counted}"
 
 
 def _difference_text(name: str, difference: Estimate, relative: float) -> str:

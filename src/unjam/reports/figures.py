@@ -13,6 +13,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
+from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate
 from unjam.reports.results import PlotEpisode, kept_row, seconds_by_part
 from unjam.text import one_line, printable
@@ -142,6 +143,28 @@ def _time_series(episode: PlotEpisode, has_cav_panels: bool, has_no_backlog: boo
     backlog = episode.backlog if len(episode.backlog) else np.zeros(len(speeds))
     backlogs = {} if has_no_backlog else {"insertion backlog\n[vehicles]": backlog}
     return {"mean speed [m/s]": np.nanmean(speeds, axis=1), **waves, **backlogs}
+
+
+@rc_context(PLOT_STYLE)
+def last_vehicle_figure(episodes: Sequence[PlotEpisode]) -> Figure:
+    """Draw the speed of the recorded vehicle over time, and that of the last vehicle with each driver."""
+    figure = new_figure(3.2)
+    axes, recorded = figure.subplots(), dict[bytes, PlotEpisode]()
+    for episode, color in zip(episodes, LINE_COLORS, strict=False):
+        if episode.has_recorded_leader:
+            recorded.setdefault(episode.replayed_motion.tobytes(), episode)
+            stride = max(1, len(episode.times) // MAX_PLOT_TIMES)
+            ratios = (METRICS[name].function(episode) for name in ("amplification", "amplification_medium"))
+            total, medium = ("–" if np.isnan(ratio) else f"{ratio:.2f}" for ratio in ratios)
+            label = f"{short_label(episode.driver)}: amplification {total}, of waves of 20 to 60 s {medium}"
+            axes.plot(episode.times[::stride], episode.speeds[::stride, 0], color=color, lw=1.4, label=label)
+    for number, episode in enumerate(recorded.values()):
+        line = {"color": TEXT_COLOR, "lw": 1.0, "ls": (0, (3, 1.5)), "label": "" if number else "recorded vehicle"}
+        axes.plot(episode.times, episode.replayed_motion[:, 0, 1], **line, zorder=1.5)
+    axes.set(xlabel="time [s]", ylabel="speed [m/s]")
+    axes.margins(x=0)
+    figure.legend(loc="outside upper left", ncols=2)
+    return figure
 
 
 @rc_context(PLOT_STYLE)

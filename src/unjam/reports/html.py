@@ -138,6 +138,8 @@ def _report_figures(
     found: dict[str, Figure] = {}
     if panels:
         found["time_series"] = figures.time_series_figure(panels)
+    if any(panel.has_recorded_leader for panel in panels):
+        found["last_vehicle"] = figures.last_vehicle_figure(panels)
     if runs := {name: result.progress for name, result in sources if result.progress}:
         test_returns, expert = _test_returns(sources, columns)
         found["learning_curve"] = figures.learning_curve_figure(runs, _expert_returns(sources), test_returns, expert)
@@ -189,12 +191,14 @@ def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
     step = max(REPLAY_STEP, longest / max_frames, *(episode.control_step for episode in panels))
     frames = 1 + int(longest / step + 1e-9)
     longest_platoon = max((-each.lane_lines[:, 0].min() for each in panels if each.has_recorded_leader), default=0.0)
+    scale = space_time.speed_scale(panels)
     tracks = ((printable(each.driver), _replay_track(each, step, frames, longest_platoon)) for each in panels)
     return {
         "step": step,
         "frames": frames,
         "start": round(_worst_time(panels[0]), 1),
-        "max_speed": space_time.speed_scale(panels).vmax,
+        "min_speed": scale.vmin,
+        "max_speed": scale.vmax,
         "colors": figures.color_table(),
         "vehicle_length": VEHICLE_LENGTH,
         "no_value": REPLAY_NAN,

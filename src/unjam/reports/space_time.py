@@ -27,9 +27,14 @@ CAV_LINE_STYLE: dict[str, Any] = {"colors": figures.CAV_PLOT_COLOR, "linewidths"
 
 
 def speed_scale(episodes: Sequence[PlotEpisode]) -> Normalize:
-    """Return one scale of speed for all figures of these episodes; a few fast vehicles do not stretch it."""
-    speeds = np.concatenate([episode.speeds[~np.isnan(episode.speeds)] for episode in episodes])
-    return Normalize(0.0, max(1.0, np.ceil(np.quantile(speeds, SCALE_QUANTILE))) if speeds.size else 1.0)
+    """Return one scale of speed for all figures of these episodes; a few fast vehicles do not stretch it.
+
+    It starts at zero, and on recorded roads, where waves are often small, at the smallest speed.
+    """
+    speeds = np.concatenate([_with_replayed(episode, episode.speeds, 1).ravel() for episode in episodes])
+    speeds = speeds[~np.isnan(speeds)]
+    lowest = np.floor(speeds.min()) if all(episode.has_recorded_leader for episode in episodes) else 0.0
+    return Normalize(lowest, max(lowest + 1.0, np.ceil(np.quantile(speeds, SCALE_QUANTILE))) if speeds.size else 1.0)
 
 
 class PanelRow(NamedTuple):

@@ -14,11 +14,12 @@ from unjam.measures.metric_table import HUMAN_LABEL, choose_baseline, driver_ran
 from unjam.measures.metrics import METRICS
 from unjam.measures.notes import early_end_notes
 from unjam.measures.statistics import (
+    count_units,
     format_difference,
+    format_units,
     gain_verdict,
     is_expert_unchanged,
     metric_estimate,
-    pair_rows,
     paired_difference,
 )
 from unjam.measures.verdict import Verdict, is_better, road_metrics, verdicts
@@ -189,7 +190,7 @@ def main_finding(result: Results) -> str:
     best = max(returns, key=lambda label: np.nan_to_num(returns[label], nan=-np.inf), default=expert)
     if expert in experts:
         gain = paired_difference(rows, experts[expert], "return")
-        seeds = format_count(gain.count, "test seed")
+        seeds = format_units(rows, gain.count, "test seed")
         finding = f"Return difference to its expert, {expert} (return {returns[expert]:,.0f}), on {seeds}"
         sentences.append(f"{finding}: {format_difference(gain)}. {gain_verdict(gain)}")
         if row := kept_row(result.progress):
@@ -288,10 +289,10 @@ def baseline_differences(columns: Sequence[ReportColumn]) -> dict[str, Any]:
     for name in COMPARED_METRICS:
         metric, cells = METRICS[name], []
         for column, others in compared:
-            gain, pairs = paired_difference(column.rows, others, name), len(pair_rows(column.rows, others))
-            verdict = is_better(name, gain) if gain.count == pairs else None
+            gain, units = paired_difference(column.rows, others, name), count_units(column.rows, others)
+            verdict = is_better(name, gain) if gain.count == units else None
             mark = {True: "better", False: "worse", None: ""}[verdict]
-            text = str(estimate_cell(gain, metric.digits, pairs, "+"))
+            text = str(estimate_cell(gain, metric.digits, units, "+"))
             cells.append({"text": text, "mark": mark, "count": gain.count})
         if any(cell["count"] for cell in cells):
             rows.append({"label": metric.label, "unit": metric.unit, "cells": cells})

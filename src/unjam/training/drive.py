@@ -1,10 +1,11 @@
 """`unjam drive`: any drivers on any seeds, and the result as tables and figures in a notebook."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from html import escape
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -25,6 +26,7 @@ from unjam.measures.verdict import metric_frame, short_table_metrics, verdicts
 from unjam.parameters import check_integer
 from unjam.reports.results import to_plot_episode
 from unjam.scenarios import make_scenario, scenario_recipe
+from unjam.scenarios.recorded import Recorded
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import TRAINING_SEED_LIMIT, held_out_seeds
 from unjam.training.evaluate import Evaluation, controller_hashes, evaluate, rows_to_frame, save_evaluation
@@ -154,6 +156,19 @@ def _lacks_acc(driver: Driver, scenario: Scenario) -> bool:
     return uses_lane_speeds and scenario.actuation != "cruise"
 
 
+def _set_speed_notes(drivers: Mapping[str, Driver], scenario: Scenario) -> list[str]:
+    """Return a note for each driver with a set speed below recorded speeds: it saves fuel by falling behind."""
+    if not isinstance(scenario, Recorded):
+        return []
+    fastest, other = scenario.max_leader_speed, max(scenario.humans.desired_speed, ceil(scenario.max_leader_speed))
+    return [
+        f"{name}: its set speed of {speed:g} m/s is below the recorded {fastest:.1f} m/s: name another, as in "
+        f"{one.describe().partition(':')[0]}:set_speed={other:g}"
+        for name, one in drivers.items()
+        if isinstance(speed := getattr(one, "set_speed", None), int | float) and speed < fastest
+    ]
+
+
 def drive(
     scenario: str = "ring",
     driver: str | DriverLike | Sequence[str | DriverLike] = "pi",
@@ -225,6 +240,7 @@ def drive(
             *episode_notes(evaluation.rows),
             *controller_notes(scenario_recipe(road), drivers, evaluation.plot_episodes),
             *(f"{name} {MISSING_ACC_NOTE}" for name, one in drivers.items() if _lacks_acc(one, road)),
+            *_set_speed_notes(drivers, road),
             *backend_notes(backend, road),
             *road.notes,
         ]

@@ -97,6 +97,10 @@ class CheckedWorld:
         self._check_last_state(episode)
         return self._count_overrides(episode)
 
+    def record_so_far(self) -> Episode:
+        """Return the record without the driver's decisions."""
+        return self.record(DriverLog())
+
     def _error(self, problem: str, allowed: str, step: int | None = None) -> InputError:
         time = (self._steps if step is None else step) * self._scenario.control_step
         return InputError(f"backend: {self._label}: {problem} at {time:g} s; allowed: {allowed}")

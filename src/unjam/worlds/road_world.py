@@ -15,7 +15,7 @@ from unjam.physics.arrays import Array, Floats
 from unjam.scenarios.road import Road
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.record import Episode, common_fields
-from unjam.worlds.world import World
+from unjam.worlds.world import DriverLog, World
 
 DrawnRoad = tuple[Road, Sequence[np.random.SeedSequence]]
 """value of `Scenario.draw_from_seed`"""
@@ -63,6 +63,10 @@ class RoadWorld(World[Episode], Protocol):
     def last_applied_acceleration(self) -> Array:
         """Return the CAVs' accelerations in the last control step after the filter [m/s2], (CAVs,) or a float."""
         ...
+
+    def record_so_far(self) -> Episode:
+        """Return the record since the start without the driver's decisions; the world can still be inspected."""
+        return self.record(DriverLog())
 
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""

@@ -38,8 +38,10 @@
   slider.max = end;
 
   const table = data.colors;
-  const color = (speed) => table[Math.max(0, Math.min(table.length - 1, Math.round(speed / data.max_speed * (table.length - 1))))];
+  const share = (speed) => (speed - data.min_speed) / (data.max_speed - data.min_speed);
+  const color = (speed) => table[Math.max(0, Math.min(table.length - 1, Math.round(share(speed) * (table.length - 1))))];
   find(".bar").style.background = `linear-gradient(to right, ${table.join(",")})`;
+  find(".min-speed").textContent = data.min_speed;
   find(".max-speed").textContent = data.max_speed;
 
   // Returns position and direction in the plane of a coordinate along the route.

@@ -59,6 +59,9 @@ class _SingleRoad:
     def record(self, driver_log: DriverLog) -> Any:
         return cast(Any, super()).record(driver_log)[0]
 
+    def record_so_far(self) -> Any:
+        return self.record(DriverLog())
+
 
 class SingleRing(_SingleRoad, RingBatch):
     """One closed road of a batch."""

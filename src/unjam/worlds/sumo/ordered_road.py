@@ -214,6 +214,10 @@ class OrderedTraffic(Traffic[OrderedRoad]):
         self._check_odometer(self.road.vehicle_ids, self.road.start_positions, positions[:, -1])
         return speeds, positions
 
+    def record_so_far(self) -> Episode:
+        """Return the record since the start without the driver's decisions; SUMO goes on."""
+        return self._make_record(DriverLog())
+
     def _make_record(self, driver_log: DriverLog) -> Episode:
         fields = {**self.record_fields(), "collisions": len(self._collided_vehicles)}
         rows = None if self.is_scalar else np.arange(len(self.cav_ids))

@@ -1,17 +1,21 @@
 """W recorded roads as one world: platoons behind vehicles that replay recordings, stepped as arrays."""
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 
 from unjam.drivers.local_state import LocalState
 from unjam.physics.arrays import Array, as_indices, clamp_max, namespace, replace_columns
+from unjam.scenarios.road import OrderedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.batch.human_idm import CONTACT_GAP, Leader, human_idm_speed, slow_to_desired_speed
 from unjam.worlds.batch.noise import ArrayFactory
 from unjam.worlds.batch.ring.world import RingBatch
-from unjam.worlds.ordered_road import without_loop
+from unjam.worlds.ordered_road import OrderedRoadLog, without_loop
+from unjam.worlds.record import Episode, Floats, common_fields
+from unjam.worlds.world import DriverLog
 
 
 class RecordedBatch(RingBatch):
@@ -52,6 +56,21 @@ class RecordedBatch(RingBatch):
     def exact_state(self) -> LocalState:
         """Return the exact local state of the CAVs now."""
         return without_loop(super().exact_state())
+
+    @property
+    def motion(self) -> Array:
+        """A copy of the speeds [m/s] and positions [m] of all vehicles now, shape (W, 2, vehicles)."""
+        return namespace(self._speed).stack((self._speed[:-1].T, self._position.T), 1)
+
+    def episode_of(self, road: int, motion: Floats) -> Episode:
+        """Return the record of one road without commands, from its `motion`, (control steps + 1, 2, vehicles)."""
+        drawn, scenario, (speeds, positions) = cast(OrderedRoad, self.roads[road]), self.scenario, motion.swapaxes(0, 1)
+        if scenario.steps_per_control_step > 1:
+            scenario = replace(scenario, simulation_step=scenario.control_step, steps_per_control_step=1)
+        moved, no_commands = np.diff(positions, axis=0) / scenario.control_step, np.zeros((0, len(drawn.cav_ids)))
+        log = OrderedRoadLog(scenario, drawn, positions[0], moved, speeds, no_commands, no_commands, no_commands)
+        fields = common_fields(scenario, drawn, (), bool(self.crashed_roads[road]))
+        return log.episode((speeds.T, positions.T), fields, DriverLog(), None)
 
     def replace_roads(self, roads: Any, source: Any, source_roads: Any) -> None:
         """Continue on some roads with those of another batch, see `RingBatch.replace_roads`."""
