@@ -18,7 +18,7 @@ class PISaturation(FormulaDriver):
 
     The defaults are Table B2 of the paper, except `time_constant`. The paper divides the desired change of speed by
     the time step. Close behind a leader, the CAV then copies its leader: it stops and starts with it, never opens a
-    gap, and stays part of the wave in a fully developed jam. With 3 s, the same controller dissolves the wave.
+    gap, and stays part of the wave in a fully developed jam. With 3 s, the same controller dissolves most waves.
     `pi:time_constant=0` is the version of the paper.
     Source: Stern et al. 2018, Transp. Res. C 89:205-221; paper Eq. 9-11.
     """
