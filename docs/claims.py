@@ -22,6 +22,7 @@ from verdicts import HELD, INCONSISTENT, NOT_HELD, UNDECIDED, Finding, Values, c
 
 from unjam.files import atomic_write
 from unjam.measures.feasibility import FEASIBLE
+from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.statistics import Estimate, estimate_over_trainings
 from unjam_paper.comparison import PAPER_RESULTS
 from unjam_paper.study import NO_VALUE_TEXT, UNFILTERED_ROADS, interval_text
@@ -48,7 +49,7 @@ of the method, and the rows with ten trainings contain them. Numbers are means o
 collisions interquartile means, as in [tables and figures](docs/results.md).
 
 The paper's method without the safety filter, in short (95 % intervals over trainings). On ring and figure eight the
-result depends on steps and checkpoint:
+result is another one with the last checkpoint, and with `paper-exact`, which has more steps and other settings:
 
 SHORT_ANSWER
 
@@ -63,7 +64,7 @@ with at most 6 m/s²). Verdicts are about trainings without it. Merges have no f
 - *By the expert*: PI, its expert, which the paper does not evaluate alone, has at least 90 % of the difference without
   learning, or the method is not shown to be better than PI (in Figure 5 also with a time constant of 3 s); in
   validation, not better than at first, where its residual is nearly zero, or no training becomes better than PI.
-- *By decreasing exploration*: a return rises in training, which is not shown in validation. That it rises faster than
+- *In training alone*: a return rises while exploration decreases, which is not shown in validation. That it rises faster than
   with other learners is not tested.
 - Values are *similar* where the interval of the difference lies within 10 % of the value. Percentages of training time
   and of Figure 9 hold if the cost is at most, or the gain at least, as large. Of other percentages the sign is judged.
@@ -88,7 +89,7 @@ EXPERT, SMOOTH_EXPERT, SMOOTH_LABEL = "PI (paper)", "PI", "PI with a time consta
 """the expert of the paper without a residual, and the same with the time constant that is unjam's default"""
 NOT_MEASURED = "not yet measured"
 BY_EXPERT, BY_CONSTRUCTION, SAYS_NOTHING = ", by the expert", ", by construction", ", but says nothing"
-BY_EXPLORATION = ", by decreasing exploration"
+BY_EXPLORATION = ", in training alone"
 CAUSES = BY_EXPERT, BY_CONSTRUCTION, SAYS_NOTHING, BY_EXPLORATION
 KINDS = (HELD, *(f"{HELD}{cause}" for cause in CAUSES), NOT_HELD, UNDECIDED, INCONSISTENT, NOT_MEASURED)
 """kinds of verdicts in the summary"""
@@ -397,6 +398,9 @@ def collisions(road: str) -> Assessment:
         braking = [row["cav_max_braking"]["largest"] or 0.0 for row in rows if "cav_max_braking" in row]
         if braking:  # older results do not have it
             numbers += f", of the hardest braking {max(braking):.1f} m/s² in the worst training"
+        others = max(row["collisions"]["mean"] for row in version.rows(f"table-1-{road}", road).values())
+        if others >= RARE:
+            return HELD if most < RARE else NOT_HELD, f"{numbers}; {others:.1f} with another driver"
         causes = "SUMO's brakes and the filter" if version.has_filter and road in UNFILTERED_ROADS else "SUMO's brakes"
         return f"{HELD}{BY_CONSTRUCTION} of {causes}" if most < RARE else NOT_HELD, numbers
 
@@ -589,13 +593,15 @@ def near_best(quantity: str) -> Assessment:
     """Return how to judge that the paper's method ends within 5 % of the best return of all trainings."""
 
     def judge_ends(version: Version) -> Finding:
-        curves = version.curves("table-1-ring", "ring", (*TABLE_1, "ours"), quantity)
+        curves = version.curves("table-1-ring", "ring", (*TABLE_1, "without-model", "ours"), quantity)
         best = max(float(curve.max()) for curve in curves.values())
         ends = curves[label_of("proposed")][:, LAST].mean(1)
         reached, count = int((ends >= best - 0.05 * abs(best)).sum()), len(ends)
         verdict = HELD if reached == count else f"{NOT_HELD} within these steps"
         cause = version.validation_cause(verdict, "table-1-ring", "ring", "proposed", quantity)
         numbers = f"{reached} of {count} trainings end within 5 % of the best return of any training, {best:,.0f}"
+        feasible = best_feasible(version.rows("table-1-ring", "ring"))
+        numbers += f"; best feasible driver of the table without learning, test seeds: {list_values(feasible)}"
         return f"{verdict} ({count} trainings){cause}", numbers
 
     return judge_ends
@@ -828,7 +834,7 @@ CLAIMS: dict[str, Sequence[Claim]] = {
         ),
         *of_ring(
             "theory",
-            *both_returns("A2: it converges to a policy as close to the optimal one as wanted", near_best),
+            *both_returns("A2: it converges to a policy as close to the optimal one as wanted (here: to the best of all trainings)", near_best),
             ("A3: the model error falls during training, ring, preset `paper`", model_error_falls),
             (
                 "A3: with IDM the model starts with a smaller error (here SUMO's human drivers follow that IDM)",
@@ -914,6 +920,9 @@ def short_answer() -> str:
         )
         proposed, without = version.returns(f"table-1-{road}", road, ("proposed", "without-model")).values()
         parts.append(f"{road} {_difference_text(proposed, without)} ({len(proposed)} trainings)")
+    rows = version.rows("table-1-merge", "merge")
+    human = f"return {rows[HUMAN_LABEL]['return']['mean']:,.0f}"
+    lines.append(f"- human traffic alone on the merge: {human}, on the same seeds; no driver there is feasible")
     lines.append(f"- the virtual environment: difference to a residual without it {', '.join(parts)}")
     return "\n".join(lines)
 

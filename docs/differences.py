@@ -101,7 +101,8 @@ def selection_effect() -> str:
     for name, label in (("trpo", "TRPO"), ("ppo", "PPO"), ("sac", "SAC"), ("proposed", "proposed")):
         values = np.array(curves[name]["return_validation"])
         texts.append(f"{label} {trainings_text(values[:, -1] - values.max(1), 0, '+')}")
-    return f"return of the last checkpoint, difference to the best: {', '.join(texts)} (`results/table-1-ring.json`)"
+    what = "return of the last checkpoint, difference to the best, on the seeds that select it (at most 0)"
+    return f"{what}: {', '.join(texts)} (`results/table-1-ring.json`)"
 
 
 def exact_effect() -> str:
