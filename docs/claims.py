@@ -64,8 +64,8 @@ with at most 6 m/s²). Verdicts are about trainings without it. Merges have no f
 - *By the expert*: PI, its expert, which the paper does not evaluate alone, has at least 90 % of the difference without
   learning, or the method is not shown to be better than PI (in Figure 5 also with a time constant of 3 s); in
   validation, not better than at first, where its residual is nearly zero, or no training becomes better than PI.
-- *In training alone*: a return rises while exploration decreases, which is not shown in validation. That it rises faster than
-  with other learners is not tested.
+- *In training alone*: a return rises while exploration decreases, which is not shown in validation. That it rises
+  faster than with other learners is not tested.
 - Values are *similar* where the interval of the difference lies within 10 % of the value. Percentages of training time
   and of Figure 9 hold if the cost is at most, or the gain at least, as large. Of other percentages the sign is judged.
 - *Convergence*: environment steps to 0.9 of TRPO's final return, in blocks of five points of the learning curve; all
@@ -834,7 +834,10 @@ CLAIMS: dict[str, Sequence[Claim]] = {
         ),
         *of_ring(
             "theory",
-            *both_returns("A2: it converges to a policy as close to the optimal one as wanted (here: to the best of all trainings)", near_best),
+            *both_returns(
+                "A2: it converges to a policy as close to the optimal one as wanted (here: the best of all trainings)",
+                near_best,
+            ),
             ("A3: the model error falls during training, ring, preset `paper`", model_error_falls),
             (
                 "A3: with IDM the model starts with a smaller error (here SUMO's human drivers follow that IDM)",
