@@ -17,6 +17,7 @@ from unjam.training.run_folder import (
     check_config,
     check_run_files,
     create_run_folder,
+    read_complete_progress,
     read_config,
     restore_newest_checkpoint,
     resume_run_folder,
@@ -181,7 +182,7 @@ def test_names_of_files_are_those_of_the_folder_in_which_the_run_was_started(
     create_run_folder(run, config)
     made, stored = config.make_tasks(), (run / "config.toml").read_text()
     save_checkpoint(run / "checkpoint", {"iteration": 1, "fingerprint": fingerprint(config)}, {})
-    (run / "progress.jsonl").touch()
+    (run / "progress.jsonl").write_text('{"iteration": 1}\n')
     monkeypatch.chdir(tmp_path / "elsewhere" / "deep")
     found = read_config(Path("../../my project/runs/a"))
     for task, expected in zip(found.make_tasks(), made, strict=True):
@@ -195,3 +196,38 @@ def test_names_of_files_are_those_of_the_folder_in_which_the_run_was_started(
     assert (run / "config.toml").read_text() == stored.replace(f"steps = {2 * STEPS}", f"steps = {9 * STEPS}", 1)
     monkeypatch.chdir(project)
     assert read_config(run) == replace(config, steps=9 * STEPS)
+
+
+CUT_PROGRESS = [
+    ([1, 7, 8], "rows 2 to 6 are missing"),
+    ([1, 2, 3], "rows 4 to 8 are missing"),
+    ([2, 3, 4, 5, 6, 7, 8, 9], "row 1 is missing"),
+    ([1, 2, 3, 3, 4, 5, 6, 7, 8], "row 4 is of iteration 3"),
+    ([], "rows 1 to 8 are missing"),
+]
+
+
+@pytest.mark.parametrize(("iterations", "reason"), CUT_PROGRESS)
+@pytest.mark.parametrize("part", ["", "second"])
+def test_progress_older_than_the_checkpoint_is_refused_and_nothing_changes(
+    iterations: list[int], reason: str, part: str, tmp_path: Path
+) -> None:
+    config = small_config(tasks=[{"name": "first"}, {"name": "second"}])
+    create_run_folder(tmp_path, config)
+    places = [tmp_path / name for name in ("", "first", "second")]
+    for place in places:
+        place.mkdir(exist_ok=True)
+        found = iterations if place == tmp_path / part else range(1, 10)
+        (place / "progress.jsonl").write_text("".join(f'{{"iteration": {each}}}\n' for each in found))
+    for iteration in (6, 7, 8):
+        save_checkpoint(tmp_path / "checkpoint", {"iteration": iteration, "fingerprint": fingerprint(config)}, {})
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    message = rf"^{tmp_path / part / 'progress.jsonl'}: {reason}; allowed: all rows up to 8"
+    with pytest.raises(InputError, match=message):
+        restore_newest_checkpoint(tmp_path, places)
+    if not part:
+        with pytest.raises(InputError, match=message):
+            read_complete_progress(tmp_path)
+        with pytest.raises(InputError, match=message):
+            resume_run_folder(tmp_path, replace(config, steps=9 * STEPS))
+    assert {path: path.read_bytes() for path in before} == before

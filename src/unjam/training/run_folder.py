@@ -211,7 +211,7 @@ def resume_run_folder(folder: Path, config: RunConfig) -> None:
     parent = folder.absolute().parent
     if folder.name in _task_names(parent):
         raise InputError(f"resume: {str(folder)!r} is one task of a run; allowed: {parent}")
-    before, progress = read_config(folder), read_progress(folder)
+    before, progress = read_config(folder), read_complete_progress(folder)
     if replace(before, steps=config.steps, workers=config.workers) != config:
         raise InputError("resume: only steps and workers may change")
     if config.steps > before.steps and before.evaluation.should_stop_early(progress):
@@ -276,19 +276,41 @@ def restore_newest_checkpoint(
 ) -> "tuple[dict[str, Any], Tensors] | None":
     """Return the newest checkpoint of a run, and remove everything later; None before the first one.
 
-    Raise `InputError` if no checkpoint is valid, or if its fingerprint differs from the `expected` one.
+    Raise `InputError` if no checkpoint is valid, if its fingerprint differs from the `expected` one, or if a row of
+    progress before it is missing.
     """
     checkpoint = load_checkpoint(folder / "checkpoint")
     if checkpoint and expected and "fingerprint" in checkpoint[0]:
         check_fingerprint(checkpoint[0]["fingerprint"], expected)
-    _remove_old_checkpoints(folder / "checkpoint")
     iteration = checkpoint[0]["iteration"] if checkpoint else 0
-    for place in progress_folders:
+    progress = {place: _progress_until(place, iteration) for place in progress_folders}
+    _remove_old_checkpoints(folder / "checkpoint")
+    for place, rows in progress.items():
         files.remove_leftovers(place)
         if (place / PROGRESS_FILE).is_file():
-            rows = [to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= iteration]
-            files.atomic_write(place / PROGRESS_FILE, "".join(rows))
+            files.atomic_write(place / PROGRESS_FILE, "".join(to_json(row) + "\n" for row in rows))
     return checkpoint
+
+
+def read_complete_progress(folder: Path) -> list[dict[str, Any]]:
+    """Return the rows of progress of a run; raise `InputError` if one before its newest checkpoint is missing."""
+    rows = read_progress(folder)
+    state = next((state for _, state, _ in _valid_checkpoints(folder / "checkpoint")), {})
+    newest = state.get("iteration", max((row["iteration"] for row in rows), default=0))
+    _progress_until(folder, check_integer("checkpoint: iteration", newest, 0))
+    return rows
+
+
+def _progress_until(folder: Path, iteration: int) -> list[dict[str, Any]]:
+    """Return the rows of progress of all iterations up to this one; raise `InputError` if they are not all there."""
+    rows = [row for row in read_progress(folder) if row["iteration"] <= iteration]
+    for expected, found in enumerate([*(row["iteration"] for row in rows), iteration + 1], 1):
+        if found != expected:
+            gap = f"rows {expected} to {found - 1} are" if found > expected + 1 else f"row {expected} is"
+            reason = f"{gap} missing" if found > expected else f"row {expected} is of iteration {found}"
+            allowed = f"allowed: all rows up to {iteration}, as when the checkpoint was written"
+            raise InputError(f"{folder / PROGRESS_FILE}: {reason}; {allowed}")
+    return rows
 
 
 def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
