@@ -14,22 +14,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tomli_w
+from safetensors import safe_open
 
 from unjam import files
 from unjam.controller import make_driver
+from unjam.controller.file import read_controller, trained_bytes
 from unjam.drivers.check import PROBE_ROWS, check_row_independence, probe_state
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
 from unjam.drivers.registry import driver_recipe
 from unjam.drivers.requirements import merge_requirements
 from unjam.drivers.user_driver import is_file_reference
-from unjam.errors import DiskError, InputError, invalid_value
+from unjam.errors import DiskError, InputError, invalid_value, resume_hint
 from unjam.files import sha256_of, to_json
 from unjam.folders import reject_unsafe_files
 from unjam.manifest import manifest, package_versions
 from unjam.parameters import build_dataclass, check_integer, read_toml
-from unjam.processes import LOCK_FILE, lock_folder
-from unjam.reports.results import read_progress
+from unjam.processes import LOCK_FILE, is_locked, lock_folder
+from unjam.reports.results import CONTROLLER_FILE, read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import CONFIG_FILE, MANIFEST_FILE, RunConfig, load_config, read_values, to_toml
@@ -46,6 +48,8 @@ if TYPE_CHECKING:
 CHECKPOINT_FORMAT = 7
 """format of run folders and their checkpoints; other formats are refused"""
 MAX_CHECKPOINTS = 2
+CONTROLLER_KINDS = "best", "latest"
+"""controllers in a checkpoint: that of the best scheduled validation, and that of the folder"""
 PROGRESS_FILE = "progress.jsonl"
 CHECKPOINT_NAME = re.compile(r"\d{6,}-[0-9a-f]{64}\.safetensors")
 """file name of a checkpoint: iteration and hash of the content"""
@@ -360,6 +364,26 @@ def check_run_files(
         current = fingerprint(config)
         check_settings(stored, current, command, ignored_prefixes)
         check_file_hashes(stored, current, command)
+
+
+def check_controller(folder: Path, command: str) -> None:
+    """Raise `InputError` if the controller in the folder of a run or task is not one of the newest checkpoint.
+
+    Other folders, runs without a checkpoint and runs that are being trained are not checked.
+    """
+    file, parent = folder / CONTROLLER_FILE, folder.absolute().parent
+    tasks = [*_task_names(parent)]
+    run, index = (parent, tasks.index(folder.absolute().name)) if folder.absolute().name in tasks else (folder, 0)
+    newest, *_ = next(_valid_checkpoints(run / "checkpoint"), (None,))
+    if newest is None or not file.is_file() or is_locked(run):
+        return
+    stored: list[bytes] = []
+    with suppress(*files.INVALID_DATA_ERRORS), safe_open(newest, "np") as tensors:
+        names = {f"{kind}/{index}" for kind in CONTROLLER_KINDS} & {*tensors.keys()}
+        stored = [tensors.get_tensor(name).tobytes() for name in names]
+    if stored and trained_bytes(read_controller(folder)) not in stored:
+        reason = "is not a controller of the newest checkpoint; allowed: the one that a resumed training writes"
+        raise InputError(f"{command}: {str(file)!r} {reason}{resume_hint(run)}")
 
 
 def _remove_old_checkpoints(folder: Path) -> None:
