@@ -22,13 +22,13 @@ from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import estimate_cell, with_no_break_spaces
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, estimate, estimate_on_shared_seeds, estimate_over_trainings, format_ci
-from unjam.reports.results import CONTROLLER_FILE, EVALUATION_FILE, read_progress, read_rows
+from unjam.reports.results import CONTROLLER_FILE, EVALUATION_FILE, read_rows
 from unjam.road_family import NO_LATENCY
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import TRAINED_LABEL, evaluate, raise_failures
-from unjam.training.run_folder import read_config
+from unjam.training.run_folder import read_complete_progress, read_config
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
@@ -140,17 +140,19 @@ class StudyFolder:
         return self.folder / "references" / road
 
     def is_finished(self, run: PlannedRun) -> bool:
-        """Return whether a training with these settings is finished."""
+        """Return whether a training with these settings is finished; raise `InputError` if its progress is cut."""
         folder = self.run_folder(run)
         files = [folder / road / EVALUATION_FILE for road in run.config.task_configs()]
-        return all(file.is_file() for file in files) and read_config(folder) == run.config
+        if not all(file.is_file() for file in files) or read_config(folder) != run.config:
+            return False
+        return bool(read_complete_progress(folder))
 
     def trained_runs(self, road: str, variants: Iterable[str], seeds: int) -> dict[str, list[TrainedRun]]:
         """Return the finished trainings on a road by variant, one for each seed."""
         runs: dict[str, list[TrainedRun]] = {variant: [] for variant in variants}
         for run in planned_runs([road], tuple(runs), seeds):
             folder = self.run_folder(run)
-            runs[run.variant].append(TrainedRun(run, read_progress(folder), read_rows(folder)[TRAINED_LABEL]))
+            runs[run.variant].append(TrainedRun(run, read_complete_progress(folder), read_rows(folder)[TRAINED_LABEL]))
         return runs
 
     def reference_rows(self, road: str) -> dict[str, Table]:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from unjam.benchmarks.leaderboard import leaderboard_figure, leaderboard_rows, read_leaderboard
-from unjam.benchmarks.result import read_result
+from unjam.benchmarks.result import FAMILY_METRICS, read_result, write_result
 from unjam.cli import app
 from unjam.errors import InputError
 
@@ -67,7 +68,15 @@ def test_gains_follow_from_the_rows_and_the_references() -> None:
         (set_entry("roads", value={}), "summary"),
         (set_entry("roads", RING, "driver", "mean_speed_second_half", value=[9.0] * 10), "summary.* from the rows"),
         (set_entry("roads", RING, "driver", "mean_speed_second_half", value=["9"] * 10), "numbers"),
-        (set_entry("roads", RING, "driver", "mean_speed_second_half", value=[9e99] * 10), "numbers"),
+        (set_entry("roads", RING, "driver", "mean_speed_second_half", value=[9e99] * 10), "summary.* from the rows"),
+        (
+            set_entry("roads", RING, "driver", "delay", value=[2.0, "x"] * 5),
+            "delay: 'x' is not allowed; allowed: numbers",
+        ),
+        (
+            set_entry("roads", RING, "driver", "status", value=["x", 2.0] * 5),
+            "status: 2.0 is not allowed; allowed: texts",
+        ),
         (set_entry("roads", RING, "driver", "mean_speed_second_half", value=[9.0]), "mean_speed_second_half"),
         (set_entry("roads", RING, "driver", "status", value=[None] * 10), "texts"),
         (set_entry("roads", RING, "driver", "speed", value=[9.0] * 10), "speed"),
@@ -85,6 +94,19 @@ def test_files_that_contradict_themselves_are_refused_in_one_line(
         read_leaderboard([PI, file])
     assert str(error.value).startswith(f"{file}: ")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [1.2e9, 1e300, -1.7e308, 5e-324, 10**15])
+def test_a_result_with_any_finite_numbers_can_be_read_again(value: float, tmp_path: Path) -> None:
+    result, file = read_result(PI), tmp_path / "a.json"
+    road = result.roads[RING]
+    for name in FAMILY_METRICS[2:]:
+        changed = replace(road, driver={**road.driver, name: [value] * 9 + [1.0]})
+        written = replace(result, roads={**result.roads, RING: changed})
+        write_result(file, written)
+        assert read_leaderboard([file]) == {"pi": written}
+        assert leaderboard_rows({"pi": written})
 
 
 def test_another_human_baseline_is_refused(tmp_path: Path) -> None:

@@ -129,6 +129,27 @@ def test_a_result_of_a_model_file_continues_only_with_the_same_file(suite: str, 
         unjam.benchmark(str(file), "ring", tmp_path / "a.json", workers=1)
 
 
+BACKEND = """
+from unjam.worlds.batch.backend import BatchBackend
+class Mine(BatchBackend): pass
+"""
+
+
+def test_a_result_of_a_backend_file_continues_only_with_the_same_code(suite: str, tmp_path: Path) -> None:
+    file, out = tmp_path / "mine.py", tmp_path / "a.json"
+    file.write_text(BACKEND)
+    first = unjam.benchmark("pi", "ring", out, workers=1, backend=f"{file}:Mine")
+    assert first.manifest["backend_sha256"] == sha256_of_file(file)
+    assert unjam.benchmark("pi", "ring", out, workers=1, backend=f"{file}:Mine") == first
+    before = out.read_bytes()
+    file.write_text(f"{BACKEND}# edited")
+    with pytest.raises(
+        InputError, match=r"a\.json has hash of the backend '.*', not '.*'; allowed: the same, or a new"
+    ):
+        unjam.benchmark("pi", "ring", out, workers=1, backend=f"{file}:Mine")
+    assert out.read_bytes() == before
+
+
 @pytest.mark.long
 def test_a_driver_that_cannot_drive_on_a_road_counts_as_the_human_baseline_there(suite: str) -> None:
     result = unjam.benchmark("unjam:ring-best", "mixed", workers=1)

@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 
 from tests.test_processes import linux, soon
-from unjam.errors import EpisodeError
+from unjam.errors import EpisodeError, InputError
 from unjam.scenarios import Ring
 from unjam.training.evaluate import Evaluation
+from unjam.training.run_folder import create_run_folder, save_checkpoint
 from unjam_paper import results_file, study
 from unjam_paper.results_file import StudyPart, measure_parts
-from unjam_paper.study import evaluate_in_batches, evaluate_metrics, write_manifest
+from unjam_paper.study import PlannedRun, StudyFolder, evaluate_in_batches, evaluate_metrics, write_manifest
 
 MEASURED: list[object] = []
 """arguments of the functions below, in calls of this process"""
@@ -164,3 +165,20 @@ def test_batches_have_the_metrics_of_sumo_except_fuel() -> None:
         for found, expected in zip(in_batches[label]["episodes"], measured["episodes"], strict=True):
             assert found.pop("seed") == expected.pop("seed")
             assert found == pytest.approx(expected, rel=1e-6, nan_ok=True)
+
+
+@pytest.mark.parametrize("kept", [[], [1, 2], [1, 3], [2, 3]])
+def test_a_finished_training_with_cut_progress_is_refused(kept: list[int], tmp_path: Path) -> None:
+    studies, run = StudyFolder(tmp_path), PlannedRun("ring", "trpo", 0)
+    folder = studies.run_folder(run)
+    create_run_folder(folder, run.config)
+    (folder / "evaluation.json").write_text(json.dumps({"rows": [{"driver": "trained"}]}))
+    save_checkpoint(folder / "checkpoint", {"iteration": 3}, {})
+    rows = {number: {"iteration": number, "return_mean": float(number)} for number in (1, 2, 3)}
+    (folder / "progress.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows.values()))
+    assert studies.is_finished(run)
+    assert studies.trained_runs("ring", ["trpo"], 1)["trpo"][0].final_training_mean("return_mean") == 3.0
+    (folder / "progress.jsonl").write_text("".join(f"{json.dumps(rows[number])}\n" for number in kept))
+    for read in (lambda: studies.is_finished(run), lambda: studies.trained_runs("ring", ["trpo"], 1)):
+        with pytest.raises(InputError, match=r"progress\.jsonl: rows? .* missing; allowed: all rows up to 3"):
+            read()

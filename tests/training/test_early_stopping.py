@@ -10,6 +10,7 @@ import pytest
 from tests.training.test_run import STEPS, controller_manifest, learn_with, outcome, small_config
 from unjam.errors import MissingPartError
 from unjam.reports.results import read_progress, validation_gains
+from unjam.training.run_folder import check_controller
 from unjam.training.tensorboard import TENSORBOARD_FOLDER, tensorboard_writer
 from unjam.training.train import Trainer
 from unjam.worlds.worker_pool import WorkerPool
@@ -101,6 +102,7 @@ def test_training_ended_by_a_callback_resumes_unchanged(tmp_path: Path) -> None:
     config = small_config(steps=2 * STEPS, evaluation__validation_interval=2)
     with WorkerPool(1) as workers:
         learn_with(workers, tmp_path / "stopped", config, lambda row: False)
+        check_controller(tmp_path / "stopped", "evaluate")
         learn_with(workers, tmp_path / "stopped", config, resume=True)
         learn_with(workers, tmp_path / "one go", config)
     assert outcome(tmp_path / "stopped") == outcome(tmp_path / "one go")

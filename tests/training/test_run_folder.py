@@ -1,22 +1,34 @@
 import json
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
+from tests.conftest import random_network
 from tests.training.test_run import STEPS, small_config
 from tests.worlds.sumo.user_networks import straight
-from unjam.controller import packaged_file
+from unjam.cli import app
+from unjam.controller import controller_bytes, packaged_file
+from unjam.controller.file import add_certificate, read_controller
+from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
+from unjam.processes import lock_folder
 from unjam.scenarios.population import population_file
 from unjam.training.config import load_config
+from unjam.training.drive import drive
+from unjam.training.export import ControllerStore, export_controller
 from unjam.training.fingerprint import fingerprint
 from unjam.training.run_folder import (
     check_config,
+    check_controller,
     check_run_files,
     create_run_folder,
+    read_complete_progress,
     read_config,
     restore_newest_checkpoint,
     resume_run_folder,
@@ -181,7 +193,7 @@ def test_names_of_files_are_those_of_the_folder_in_which_the_run_was_started(
     create_run_folder(run, config)
     made, stored = config.make_tasks(), (run / "config.toml").read_text()
     save_checkpoint(run / "checkpoint", {"iteration": 1, "fingerprint": fingerprint(config)}, {})
-    (run / "progress.jsonl").touch()
+    (run / "progress.jsonl").write_text('{"iteration": 1}\n')
     monkeypatch.chdir(tmp_path / "elsewhere" / "deep")
     found = read_config(Path("../../my project/runs/a"))
     for task, expected in zip(found.make_tasks(), made, strict=True):
@@ -195,3 +207,110 @@ def test_names_of_files_are_those_of_the_folder_in_which_the_run_was_started(
     assert (run / "config.toml").read_text() == stored.replace(f"steps = {2 * STEPS}", f"steps = {9 * STEPS}", 1)
     monkeypatch.chdir(project)
     assert read_config(run) == replace(config, steps=9 * STEPS)
+
+
+CUT_PROGRESS = [
+    ([1, 7, 8], "rows 2 to 6 are missing"),
+    ([1, 2, 3], "rows 4 to 8 are missing"),
+    ([2, 3, 4, 5, 6, 7, 8, 9], "row 1 is missing"),
+    ([1, 2, 3, 3, 4, 5, 6, 7, 8], "row 4 is of iteration 3"),
+    ([], "rows 1 to 8 are missing"),
+]
+
+
+@pytest.mark.parametrize(("iterations", "reason"), CUT_PROGRESS)
+@pytest.mark.parametrize("part", ["", "second"])
+def test_progress_older_than_the_checkpoint_is_refused_and_nothing_changes(
+    iterations: list[int], reason: str, part: str, tmp_path: Path
+) -> None:
+    config = small_config(tasks=[{"name": "first"}, {"name": "second"}])
+    create_run_folder(tmp_path, config)
+    places = [tmp_path / name for name in ("", "first", "second")]
+    for place in places:
+        place.mkdir(exist_ok=True)
+        found = iterations if place == tmp_path / part else range(1, 10)
+        (place / "progress.jsonl").write_text("".join(f'{{"iteration": {each}}}\n' for each in found))
+    for iteration in (6, 7, 8):
+        save_checkpoint(tmp_path / "checkpoint", {"iteration": iteration, "fingerprint": fingerprint(config)}, {})
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    message = rf"^{tmp_path / part / 'progress.jsonl'}: {reason}; allowed: all rows up to 8"
+    with pytest.raises(InputError, match=message):
+        restore_newest_checkpoint(tmp_path, places)
+    if not part:
+        with pytest.raises(InputError, match=message):
+            read_complete_progress(tmp_path)
+        with pytest.raises(InputError, match=message):
+            resume_run_folder(tmp_path, replace(config, steps=9 * STEPS))
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def controller(seed: int) -> bytes:
+    driver = ResidualDriver(PISaturation(), random_network(seed=seed), 3.0)
+    return controller_bytes(driver, {"time_step": 0.1, "iteration": seed})
+
+
+def run_with_controllers(folder: Path, *tasks: str) -> Path:
+    """A run whose checkpoint has the best controllers 1, 2, ... of its tasks, and the latest controllers 11, 12, ..."""
+    config = small_config(tasks=[{"name": name} for name in tasks])
+    create_run_folder(folder, config)
+    store = ControllerStore([folder / name for name in tasks or ("",)])
+    for first in (1, 11):
+        store.save([controller(first + number) for number in range(len(tasks) or 1)], is_best=first == 1)
+    state = {"iteration": 1, "fingerprint": fingerprint(config)}
+    save_checkpoint(folder / "checkpoint", state, store.tensors())
+    return folder
+
+
+def evaluate_in_cli(folder: Path) -> None:
+    ran = CliRunner().invoke(app, ["evaluate", str(folder)])
+    if isinstance(ran.exception, InputError):
+        raise ran.exception
+
+
+@pytest.mark.parametrize("name", ["evaluate", "export", "drive"])
+def test_a_controller_that_is_not_in_the_checkpoint_is_refused_before_anything_runs(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("unjam.worlds.worker_pool.WorkerPool.__init__", lambda *given: pytest.fail("it simulates"))
+    commands: dict[str, Callable[[Path], Any]] = {
+        "evaluate": evaluate_in_cli,
+        "export": partial(export_controller, out=tmp_path / "out.unjam"),
+        "drive": lambda folder: drive("ring", ["idm", f"pi+{folder}"]),
+    }
+    folder = run_with_controllers(tmp_path / "run")
+    (folder / "controller.unjam").write_bytes(controller(2))
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(
+        InputError, match=rf"^{name}: '.*controller\.unjam' is not .*; resume with: unjam train --resume"
+    ):
+        commands[name](folder)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_controllers_of_the_checkpoint_are_accepted_also_with_a_certificate(tmp_path: Path) -> None:
+    folder = run_with_controllers(tmp_path / "run")
+    file = folder / "controller.unjam"
+    for number in (11, 1):
+        file.write_bytes(controller(number))
+        check_controller(folder, "evaluate")
+        add_certificate(file, read_controller(folder), {"certified": True})
+        assert file.read_bytes() != controller(number)
+        check_controller(folder, "evaluate")
+    file.write_bytes(controller(3))
+    with lock_folder(folder):  # a training writes the controller before the checkpoint
+        check_controller(folder, "evaluate")
+    for checkpoint in (folder / "checkpoint").iterdir():
+        checkpoint.unlink()
+    check_controller(folder, "evaluate")
+    file.unlink()
+    check_controller(folder, "evaluate")
+    check_controller(tmp_path / "nowhere", "evaluate")
+
+
+def test_a_task_has_its_own_controller_in_the_checkpoint_of_its_run(tmp_path: Path) -> None:
+    folder = run_with_controllers(tmp_path / "run", "first", "second")
+    for name in ("first", "second"):
+        check_controller(folder / name, "export")
+    copyfile(folder / "first" / "controller.unjam", folder / "second" / "controller.unjam")
+    with pytest.raises(InputError, match=f"^export: .*; resume with: unjam train --resume {folder}$"):
+        check_controller(folder / "second", "export")

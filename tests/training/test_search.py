@@ -14,6 +14,7 @@ from unjam.errors import InputError, UnjamError
 from unjam.files import to_json
 from unjam.training.config import load_config
 from unjam.training.executors import CommandLine, LocalExecutor
+from unjam.training.run_folder import save_checkpoint
 from unjam.training.search import (
     SearchTrial,
     _propose_trials,
@@ -308,6 +309,23 @@ def test_failure_of_all_trials_is_reported(tmp_path: Path, trainings: Trainings)
     with pytest.raises(UnjamError, match="no training of 3 trials ended; their logs are in"):
         search(BASE, SPACE, 3, tmp_path, 2, on_message=messages.append)
     assert all(line.endswith("failed") for line in messages)
+
+
+@pytest.mark.parametrize("kept", [[], [1], [1, 3], [2, 3]])
+def test_a_repeated_search_refuses_the_cut_progress_of_a_finished_trial(
+    kept: list[int], tmp_path: Path, trainings: Trainings
+) -> None:
+    search(BASE, SPACE, 2, tmp_path, 1)
+    file = tmp_path / "trials" / "0001" / "progress.jsonl"
+    row = json.loads(file.read_text())
+    save_checkpoint(file.parent / "checkpoint", {"iteration": 3}, {})
+    file.write_text("".join(f"{to_json(row | {'iteration': each})}\n" for each in (1, 2, 3)))
+    assert len(search(BASE, SPACE, 2, tmp_path, 1)) == 2
+    before = (tmp_path / "search.json").read_bytes()
+    file.write_text("".join(f"{to_json(row | {'iteration': each})}\n" for each in kept))
+    with pytest.raises(InputError, match=rf"^{file}: rows? .* missing; allowed: all rows up to 3"):
+        search(BASE, SPACE, 2, tmp_path, 1)
+    assert (tmp_path / "search.json").read_bytes() == before
 
 
 @pytest.mark.slow

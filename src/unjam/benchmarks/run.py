@@ -39,6 +39,7 @@ from unjam.road_family import FAMILY_PREFIX
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.text import format_count, one_line
+from unjam.training.fingerprint import file_hashes
 from unjam.worlds.backend import BackendLike, check_support, open_backend
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.batch.support import unsupported_reason
@@ -101,7 +102,10 @@ def benchmark(
         driver=one_line(without_folders([label])[0] or first.describe(), MAX_LABEL_CHARACTERS),
         sha256=_driver_hash(label, first),
         training_steps=_recorded_steps(label) or training_steps,
-        manifest={**origin, "command": without_folders(origin["command"]), "backend": backend},
+        manifest={
+            **{**origin, "command": without_folders(origin["command"]), "backend": backend},
+            "backend_sha256": next(iter(file_hashes([str(backend)]).values()), None),
+        },
     )
     path, lock = None if out is None else Path(out), nullcontext()
     if path is not None:
@@ -238,6 +242,7 @@ def _stored_result(path: Path, new: BenchmarkResult) -> BenchmarkResult:
         sumo = (made.get("packages") or {}).get("eclipse-sumo")
         names = {"suite": result.suite, "driver": result.driver, "hash of the driver": result.sha256}
         names |= {"training steps": result.training_steps, "backend": made.get("backend")}
+        names |= {"hash of the backend": made.get("backend_sha256")}
         return names | {"unjam": made.get("unjam"), "SUMO": sumo}
 
     if new.sha256 is None:

@@ -20,7 +20,7 @@ from unjam.processes import check_not_locked, continue_in_limited_child, lock_fo
 from unjam.reports.results import CONTROLLER_FILE, read_progress, read_results
 from unjam.text import printable
 from unjam.training.evaluate import evaluate_run, evaluation_steps, gain_over_expert
-from unjam.training.run_folder import check_run_files, lock_new_folder, read_config
+from unjam.training.run_folder import check_controller, check_run_files, lock_new_folder, read_config
 from unjam.training.runs import config_differences, find_run, list_runs, read_run, remove_run
 from unjam.worlds.episode import check_can_drive
 from unjam.worlds.worker_pool import WorkerPool
@@ -67,6 +67,7 @@ def evaluate_command(
     """
     config = read_config(run)
     check_run_files(run, config, "evaluate")
+    check_controller(run, "evaluate")
     episodes = episodes or config.evaluation.episodes
     if driver or humans is not None or episodes < config.evaluation.episodes:
         out = opt.new_folder(out, f"evaluate-{run.resolve().name}")

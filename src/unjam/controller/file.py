@@ -66,6 +66,11 @@ def _pack_with_hashes(manifest: dict[str, Any], parts: dict[str, bytes]) -> byte
     return pack_parts({MANIFEST_PART: to_json(manifest, indent=1).encode(), **parts})
 
 
+def trained_bytes(controller: Controller) -> bytes:
+    """Return the content of a controller as its training wrote it, without a certificate and a signature."""
+    return _pack_with_hashes(controller.manifest, {WEIGHTS_PART: controller.parts[WEIGHTS_PART]})
+
+
 def add_certificate(file: Path, controller: Controller, certificate: dict[str, Any]) -> None:
     """Write a controller again with its certificate; raise `InputError` if it is signed, or has changed meanwhile."""
     check_unsigned(controller)

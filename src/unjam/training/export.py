@@ -28,7 +28,13 @@ from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_scenario import CODE_ENTRY, class_reference
 from unjam.seeds import held_out_seeds
 from unjam.training.evaluate import TRAINED_LABEL
-from unjam.training.run_folder import check_run_files, controller_origin, read_config
+from unjam.training.run_folder import (
+    CONTROLLER_KINDS,
+    check_controller,
+    check_run_files,
+    controller_origin,
+    read_config,
+)
 from unjam.trust import check_trusted, expecting_code
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
@@ -65,7 +71,7 @@ class ControllerStore:
 
     def restore(self, tensors: "Tensors", is_finished: bool) -> None:
         """Take the contents from a checkpoint's `tensors` and write them: `latest` if the training has ended."""
-        for kind in ("best", "latest") if "best/0" in tensors else ():
+        for kind in CONTROLLER_KINDS if "best/0" in tensors else ():
             stored = [tensors.pop(f"{kind}/{index}") for index in range(len(self._folders))]
             self._contents[kind] = [each.numpy().tobytes() for each in stored]
         if not is_finished and "best" in self._contents:
@@ -212,6 +218,7 @@ def _read_run_origin(run: str, scenario: str, settings: dict[str, Any]) -> tuple
     folder = Path(run)
     config = read_config(folder)
     check_run_files(folder, config, "export")
+    check_controller(folder, "export")
     road, controller = make_scenario(config.make_scenario(), settings), read_controller(folder)
     metadata = {
         **controller_origin(road, config.make_expert()),

@@ -14,22 +14,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import tomli_w
+from safetensors import safe_open
 
 from unjam import files
 from unjam.controller import make_driver
+from unjam.controller.file import read_controller, trained_bytes
 from unjam.drivers.check import PROBE_ROWS, check_row_independence, probe_state
 from unjam.drivers.driver import Driver
 from unjam.drivers.observation import feature, observation_size
 from unjam.drivers.registry import driver_recipe
 from unjam.drivers.requirements import merge_requirements
 from unjam.drivers.user_driver import is_file_reference
-from unjam.errors import DiskError, InputError, invalid_value
+from unjam.errors import DiskError, InputError, invalid_value, resume_hint
 from unjam.files import sha256_of, to_json
 from unjam.folders import reject_unsafe_files
 from unjam.manifest import manifest, package_versions
 from unjam.parameters import build_dataclass, check_integer, read_toml
-from unjam.processes import LOCK_FILE, lock_folder
-from unjam.reports.results import read_progress
+from unjam.processes import LOCK_FILE, is_locked, lock_folder
+from unjam.reports.results import CONTROLLER_FILE, read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import CONFIG_FILE, MANIFEST_FILE, RunConfig, load_config, read_values, to_toml
@@ -46,6 +48,8 @@ if TYPE_CHECKING:
 CHECKPOINT_FORMAT = 7
 """format of run folders and their checkpoints; other formats are refused"""
 MAX_CHECKPOINTS = 2
+CONTROLLER_KINDS = "best", "latest"
+"""controllers in a checkpoint: that of the best scheduled validation, and that of the folder"""
 PROGRESS_FILE = "progress.jsonl"
 CHECKPOINT_NAME = re.compile(r"\d{6,}-[0-9a-f]{64}\.safetensors")
 """file name of a checkpoint: iteration and hash of the content"""
@@ -211,7 +215,7 @@ def resume_run_folder(folder: Path, config: RunConfig) -> None:
     parent = folder.absolute().parent
     if folder.name in _task_names(parent):
         raise InputError(f"resume: {str(folder)!r} is one task of a run; allowed: {parent}")
-    before, progress = read_config(folder), read_progress(folder)
+    before, progress = read_config(folder), read_complete_progress(folder)
     if replace(before, steps=config.steps, workers=config.workers) != config:
         raise InputError("resume: only steps and workers may change")
     if config.steps > before.steps and before.evaluation.should_stop_early(progress):
@@ -276,19 +280,41 @@ def restore_newest_checkpoint(
 ) -> "tuple[dict[str, Any], Tensors] | None":
     """Return the newest checkpoint of a run, and remove everything later; None before the first one.
 
-    Raise `InputError` if no checkpoint is valid, or if its fingerprint differs from the `expected` one.
+    Raise `InputError` if no checkpoint is valid, if its fingerprint differs from the `expected` one, or if a row of
+    progress before it is missing.
     """
     checkpoint = load_checkpoint(folder / "checkpoint")
     if checkpoint and expected and "fingerprint" in checkpoint[0]:
         check_fingerprint(checkpoint[0]["fingerprint"], expected)
-    _remove_old_checkpoints(folder / "checkpoint")
     iteration = checkpoint[0]["iteration"] if checkpoint else 0
-    for place in progress_folders:
+    progress = {place: _progress_until(place, iteration) for place in progress_folders}
+    _remove_old_checkpoints(folder / "checkpoint")
+    for place, rows in progress.items():
         files.remove_leftovers(place)
         if (place / PROGRESS_FILE).is_file():
-            rows = [to_json(row) + "\n" for row in read_progress(place) if row["iteration"] <= iteration]
-            files.atomic_write(place / PROGRESS_FILE, "".join(rows))
+            files.atomic_write(place / PROGRESS_FILE, "".join(to_json(row) + "\n" for row in rows))
     return checkpoint
+
+
+def read_complete_progress(folder: Path) -> list[dict[str, Any]]:
+    """Return the rows of progress of a run; raise `InputError` if one before its newest checkpoint is missing."""
+    rows = read_progress(folder)
+    state = next((state for _, state, _ in _valid_checkpoints(folder / "checkpoint")), {})
+    newest = state.get("iteration", max((row["iteration"] for row in rows), default=0))
+    _progress_until(folder, check_integer("checkpoint: iteration", newest, 0))
+    return rows
+
+
+def _progress_until(folder: Path, iteration: int) -> list[dict[str, Any]]:
+    """Return the rows of progress of all iterations up to this one; raise `InputError` if they are not all there."""
+    rows = [row for row in read_progress(folder) if row["iteration"] <= iteration]
+    for expected, found in enumerate([*(row["iteration"] for row in rows), iteration + 1], 1):
+        if found != expected:
+            gap = f"rows {expected} to {found - 1} are" if found > expected + 1 else f"row {expected} is"
+            reason = f"{gap} missing" if found > expected else f"row {expected} is of iteration {found}"
+            allowed = f"allowed: all rows up to {iteration}, as when the checkpoint was written"
+            raise InputError(f"{folder / PROGRESS_FILE}: {reason}; {allowed}")
+    return rows
 
 
 def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
@@ -338,6 +364,26 @@ def check_run_files(
         current = fingerprint(config)
         check_settings(stored, current, command, ignored_prefixes)
         check_file_hashes(stored, current, command)
+
+
+def check_controller(folder: Path, command: str) -> None:
+    """Raise `InputError` if the controller in the folder of a run or task is not one of the newest checkpoint.
+
+    Other folders, runs without a checkpoint and runs that are being trained are not checked.
+    """
+    file, parent = folder / CONTROLLER_FILE, folder.absolute().parent
+    tasks = [*_task_names(parent)]
+    run, index = (parent, tasks.index(folder.absolute().name)) if folder.absolute().name in tasks else (folder, 0)
+    newest, *_ = next(_valid_checkpoints(run / "checkpoint"), (None,))
+    if newest is None or not file.is_file() or is_locked(run):
+        return
+    stored: list[bytes] = []
+    with suppress(*files.INVALID_DATA_ERRORS), safe_open(newest, "np") as tensors:
+        names = {f"{kind}/{index}" for kind in CONTROLLER_KINDS} & {*tensors.keys()}
+        stored = [tensors.get_tensor(name).tobytes() for name in names]
+    if stored and trained_bytes(read_controller(folder)) not in stored:
+        reason = "is not a controller of the newest checkpoint; allowed: the one that a resumed training writes"
+        raise InputError(f"{command}: {str(file)!r} {reason}{resume_hint(run)}")
 
 
 def _remove_old_checkpoints(folder: Path) -> None:

@@ -26,7 +26,7 @@ from unjam.text import format_count
 from unjam.training.config import CONFIG_FILE, RunConfig, load_config, to_toml
 from unjam.training.executors import CommandLine, Executor, MessageCallback, open_executor, training_command
 from unjam.training.fingerprint import fingerprint
-from unjam.training.run_folder import check_config
+from unjam.training.run_folder import check_config, read_complete_progress
 from unjam.training.search_space import SearchSpace, boundary_values
 from unjam.training.trial_log import TRIALS_FILE, TrialLog
 
@@ -133,7 +133,7 @@ def _file_hashes(base: RunConfig, space: SearchSpace) -> dict[str, str]:
 
 def _make_trial(folder: Path, number: int, values: dict[str, Any], has_failed: bool) -> SearchTrial:
     trial_folder = _trial_folder(folder, number)
-    gains = None if has_failed else validation_gains(read_progress(trial_folder))
+    gains = None if has_failed else validation_gains(read_complete_progress(trial_folder))
     return SearchTrial(number, values, trial_folder, *(gains or (None, None)))
 
 
@@ -185,8 +185,11 @@ def _propose_trials(
 
 
 def validation_gain(folder: Path) -> float | None:
-    """Return the best validation return of a training minus that of its expert; None without validations."""
-    gains = validation_gains(read_progress(folder))
+    """Return the best validation return of a training minus that of its expert; None without validations.
+
+    Raise `InputError` if rows of progress before the newest checkpoint are missing.
+    """
+    gains = validation_gains(read_complete_progress(folder))
     return gains and gains[0]
 
 

@@ -321,6 +321,7 @@ class Trainer:
         stopped = self._on_iteration(whole) is False
         if stopped and validation is None and not early:
             self.validate(has_ended=True)
+            self._save_checkpoint()  # it has the controller in the folder
         return stopped or early
 
     def _save_checkpoint(self) -> None:

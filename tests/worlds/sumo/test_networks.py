@@ -1,11 +1,13 @@
 import errno
 import os
+import resource
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 from xml.etree import ElementTree
@@ -15,11 +17,12 @@ import platformdirs
 import pytest
 
 from unjam import files
-from unjam.errors import DiskError, EpisodeError, MissingPartError
+from unjam.errors import DiskError, EpisodeError, MissingPartError, as_unjam_error
 from unjam.files import is_leftover
 from unjam.scenarios import Ring
 from unjam.scenarios.road import RoadNetwork
 from unjam.worlds.sumo import networks
+from unjam.worlds.sumo.example_roads import write_example_road
 from unjam.worlds.sumo.networks import cache_folder, network_file, sumo_program
 
 
@@ -207,6 +210,21 @@ def test_a_full_disk_is_a_disk_error_and_leaves_nothing_behind(
     with pytest.raises(DiskError, match=f"cannot write .*networks.*: {os.strerror(problem)}"):
         network_file(road_of(230))
     assert files_in(cache) == {cache / "networks"}
+
+
+@pytest.mark.parametrize("size", [0, 500, 4096])
+@pytest.mark.parametrize("write", [lambda place: network_file(road_of(230)), partial(write_example_road, "on-ramp")])
+def test_a_network_above_the_limit_of_file_sizes_is_a_full_disk(
+    write: Callable[[Path], object], size: int, cache: Path, tmp_path: Path
+) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        with pytest.raises((DiskError, OSError)) as caught:
+            write(tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert isinstance(as_unjam_error(caught.value), DiskError)
 
 
 def cut(path: Path) -> None:

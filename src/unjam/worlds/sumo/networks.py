@@ -172,7 +172,8 @@ def run_netconvert(files: dict[tuple[str, str], str], options: list[str], folder
     inputs = [f"{option}={folder / name}" for option, name in files]
     fixed = [f"--output-file={network}", "--offset.disable-normalization=true", "--precision=6"]
     command = [sumo_program("netconvert"), *inputs, *fixed, *options]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    # Without the signal of a file size limit, which Python ignores, netconvert writes a cut file, as on a full disk.
+    result = subprocess.run(command, capture_output=True, text=True, check=False, restore_signals=False)
     if result.returncode == 0 and network.exists():
         if network.read_bytes().rstrip().endswith(b"</net>"):
             return network
