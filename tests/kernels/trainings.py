@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from tests.training.test_run import learn_with, small_config
+from unjam.road_family import NO_LATENCY
 from unjam.worlds.worker_pool import WorkerPool
 
 DATA = ("model/data/", "replay/")
@@ -35,7 +36,11 @@ def hashes(learners: list[str]) -> dict[str, str]:
     with tempfile.TemporaryDirectory() as folder, WorkerPool(1) as workers:
         for learner in learners:
             config = small_config(
-                agent=learner, policy__hidden=[32, 32], evaluation__validation_interval=0, **LEARNERS[learner]
+                agent=learner,
+                policy__hidden=[32, 32],
+                evaluation__validation_interval=0,
+                scenario_options__actuator=NO_LATENCY,
+                **LEARNERS[learner],
             )
             run = learn_with(workers, Path(folder) / learner, config)
             total = hashlib.sha256()
