@@ -282,3 +282,16 @@ def test_files_that_belong_to_no_controller_are_not_overwritten(
     for _ in range(2):  # its own files are replaced
         export_controller(run, tmp_path / "mine.unjam", **options)
         assert mine.is_file()
+
+
+@pytest.mark.parametrize(
+    ("settings", "car"), [({}, (0.2, 0.3)), ({"actuator.delay": 0.4}, (0.4, 0.3)), ({"actuator.lag": 0.0}, (0.2, 0.0))]
+)
+def test_a_packaged_controller_for_ideal_cars_is_exported_with_the_filter_of_a_usual_car(
+    settings: dict[str, Any], car: tuple[float, float], tmp_path: Path
+) -> None:
+    result = export_controller("unjam:ring-gap-tuned", tmp_path / "a.unjam", settings=settings)
+    driver = read_controller(result.file).driver
+    assert isinstance(driver, FilteredDriver)
+    assert (driver.actuator.delay, driver.actuator.lag) == car
+    assert result.car == driver.actuator.describe()

@@ -27,7 +27,7 @@ from unjam.errors import invalid_value
 from unjam.files import check_parent_folder
 from unjam.processes import continue_in_limited_child
 from unjam.scenarios import scenario_from_recipe
-from unjam.training.export import export_controller, read_in_car
+from unjam.training.export import export_controller, measure_test_episode, read_in_car
 
 
 def export_command(
@@ -73,7 +73,9 @@ def export_command(
     is_source = source.endswith((".onnx", ".toml")) and Path(source).with_suffix(".onnx").resolve() == other.resolve()
     if result.graph is None and other.exists() and not is_source:
         err_console.print(f"note: {other} is not the graph of this controller; --onnx writes the graph")
-    err_console.print(f"{result.driver}, verified on {result.sample_steps:,} control steps of a test episode")
+    car = f", {result.car}" if result.car else ""
+    steps = f"{result.sample_steps:,} control steps of a test episode"
+    err_console.print(f"{result.driver}{car}, verified on {steps}")
 
 
 def certify_command(
@@ -136,17 +138,20 @@ def certify_command(
         gain = f"gain {max(each['gains']):.3f} at {each['peak_frequency']:.3g} Hz"
         console.print(f"  at {each['speed']:g} m/s: {'falls behind its leader' if falls_behind(each) else gain}")
     console.print(describe_worst_cases(certificate, controller.driver))
+    if is_packaged:
+        row = measure_test_episode(controller)
+        console.print(f"a test episode of {row['steps']:,} control steps in this car: {row['feasibility']}")
     err_console.print(f"page: {target}")
 
 
 def _read_with_filter(name: str, settings: dict[str, Any]) -> Controller:
     """Return a packaged controller with the safety filter of its road, for the car of this road, and a sample of it."""
     controller = read_controller(Path(name))
-    if recipe := controller.manifest.get("scenario"):
-        car = asdict(scenario_from_recipe({"kind": recipe["kind"]}).actuator)
-        if car != recipe["actuator"]:  # it was made for a car that obeys at once
-            settings = {"actuator": car, **settings}
-    if isinstance(controller.driver, FilteredDriver) and not settings:
+    recipe = controller.manifest.get("scenario")
+    if recipe is None:
+        raise invalid_value("file", name, "a controller for one road: it selects its controller by the road")
+    is_usual = asdict(scenario_from_recipe({"kind": recipe["kind"]}).actuator) == recipe["actuator"]
+    if isinstance(controller.driver, FilteredDriver) and is_usual and not settings:
         return controller
     return read_in_car(name, settings)
 

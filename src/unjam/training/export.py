@@ -4,12 +4,20 @@ import logging
 import os
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from unjam.controller import SUFFIX, controller_bytes, controller_path, make_driver
-from unjam.controller.file import GRAPH_PART, MAX_SAMPLE_STEPS, SAMPLE_PART, Controller, read_controller, sample_bytes
+from unjam.controller.file import (
+    GRAPH_PART,
+    MAX_SAMPLE_STEPS,
+    PACKAGED_PREFIX,
+    SAMPLE_PART,
+    Controller,
+    read_controller,
+    sample_bytes,
+)
 from unjam.controller.manifest import PROVENANCE_ENTRIES
 from unjam.controller.verify import verify_controller_file
 from unjam.drivers.driver import Driver
@@ -95,6 +103,8 @@ class ExportResult:
     driver: str
     sample_steps: int
     """length of the recorded sample"""
+    car: str
+    """the actuator that its safety filter knows; empty without a filter"""
 
 
 @expecting_code()
@@ -171,7 +181,8 @@ def export_controller(
     model_file = None if model is None else out.with_suffix(".zip")
     if model is not None and model_file is not None:
         atomic_write(model_file, model)
-    return ExportResult(out, graph_file, model_file, driver.describe(), len(states.speed))
+    car = driver.actuator.describe() if isinstance(driver, FilteredDriver) else ""
+    return ExportResult(out, graph_file, model_file, driver.describe(), len(states.speed), car)
 
 
 def read_in_car(source: str, settings: dict[str, Any], scenario: str = "") -> Controller:
@@ -180,6 +191,14 @@ def read_in_car(source: str, settings: dict[str, Any], scenario: str = "") -> Co
         return read_controller(
             export_controller(source, Path(private, f"in-car{SUFFIX}"), False, scenario, False, settings).file
         )
+
+
+def measure_test_episode(controller: Controller) -> dict[str, Any]:
+    """Return the metrics of a controller in the first test episode of its own road and car."""
+    road = scenario_from_recipe(controller.manifest["scenario"])
+    with WorkerPool(1) as workers:
+        (episode,) = workers.run([EpisodeTask(road, controller.driver, held_out_seeds(1)[0], record_details=True)])
+    return measure(episode)
 
 
 def driver_with_filter(driver: Driver, road: Scenario) -> FilteredDriver:
@@ -238,6 +257,10 @@ def _read_driver_origin(
         controller = read_controller(file)
         metadata = {name: controller.manifest[name] for name in PROVENANCE_ENTRIES if name in controller.manifest}
         road, driver = _read_scenario(file, metadata.get("scenario")), controller.driver
+        if driver_name.startswith(PACKAGED_PREFIX) and road.is_closed:
+            car = asdict(type(road)().actuator)
+            if car != asdict(road.actuator):  # it was made for a car that obeys at once
+                settings = {"actuator": car, **settings}
         if not settings:
             return road, driver, metadata
         road = make_scenario(road, settings)
