@@ -131,7 +131,7 @@ def test_beneficial_effect_has_no_rejection_reasons() -> None:
         (
             {"hard_braking": between(-1, 9)},
             "human drivers may brake beyond 4.5 m/s² more often than in the human baseline: +4 [-1, +9] times "
-            "in a million vehicle-steps (the sign of the mean counts)",
+            "in a million vehicle-steps (a positive mean counts)",
         ),
     ],
 )

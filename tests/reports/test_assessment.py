@@ -132,7 +132,7 @@ def test_main_table_has_a_row_per_option_with_differences_to_both_baselines(page
     ("feasibility", "more_braking", "text"),
     [
         ("feasible", 0.0, "feasible"),
-        ("feasible", 0.2, "feasible, but human drivers brake hard more often"),
+        ("feasible", 0.2, "feasible, but human drivers brake hard more often in the mean"),
         ("brakes with 9.0 m/s2", 0.2, "brakes with 9.0 m/s2"),
         ("", 0.0, "–"),
     ],

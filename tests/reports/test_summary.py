@@ -358,6 +358,10 @@ def test_two_configurations_of_a_network_are_compared_on_the_same_seeds() -> Non
     assert verdict is not None
     assert verdict.driver == "limited: human"
     assert "human drivers of the first network, 2 paired seeds" in verdict.comparison
+    longer = drive_results("runs/longer", "b.sumocfg", human=rows_of([5.0, 7.0, 9.0]))
+    assert first_alternative([plain, longer]) == "plain: human"
+    column = compare_alternative(report_columns([plain, longer])[1], plain.rows["human"])
+    assert (len(column.rows), len(column.baseline_rows or ())) == (2, 2), "seeds of both"
     others = {
         "other seeds": drive_results("runs/c", "c.sumocfg", human=rows_of([1.0])),
         "no humans": drive_results("d", "d.sumocfg", pi=[]),

@@ -50,6 +50,11 @@ def run_example(folder: Path, name: str, *arguments: str) -> str:
     return ran.stdout + ran.stderr
 
 
+def test_all_examples_are_run_by_a_test() -> None:
+    tests = "".join(file.read_text() for file in Path(__file__).parents[1].rglob("test_*.py"))
+    assert not [file.name for file in EXAMPLES.glob("*.py") if file.name not in tests]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "words"),
@@ -61,6 +66,7 @@ def run_example(folder: Path, name: str, *arguments: str) -> str:
         ("shared_policy.py 1 60", "update 0: "),
         ("offline_dataset.py 1 100", "600 transitions, observations (600, 5)"),
         ("training_logger.py 2000", "steps, return"),
+        ("differentiable_ring.py --updates 2 --episodes 2", "paired difference"),
     ],
 )
 def test_the_examples_run(command: str, words: str, tmp_path: Path) -> None:

@@ -238,7 +238,7 @@ def suggest_after_drive(
         command = "train", scenario, "--expert", controllers[-1], "--preset", "demo"
         options = setting_options(changes, "scenario_options.", reward, backend)
         print_next_command("train on an expert", *command, *options)
-    elif is_drawable:
+    elif is_drawable and not controllers[-1].partition(":")[0].endswith(".zip"):  # in this process only
         command = "watch", scenario, "-d", controllers[-1], "--video", f"{Path(scenario).stem}.gif"
         print_next_command(f"watch {controllers[-1]}", *command, *setting_options(changes, backend=backend))
 

@@ -33,7 +33,7 @@ def rejection_reasons(effect: Effect) -> list[str]:
     keeps_flow = effect.flow.high < 0 or effect.flow.low >= -MAX_FLOW_LOSS * effect.baseline_flow
     teleported = f"SUMO teleports or removes {100 * effect.baseline_teleport_share:.1f} % of the vehicles"
     teleports, contacts = (format_count(each, "more vehicle") for each in (effect.teleports, round(effect.collisions)))
-    braking = f"{format_difference(effect.hard_braking)} times in a million vehicle-steps (the sign of the mean counts)"
+    braking = f"{format_difference(effect.hard_braking)} times in a million vehicle-steps (a positive mean counts)"
     may = "" if effect.hard_braking.low > 0 else " may"
     # Too few seeds give NaN, with which every comparison is false: then a check fails.
     checks = (

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from unjam.drivers.command import Command, as_numbers
 from unjam.drivers.driver import Driver, Memory
+from unjam.drivers.user_driver import object_label
 from unjam.errors import InputError, invalid_value
 from unjam.models.rollouts import check_device
 from unjam.models.settings import Device
@@ -126,10 +127,16 @@ class DifferentiableRings(RingBatch):
             raise InputError(f"{name}: {value} of ring {ring} is not allowed; allowed: {allowed}")
         return found
 
-    def initial_memory(self, driver: Driver) -> Memory:
-        """Return a driver's memory after the warm-up as tensors; `InputError` if it takes only NumPy arrays."""
-        if driver.requirements().needs_numpy:
-            raise invalid_value("driver", driver.describe(), "one that takes tensors, like 'pi' or a torch.nn.Module")
+    def initial_memory(self, driver: Any) -> Memory:
+        """Return the memory after the warm-up as tensors, of a driver or of an object with `initial_memory(n)`.
+
+        Raise `InputError` for a driver that takes only NumPy arrays, or an object without memory.
+        """
+        is_array_driver = isinstance(driver, Driver) and driver.requirements().needs_numpy
+        if is_array_driver or not hasattr(driver, "initial_memory"):
+            allowed = "one that takes tensors, like 'pi' or policy_driver(module)"
+            name = driver.describe() if is_array_driver else object_label(driver)
+            raise invalid_value("driver", name, allowed)
         memory = initial_batch_memory(driver, len(self.roads), self.cav_count)
         memory = memory if self._history is None else driver.recall(memory, self._history)
         return map_leaves(self._to_array, memory)

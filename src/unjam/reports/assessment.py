@@ -156,7 +156,7 @@ def option_rows(assessment: dict[str, Any]) -> list[list[str]]:
 def feasibility_text(effect: dict[str, Any]) -> str:
     """Return whether the CAVs are feasible, and whether human drivers brake hard more often; a dash if unknown."""
     if effect["feasibility"] == FEASIBLE and effect["hard_braking"].mean > 0:
-        return f"{FEASIBLE}, but human drivers brake hard more often"
+        return f"{FEASIBLE}, but human drivers brake hard more often in the mean"
     return effect["feasibility"] or "–"
 
 

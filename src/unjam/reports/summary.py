@@ -78,21 +78,31 @@ def common_baseline(results: Sequence[Results]) -> str:
 def first_alternative(results: Sequence[Results]) -> str:
     """Return the column of human drivers in the first of several folders of users' networks; empty without it.
 
-    Those of the others, on the same seeds, are compared with it: a network with a speed limit with one without, say.
+    Those of the others, on the seeds that both have, are compared with it: a network with a speed limit with one
+    without, say.
     """
-    seeds = {str([row["seed"] for row in result.rows.get(HUMAN_LABEL, [])]) for result in results}
     has_humans = all(HUMAN_LABEL in result.rows and result.trained_label is None for result in results)
     are_networks = all(result.metadata["scenario"].endswith(".sumocfg") for result in results)
-    differs = has_humans and len({str(_episode_keys(result.rows[HUMAN_LABEL])) for result in results}) > 1
-    is_comparison = len(results) > 1 and differs and are_networks and len(seeds) == 1
+    common = common_seeds(results)
+    keys = [_episode_keys(result.rows[HUMAN_LABEL]) for result in results] if has_humans else []
+    episodes = {str([key for key in each if key[0] in common]) for each in keys}
+    is_comparison = len(results) > 1 and are_networks and bool(common) and len(episodes) > 1
     return f"{folder_names(results)[0]}: {HUMAN_LABEL}" if is_comparison else ""
 
 
+def common_seeds(results: Sequence[Results]) -> set[str]:
+    """Return the seeds that human drivers of all folders have."""
+    return set.intersection(*({str(row["seed"]) for row in result.rows.get(HUMAN_LABEL, [])} for result in results))
+
+
 def compare_alternative(column: ReportColumn, first_rows: Sequence[dict[str, Any]]) -> ReportColumn:
-    """Return the column of human drivers on another network, compared with those on the first one."""
+    """Return the column of human drivers on another network, compared with those on the first one on common seeds."""
     label = "human drivers of the first network"
-    (verdict,) = verdicts({label: [*first_rows], column.name: [*column.rows]}, label)
-    return replace(column, baseline_rows=first_rows, verdict=verdict)
+    seeds = [{str(row["seed"]) for row in rows} for rows in (column.rows, first_rows)]
+    common = seeds[0] & seeds[1]
+    own, first = ([row for row in rows if str(row["seed"]) in common] for rows in (column.rows, first_rows))
+    (verdict,) = verdicts({label: first, column.name: own}, label)
+    return replace(column, rows=own, baseline_rows=first, verdict=verdict)
 
 
 def _episode_keys(rows: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
@@ -142,8 +152,9 @@ def mismatch_warning(results: Sequence[Results]) -> str:
     different = [kind for kind, values in kinds.items() if len(set(values)) > 1]
     if (first := first_alternative(results)) and "durations" not in different:
         return (
-            f"Human drivers of these networks are compared with {first}, on the same seeds. Delay is the time lost to "
-            "the speed that is allowed at each moment: a speed limit hides its own cost, so compare travel times."
+            f"Human drivers of these networks are compared with {first}, on the seeds that both have. Delay is the "
+            "time lost to the speed that is allowed at each moment: a speed limit hides its own cost, so compare "
+            "travel times."
         )
     if not different:
         return ""

@@ -250,7 +250,9 @@ def budget_lines(request: AssessmentRequest, budget: EpisodeBudget, stored_episo
     if len(request.options) > 1:
         (option,) = small.options
         question = f"--penetration-rates {option.penetration_rate:g} -d {shlex.quote(option.driver)}"
-        lines.append(f"a smaller question, {question}, needs at least {duration(small.verdict_episodes)}")
+        fewer = small.verdict_episodes  # which of the stored episodes are of this question is not counted
+        text = f"{format_count(fewer, 'episode')}, less those stored" if stored_episodes else duration(fewer)
+        lines.append(f"a smaller question, {question}, needs at least {text}")
     return lines
 
 

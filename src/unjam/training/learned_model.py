@@ -102,12 +102,13 @@ class LearnedModel:
         self._generator.set_state(state.generator_state)
         self._state = state
 
-    def step(self, acceleration: Tensor) -> ModelTransition:
+    def step(self, acceleration: Any) -> ModelTransition:
         """Make one control step under `acceleration` [m/s2], shape (n,), within the limits and the safety filter.
 
         After its collision a row still moves, with the reward zero; `crashed` says whether it had one so far.
         """
         observed, actuators, drawn, is_running, _ = self._state
+        acceleration = torch.as_tensor(acceleration)
         if tuple(acceleration.shape) != tuple(observed.speed.shape):
             raise invalid_value("acceleration: shape", tuple(acceleration.shape), str(tuple(observed.speed.shape)))
         if not bool((is_finite := acceleration.isfinite()).all()):
