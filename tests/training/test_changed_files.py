@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from optuna.distributions import FloatDistribution
@@ -24,7 +25,7 @@ from unjam.worlds.sumo.detectors import DetectorPool
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 DETECTORS = "edge,position,begin,end,flow_veh_per_h,speed\nroad,100,0,30,1800,10\n"
-SHORT = {"horizon": 60}
+SHORT: dict[str, Any] = {"horizon": 60}
 CommandRunner = Callable[[str, Path, Callable[[], None]], object]
 """runs a command on a network with results in a folder, and calls the function while it runs"""
 
