@@ -20,8 +20,6 @@ from unjam_paper.variants import VARIANTS
 PRESETS = {"default": "", "`paper`": "paper", "`paper-exact`": "paper-exact"}
 """presets by their heading; the studies of tables and figures use `paper`"""
 NOT_MEASURED = "not measured"
-LENGTHS, SEEDS_PER_LENGTH = 6, 10
-"""lengths of the ring and test seeds of the studies of feasible driving"""
 
 
 @dataclass(frozen=True)
@@ -86,8 +84,7 @@ def expert_effect() -> str:
     for road, part in parts.items():
         comparison = DriverComparison([*results_part(part).values()])
         paper, default = (comparison.values([label], "return") for label in ("PI (paper)", "PI"))
-        by_length = (paper - default).reshape(-1, LENGTHS, SEEDS_PER_LENGTH).mean((0, 2))
-        by_seed = (paper - default).reshape(-1, LENGTHS, SEEDS_PER_LENGTH).mean((0, 1))
+        by_length, by_seed = ((paper - default).mean(axes) for axes in ((1, 2), (0, 1)))
         lengths = f"({by_length.min():+,.0f} to {by_length.max():+,.0f} by length)"
         texts.append(f"{interval_text(asdict(estimate(by_seed.tolist())), 0, '+,')} {lengths} {road}")
     source = "ten seeds of six lengths, `results/feasible-ring-ideal.json`, `results/feasible-ring.json`"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from tables import results_part
-from verdicts import Finding, compare, judge
+from verdicts import Finding, Values, compare, judge
 
 from unjam.measures.metric_table import estimate_cell
 from unjam.measures.statistics import estimate, estimate_over_trainings
@@ -192,13 +192,25 @@ def _final_loss(name: str, least: float = 0.0, is_above_noise: bool = False) -> 
 
 def _errors(driver: str, statistic: Callable[[pd.Series], pd.Series]) -> Finding:
     """Judge a statistic of the errors of the repeats with and without IDM, by size of the data."""
-    numbers, sizes = list[str](), dict[str, list[str]]()
-    for size, rows in figure_6(driver=driver, split="trajectories", is_long=False).groupby("size"):
-        values = {label: statistic(found["driver_error"]).to_numpy() for label, found in _networks(rows).items()}
+    by_size = figure_6(driver=driver, split="trajectories", is_long=False).groupby("size")
+    return _judge_errors(
+        {
+            f"{100 * size:g} %": {
+                label: statistic(found["driver_error"]).to_numpy() for label, found in _networks(rows).items()
+            }
+            for size, rows in by_size
+        }
+    )
+
+
+def _judge_errors(errors_by_setting: dict[str, Values]) -> Finding:
+    """Judge for each setting whether the errors of the repeats are smaller with IDM."""
+    numbers, settings = list[str](), dict[str, list[str]]()
+    for setting, values in errors_by_setting.items():
         verdict, text = compare(values, "with IDM", larger=False, digits=4, unit="repeats")
-        sizes.setdefault(verdict, []).append(f"{100 * size:g} %")
-        numbers.append(f"{100 * size:g} %: {text}")
-    verdict = "; ".join(f"{verdict} at {', '.join(found)}" for verdict, found in sizes.items())
+        settings.setdefault(verdict, []).append(setting)
+        numbers.append(f"{setting}: {text}")
+    verdict = "; ".join(f"{verdict} at {', '.join(found)}" for verdict, found in settings.items())
     return verdict, f"[m/s²] {'. '.join(numbers)}"
 
 
@@ -206,16 +218,13 @@ def _other_settings() -> Finding:
     """Judge the errors with few data for other splits of the data, and with as many gradient steps as with 30 %."""
     settings = {"split by rows": ("rows", False), "the authors' split": ("released", False)}
     settings["more gradient steps"] = "trajectories", True
-    numbers, verdicts = list[str](), dict[str, list[str]]()
+    found = dict[str, Values]()
     for (what, (split, is_long)), size in product(settings.items(), FEW_DATA):
         networks = _networks(figure_6(driver="other", split=split, is_long=is_long, size=size))
-        values = {label: found["driver_error"].to_numpy() for label, found in networks.items()}
+        values = {label: rows["driver_error"].to_numpy() for label, rows in networks.items()}
         if all(len(each) > 1 for each in values.values()):
-            verdict, text = compare(values, "with IDM", larger=False, digits=4, unit="repeats")
-            verdicts.setdefault(verdict, []).append(f"{100 * size:g} % {what}")
-            numbers.append(f"{100 * size:g} % {what}: {text}")
-    verdict = "; ".join(f"{verdict} at {', '.join(found)}" for verdict, found in verdicts.items())
-    return verdict, f"[m/s²] {'. '.join(numbers)}"
+            found[f"{100 * size:g} % {what}"] = values
+    return _judge_errors(found)
 
 
 def _one_step() -> Finding:

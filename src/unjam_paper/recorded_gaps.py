@@ -18,7 +18,7 @@ from unjam.controller import make_driver
 from unjam.drivers.smooth_acc import SmoothACC
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import METRICS
-from unjam.measures.platoon_metrics import cav_mean_gap
+from unjam.measures.platoon_metrics import cav_mean_gap, fuel_by_power
 from unjam.measures.statistics import estimate
 from unjam.physics.fuel import fuel_rate, kinetic_fuel_rate
 from unjam.worlds.batch.run import run_batches
@@ -54,13 +54,12 @@ GAPS_BUDGET = SearchBudget(generations=14, size=24)
 START_SECONDS = 60.0
 """time in which controllers open their gaps, at the start of each episode"""
 SOURCES_PART = "sources"
-LONG_HEADWAY, PLAIN_ACC = "human driver with a time headway of 2.4 s", "acc, tuned"
 SOURCE_DRIVERS = {
     HUMAN_LABEL: HUMAN_LABEL,
     "smooth-acc, tuned": "unjam:recorded-tuned",
-    PLAIN_ACC: "acc:set_speed=45,time_gap=2.4496,gap_gain=0.0044,speed_gain=0.2017",
+    "acc, tuned": "acc:set_speed=45,time_gap=2.4496,gap_gain=0.0044,speed_gain=0.2017",
     "acc with default gains, 2.4 s": "acc:set_speed=45,time_gap=2.4",
-    LONG_HEADWAY: "idm:desired_speed=45,time_headway=2.4",
+    "human driver with a time headway of 2.4 s": "idm:desired_speed=45,time_headway=2.4",
 }
 SOURCES = {
     "whole": "whole drives [%]",
@@ -118,7 +117,7 @@ def _fuel_sources(episode: Episode) -> dict[str, float]:
     fuel, kinetic = fuel_rate(speeds, accelerations), kinetic_fuel_rate(speeds, accelerations)
     mean = float(speeds.mean())
     return {
-        "whole": float(1000.0 * fuel.sum() / speeds.sum()),
+        "whole": fuel_by_power(episode),
         "later": float(1000.0 * fuel[start:].sum() / speeds[start:].sum()),
         "net": float(1000.0 * (fuel - kinetic).sum() / speeds.sum()),
         "steady": float(1000.0 * fuel_rate(np.array(mean), np.array(0.0)) / mean),

@@ -26,7 +26,7 @@ from unjam.controller.domain import SB3_SUFFIX, control_step_note
 from unjam.controller.file import read_controller
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable, user_code_recipes
-from unjam.drivers.user_driver import DriverLike, as_driver
+from unjam.drivers.user_driver import DriverLike, as_driver, code_hashes
 from unjam.errors import InputError, invalid_value, raise_failure, unknown_name
 from unjam.files import make_folder, sha256_of, sha256_of_file, to_json
 from unjam.manifest import manifest, without_folders
@@ -39,7 +39,6 @@ from unjam.road_family import FAMILY_PREFIX
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.text import format_count, one_line
-from unjam.training.fingerprint import file_hashes
 from unjam.worlds.backend import BackendLike, check_support, open_backend
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.batch.support import unsupported_reason
@@ -103,8 +102,10 @@ def benchmark(
         sha256=_driver_hash(label, first),
         training_steps=_recorded_steps(label) or training_steps,
         manifest={
-            **{**origin, "command": without_folders(origin["command"]), "backend": backend},
-            "backend_sha256": next(iter(file_hashes([str(backend)]).values()), None),
+            **origin,
+            "command": without_folders(origin["command"]),
+            "backend": backend,
+            "backend_sha256": next(iter(code_hashes([str(backend)]).values()), None),
         },
     )
     path, lock = None if out is None else Path(out), nullcontext()

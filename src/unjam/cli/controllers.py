@@ -27,7 +27,7 @@ from unjam.errors import invalid_value
 from unjam.files import check_parent_folder
 from unjam.processes import continue_in_limited_child
 from unjam.scenarios import scenario_from_recipe
-from unjam.training.export import export_controller, measure_test_episode, read_in_car
+from unjam.training.export import export_controller, has_usual_car, measure_test_episode, read_in_car
 
 
 def export_command(
@@ -150,7 +150,7 @@ def _read_with_filter(name: str, settings: dict[str, Any]) -> Controller:
     recipe = controller.manifest.get("scenario")
     if recipe is None:
         raise invalid_value("file", name, "a controller for one road: it selects its controller by the road")
-    is_usual = asdict(scenario_from_recipe({"kind": recipe["kind"]}).actuator) == recipe["actuator"]
+    is_usual = has_usual_car(scenario_from_recipe(recipe))
     if isinstance(controller.driver, FilteredDriver) and is_usual and not settings:
         return controller
     return read_in_car(name, settings)

@@ -18,9 +18,8 @@ SETTLING_SECONDS = 300.0  # time behind a leader with constant speed, before the
 GAIN_TOLERANCE = 0.02  # a vehicle counts as string stable with gains up to one plus this tolerance
 OPERATING_SPEED_RATIOS = (0.5, 1.0, 1.5)  # shares of the mean speed of CAVs on their road
 MIN_OPERATING_SPEED = 1.0  # [m/s]
-MIN_SPEED_SHARE = (
-    0.975  # mean speed as a share of the leader's, below which a vehicle does not follow, but falls behind
-)
+MIN_SPEED_SHARE = 0.975
+"""mean speed as a share of the leader's, below which a vehicle does not follow, but falls behind"""
 MAX_FOLLOWERS = 60  # human drivers behind a CAV
 
 

@@ -6,7 +6,7 @@ Such a file is executed as code: use only files that you trust.
 import inspect
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import RLock
@@ -175,6 +175,12 @@ class FileReference:
             public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
             raise InputError(f"{self.path.name}: has no {self.name!r}; it has: {public}")
         return getattr(module, self.name)
+
+
+def code_hashes(names: Iterable[str]) -> dict[str, str]:
+    """Return the hash of the code of each of the `names` that is `path.py:name`, by path."""
+    codes = (FileReference.parse(name).read_code() for name in names if is_file_reference(name))
+    return {str(code.path): code.sha256 for code in codes}
 
 
 class UserDriver(Driver):

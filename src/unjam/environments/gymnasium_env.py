@@ -56,6 +56,14 @@ class CopyableLock:
         return type(self), ()
 
 
+class CopiedWhole:
+    """An object of which shallow copies are deep: two environments never share a simulation."""
+
+    def __copy__(self) -> Self:
+        """Return an independent copy, as `copy.deepcopy` does."""
+        return deepcopy(self)
+
+
 def synchronized(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
     """Return a method of an environment in which a second thread waits until the first has returned."""
 
@@ -283,7 +291,7 @@ class RoadStepper:
         self._backend_context.close()
 
 
-class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
+class RoadEnv(CopiedWhole, gymnasium.Env[Observations, NDArray[Any]]):
     """One CAV among human drivers, in SUMO or another backend.
 
     ``gymnasium.make("unjam/Ring-v0")``, ``"unjam/FigureEight-v0"``, ``"unjam/Merge-v0"``, ``"unjam/OnRamp-v0"``,
@@ -362,10 +370,6 @@ class RoadEnv(gymnasium.Env[Observations, NDArray[Any]]):
         check_single_cav(self._road.scenario)
         self.observation_space = self._road.observation_space
         self.action_space = self._road.action_space
-
-    def __copy__(self) -> Self:
-        """Return an independent copy, as `copy.deepcopy` does."""
-        return deepcopy(self)
 
     @synchronized
     def reset(self, *, seed: int | None = None, options: ResetOptions = None) -> tuple[Observations, dict[str, Any]]:

@@ -2,18 +2,18 @@
 
 from collections.abc import Iterable, Mapping
 from copy import deepcopy
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
-from unjam.environments.gymnasium_env import ResetOptions, RoadStepper, as_action, synchronized
+from unjam.environments.gymnasium_env import CopiedWhole, ResetOptions, RoadStepper, as_action, synchronized
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import check_integer
 
 
-class RoadAgents(ParallelEnv[str, Any, Any]):
+class RoadAgents(CopiedWhole, ParallelEnv[str, Any, Any]):
     """Agents of a road, each with the spaces of one CAV; nothing is drawn."""
 
     def __init__(self, road: RoadStepper, possible_agents: Iterable[str]) -> None:
@@ -21,10 +21,6 @@ class RoadAgents(ParallelEnv[str, Any, Any]):
         self.possible_agents, self.agents = list(possible_agents), []
         self.observation_spaces = {agent: deepcopy(road.observation_space) for agent in self.possible_agents}
         self.action_spaces = {agent: deepcopy(road.action_space) for agent in self.possible_agents}
-
-    def __copy__(self) -> Self:
-        """Return an independent copy, as `copy.deepcopy` does."""
-        return deepcopy(self)
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Return the observation space of an agent: that of one CAV; raise `InputError` for an unknown agent."""

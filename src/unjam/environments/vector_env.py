@@ -3,10 +3,9 @@
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from copy import deepcopy
 from functools import partial
 from operator import index
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -19,7 +18,7 @@ from unjam.drivers.command import as_numbers
 from unjam.drivers.observation import MAX_OBSERVATION, FeatureLike
 from unjam.drivers.user_driver import DriverLike
 from unjam.environments.external_driver import ExternalDriver
-from unjam.environments.gymnasium_env import RoadStepper, check_single_cav, episode_seed
+from unjam.environments.gymnasium_env import CopiedWhole, RoadStepper, check_single_cav, episode_seed
 from unjam.errors import InputError, MissingPartError, UnjamError, import_optional, invalid_value
 from unjam.measures.metrics import METRICS, RECORDED_ROAD_METRICS
 from unjam.measures.step_metrics import step_metrics
@@ -106,7 +105,7 @@ class Episodes:
         self.observations = replace_entries(self.observations, rows, source.observations, source_rows)
 
 
-class RoadVectorEnv(VectorEnv[Any, Any, Any]):
+class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
     """W environments as `RoadEnv`, simulated together without SUMO.
 
     ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4096)``, with the arguments of `RoadEnv`. Spaces, observations,
@@ -187,10 +186,6 @@ class RoadVectorEnv(VectorEnv[Any, Any, Any]):
         self._motions = deque[Array](maxlen=made.max_episode_steps + 1)
         """motion in the last control steps, on recorded roads alone"""
         self._ended_rows: list[int] = []  # environments whose episode ended in the last step
-
-    def __copy__(self) -> Self:
-        """Return an independent copy, as `copy.deepcopy` does."""
-        return deepcopy(self)
 
     def _unsupported_reason(self, scenario: Scenario) -> str:
         """Return why this class has no environment of a scenario that batches simulate; empty if it has one."""

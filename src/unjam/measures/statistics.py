@@ -125,18 +125,20 @@ def pair_rows(rows: EpisodeRows, others: EpisodeRows) -> list[tuple[dict[str, An
     return [(row, by_seed[str(row["seed"])]) for row in rows if str(row["seed"]) in by_seed]
 
 
-def _independent_units(rows: EpisodeRows, others: EpisodeRows) -> list[Hashable]:
-    """Return the unit of each pair of rows: its recording, or else the pair itself.
+def _group_pairs(rows: EpisodeRows, others: EpisodeRows) -> list[list[tuple[dict[str, Any], dict[str, Any]]]]:
+    """Return the pairs of rows by recording, or else one by one.
 
     Episodes behind one recording differ in the noise of human drivers alone, and count as one.
     """
-    pairs = enumerate(pair_rows(rows, others))
-    return [(row["file"], row["part"]) if "part" in row else number for number, (row, _) in pairs]
+    groups = defaultdict[Hashable, list[tuple[dict[str, Any], dict[str, Any]]]](list)
+    for number, pair in enumerate(pair_rows(rows, others)):
+        groups[(pair[0]["file"], pair[0]["part"]) if "part" in pair[0] else number].append(pair)
+    return [*groups.values()]
 
 
 def count_units(rows: EpisodeRows, others: EpisodeRows) -> int:
     """Return the largest possible count of a paired difference: the number of pairs, or that of their recordings."""
-    return len({*_independent_units(rows, others)})
+    return len(_group_pairs(rows, others))
 
 
 def format_units(rows: EpisodeRows, count: int, noun: str) -> str:
@@ -146,12 +148,11 @@ def format_units(rows: EpisodeRows, count: int, noun: str) -> str:
 
 def _paired_values(rows: EpisodeRows, others: EpisodeRows, name: str) -> Any:
     """Return a metric in both sets of rows, shape (units, 2): means over the pairs of each unit with both values."""
-    values = defaultdict[Hashable, list[list[float]]](list)
-    for unit, pair in zip(_independent_units(rows, others), pair_rows(rows, others), strict=True):
-        both = [metric_value(row, name) for row in pair]
-        if np.isfinite(both).all():
-            values[unit].append(both)
-    return np.array([np.mean(each, axis=0) for each in values.values()], float).reshape(-1, 2)
+    groups = (
+        [both for pair in pairs if np.isfinite(both := [metric_value(row, name) for row in pair]).all()]
+        for pairs in _group_pairs(rows, others)
+    )
+    return np.array([np.mean(values, axis=0) for values in groups if values], float).reshape(-1, 2)
 
 
 def paired_difference(rows: EpisodeRows, others: EpisodeRows, name: str, confidence: float = CONFIDENCE) -> Estimate:

@@ -20,6 +20,7 @@ from unjam.measures.statistics import (
     gain_verdict,
     is_expert_unchanged,
     metric_estimate,
+    pair_rows,
     paired_difference,
 )
 from unjam.measures.verdict import Verdict, is_better, road_metrics, verdicts
@@ -98,9 +99,7 @@ def common_seeds(results: Sequence[Results]) -> set[str]:
 def compare_alternative(column: ReportColumn, first_rows: Sequence[dict[str, Any]]) -> ReportColumn:
     """Return the column of human drivers on another network, compared with those on the first one on common seeds."""
     label = "human drivers of the first network"
-    seeds = [{str(row["seed"]) for row in rows} for rows in (column.rows, first_rows)]
-    common = seeds[0] & seeds[1]
-    own, first = ([row for row in rows if str(row["seed"]) in common] for rows in (column.rows, first_rows))
+    own, first = (list(rows) for rows in zip(*pair_rows(column.rows, first_rows), strict=True))
     (verdict,) = verdicts({label: first, column.name: own}, label)
     return replace(column, rows=own, baseline_rows=first, verdict=verdict)
 

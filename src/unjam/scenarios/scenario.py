@@ -246,6 +246,11 @@ class Scenario(Subclassable):
         return ()
 
     @property
+    def max_leader_speed(self) -> float:
+        """Largest speed of recorded vehicles that others follow [m/s]; 0 without any."""
+        return 0.0
+
+    @property
     def user_files(self) -> list[Path]:
         """Files with data that episodes depend on, apart from the code of a user's class."""
         return [population_file(self.population)] if self.population else []

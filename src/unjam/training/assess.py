@@ -14,7 +14,7 @@ from typing import Any
 
 from unjam.drivers.registry import driver_recipe, is_serializable
 from unjam.errors import NoCavError, raise_failure
-from unjam.files import FileWatch, atomic_write, to_json
+from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import HARD_BRAKING_METRIC
 from unjam.measures.notes import check_baseline, episode_notes
@@ -37,6 +37,7 @@ from unjam.reports.assessment import (
     write_assessment,
 )
 from unjam.scenarios import scenario_recipe
+from unjam.scenarios.file_watch import watch_files
 from unjam.seeds import held_out_seeds
 from unjam.text import format_count, format_duration
 from unjam.training.assessment_request import PLOT_EPISODE_COUNT, AssessmentRequest
@@ -110,7 +111,7 @@ def assess(
             f"{known}: not simulated again for the same controllers, except those of pictures; data that their code "
             "reads is not compared"
         )
-    watch = FileWatch(lambda: request.network.user_files)
+    watch = watch_files([request.network])
     budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
     new_episodes = set[tuple[Option, EpisodeSeed]]()
 

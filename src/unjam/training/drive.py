@@ -27,7 +27,6 @@ from unjam.measures.verdict import metric_frame, short_table_metrics, verdicts
 from unjam.parameters import check_integer
 from unjam.reports.results import to_plot_episode
 from unjam.scenarios import make_scenario, scenario_recipe
-from unjam.scenarios.recorded import Recorded
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import TRAINING_SEED_LIMIT, held_out_seeds
 from unjam.training.evaluate import Evaluation, controller_hashes, evaluate, rows_to_frame, save_evaluation
@@ -159,9 +158,8 @@ def _lacks_acc(driver: Driver, scenario: Scenario) -> bool:
 
 def _set_speed_notes(drivers: Mapping[str, Driver], scenario: Scenario) -> list[str]:
     """Return a note for each driver with a set speed below recorded speeds: it saves fuel by falling behind."""
-    if not isinstance(scenario, Recorded):
-        return []
-    fastest, other = scenario.max_leader_speed, max(scenario.humans.desired_speed, ceil(scenario.max_leader_speed))
+    fastest = scenario.max_leader_speed
+    other = max(scenario.humans.desired_speed, ceil(fastest))
     return [
         f"{name}: its set speed of {speed:g} m/s is below the recorded {fastest:.1f} m/s: name another, as in "
         f"{one.describe().partition(':')[0]}:set_speed={other:g}"

@@ -193,6 +193,11 @@ def read_in_car(source: str, settings: dict[str, Any], scenario: str = "") -> Co
         )
 
 
+def has_usual_car(road: Scenario) -> bool:
+    """Return whether CAVs of a road have the actuator that such roads have by default; true on open roads."""
+    return not road.is_closed or road.actuator == type(road)().actuator
+
+
 def measure_test_episode(controller: Controller) -> dict[str, Any]:
     """Return the metrics of a controller in the first test episode of its own road and car."""
     road = scenario_from_recipe(controller.manifest["scenario"])
@@ -257,10 +262,8 @@ def _read_driver_origin(
         controller = read_controller(file)
         metadata = {name: controller.manifest[name] for name in PROVENANCE_ENTRIES if name in controller.manifest}
         road, driver = _read_scenario(file, metadata.get("scenario")), controller.driver
-        if driver_name.startswith(PACKAGED_PREFIX) and road.is_closed:
-            car = asdict(type(road)().actuator)
-            if car != asdict(road.actuator):  # it was made for a car that obeys at once
-                settings = {"actuator": car, **settings}
+        if driver_name.startswith(PACKAGED_PREFIX) and not has_usual_car(road):
+            settings = {"actuator": asdict(type(road)().actuator), **settings}
         if not settings:
             return road, driver, metadata
         road = make_scenario(road, settings)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from unjam.drivers.registry import driver_recipe
-from unjam.drivers.user_driver import FileReference, is_file_reference
+from unjam.drivers.user_driver import code_hashes
 from unjam.errors import InputError, invalid_value
 from unjam.files import sha256_of, sha256_of_file, to_json
 from unjam.kernels import kernel_info
@@ -98,8 +98,7 @@ def _without_folders(value: Any) -> str:
 
 def file_hashes(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:
     """Return hashes of the code that `names` refer to and of the files of scenarios, by path."""
-    codes = [FileReference.parse(name).read_code() for name in names if is_file_reference(name)]
-    paths, hashes = list[Path](), {str(code.path): code.sha256 for code in codes}
+    paths, hashes = list[Path](), code_hashes(names)
     for scenario in scenarios:
         paths += scenario.user_files
         if code := scenario_recipe(scenario).get(CODE_ENTRY):

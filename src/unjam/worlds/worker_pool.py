@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable
-from unjam.drivers.user_driver import FileReference, is_file_reference
+from unjam.drivers.user_driver import code_hashes
 from unjam.errors import EpisodeError, SumoInputError
 from unjam.parameters import split_parameters
 from unjam.processes import PrivateFolder, check_owner, remove_stale_private_folders
@@ -71,8 +71,7 @@ class EpisodeTask:
     def code_hashes(self) -> dict[str, str]:
         """Return hashes of the files of reward and backend by path; drivers and scenarios have those of their own."""
         reward, _ = split_parameters(str(self.reward or self.scenario.reward))
-        names = (name for name in (reward, str(self.backend)) if is_file_reference(name))
-        return {str(code.path): code.sha256 for code in (FileReference.parse(name).read_code() for name in names)}
+        return code_hashes([reward, str(self.backend)])
 
 
 class WorkerPool(AbstractContextManager["WorkerPool"]):
