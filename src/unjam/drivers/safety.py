@@ -88,8 +88,12 @@ class Actuator(Subclassable):
         z = v + T (a + `braking`) with T = h r / (1 - r), where r is the share of the difference to a command that
         remains after one step of length h. For any command u, one step turns z into z + h u: as without lag.
         """
+        return speed + self.response_time(step) * (state.acceleration + braking)
+
+    def response_time(self, step: float) -> float:
+        """Return T of `equivalent_speed` [s]."""
         decay = self.decay(step)
-        return speed + step * decay / (1.0 - decay) * (state.acceleration + braking)
+        return step * decay / (1.0 - decay)
 
     def decay(self, step: float) -> float:
         """Return the share of the difference to a command that remains after one step."""
@@ -167,8 +171,12 @@ class SafetyFilter(Subclassable):
         """
         if not self.active:
             return acceleration
-        if type(acceleration) is float and actuation is None and self._is_clearly_safe(acceleration, state, step):
-            return acceleration
+        if type(acceleration) is float and actuation is None:
+            speed = next_speed(state.speed, acceleration, step)
+            leader = clamp_min(state.leader_speed - self.speed_error, 0.0)
+            gap = state.gap - (self.gap_error + self.standstill_gap) - step * speed
+            if self._is_clearly_safe(speed, leader, gap, step):
+                return acceleration
         if actuation is not None and (type(acceleration) is float or namespace(acceleration) is np):
             return self._limit_by_plan_if_needed(acceleration, state, step, *actuation)
         return clamp_max(acceleration, self.max_acceleration(state, step, actuation))
@@ -242,10 +250,12 @@ class SafetyFilter(Subclassable):
         leader, commands = clamp_min(leader - self.speed_error, 0.0), clamp_min(acceleration, 0.0)
         for pending in actuator_state.pending:
             commands = commands + clamp_min(pending, 0.0)
-        standing = actuator.equivalent_speed(0.0 * speed, ActuatorState(0.0 * speed), self.braking, step)
-        top = speed + clamp_min(actuator.equivalent_speed(0.0 * speed, actuator_state, self.braking, step), 0.0)
-        top = clamp_min(top, standing) + step * commands
+        response_time = actuator.response_time(step)
+        top = speed + clamp_min(response_time * (actuator_state.acceleration + self.braking), 0.0)
+        top = clamp_min(top, response_time * self.braking) + step * commands
         first = step * (len(actuator_state.pending) + 1) * top
+        if type(acceleration) is float and self._is_clearly_safe(top, leader, gap - first, step):
+            return acceleration
 
         def margin(braking: float, leader_braking: float) -> Array:
             return stopping_distance(leader, leader_braking, step) - first - stopping_distance(top, braking, step)
@@ -268,21 +278,14 @@ class SafetyFilter(Subclassable):
         limited[rows] = np.minimum(limited[rows], self.max_acceleration(near, step, own))
         return limited
 
-    def _is_clearly_safe(self, acceleration: float, state: FollowingState, step: float) -> bool:
-        """Return whether simple bounds prove an acceleration safe; they take a third of the time of the formulas."""
-        speed, leader, gap = state
-        braking, time_gap = self.time_gap_braking, self.time_gap
-        leader, speed = leader - self.speed_error, speed + acceleration * step
-        gap = gap - (self.gap_error + self.standstill_gap)
-        later = leader - braking * step
-        if later < 0.0 or speed < 0.0 or speed - later > time_gap * braking:
-            return False
-        own, others = self.braking, self.leader_braking
-        return (
-            speed * (time_gap + step) <= gap + later * step
-            and speed * (speed / own + step) / 2.0 + own * step * step / 8.0
-            <= gap + leader * (leader / others - step) / 2.0
-        )
+    def _is_clearly_safe(self, speed: float, leader: float, gap: float, step: float) -> bool:
+        """Return whether simple bounds prove that braking from a speed keeps both gaps."""
+        # Stopping distances are at least v (v / b - h) / 2, and at most b h h / 8 more.
+        half, square, leader_square = (leader - speed) * step / 2.0, speed * speed / 2.0, leader * leader / 2.0
+        braking, own, error = self.time_gap_braking, self.braking, step * step / 8.0
+        at_end = leader_square / self.leader_braking - square / own - half - own * error
+        with_time_gap = min((leader_square - square) / braking - half - braking * error, 0.0)
+        return gap + at_end >= 0.0 and gap + with_time_gap >= self.time_gap * speed
 
 
 def _steps_to_standstill(speed: Array, change: float) -> int:
