@@ -122,10 +122,11 @@ class BenchmarkResult:
         return rows + [{**empty, "road": f"mean, {part}", **_interval(self.mean_gain(part))} for part in parts]
 
     def table(self) -> "pd.DataFrame":
-        """Return `road_rows` as a table."""
+        """Return `road_rows` as a table of 80 characters: without back ends and experts."""
         import pandas as pd
 
-        return pd.DataFrame(self.road_rows()).set_index("road")
+        table = pd.DataFrame(self.road_rows()).set_index("road").drop(columns=["backend", "expert"])
+        return table.round({"gain": 2, "low": 2, "high": 2})
 
     def summary(self) -> dict[str, Any]:
         """Return what follows from the rows, as the file has it."""
