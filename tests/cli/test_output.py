@@ -80,11 +80,10 @@ def test_without_a_terminal_output_has_80_columns_or_as_many_as_columns_says(
     assert found.stdout.split() == [str(width)] * 2
 
 
-def test_names_are_printed_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = StringIO()
-    monkeypatch.setattr(output.console, "file", text)
-    output.print_results({"human": rows_of(1.0), "a.py:car:zero: [b]x": rows_of(2.0)}, shows_all=False)
-    assert "a.py:car:zero: [b]x: " in text.getvalue()
+def test_names_are_printed_as_they_are() -> None:
+    with output.console.capture() as text:
+        output.print_results({"human": rows_of(1.0), "a.py:car:zero: [b]x": rows_of(2.0)}, shows_all=False)
+    assert "a.py:car:zero: [b]x: " in text.get()
 
 
 @pytest.mark.parametrize(
