@@ -1,7 +1,6 @@
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
@@ -12,6 +11,7 @@ from typer.testing import CliRunner
 from tests.conftest import random_network
 from tests.training.test_run import STEPS, small_config
 from tests.worlds.sumo.user_networks import straight
+from unjam import benchmark
 from unjam.cli import app
 from unjam.controller import controller_bytes, packaged_file
 from unjam.controller.file import add_certificate, read_controller
@@ -19,6 +19,7 @@ from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
 from unjam.processes import lock_folder
 from unjam.scenarios.population import population_file
+from unjam.training.assessment_request import make_request
 from unjam.training.config import load_config
 from unjam.training.drive import drive
 from unjam.training.export import ControllerStore, export_controller
@@ -261,30 +262,41 @@ def run_with_controllers(folder: Path, *tasks: str) -> Path:
     return folder
 
 
-def evaluate_in_cli(folder: Path) -> None:
-    ran = CliRunner().invoke(app, ["evaluate", str(folder)])
+def run_command(*words: str) -> None:
+    ran = CliRunner().invoke(app, words)
     if isinstance(ran.exception, InputError):
         raise ran.exception
+    pytest.fail(ran.output)
 
 
-@pytest.mark.parametrize("name", ["evaluate", "export", "drive"])
+COMMANDS: dict[str, Callable[[Path], Any]] = {
+    "evaluate": lambda folder: run_command("evaluate", str(folder)),
+    "export": lambda folder: export_controller(folder, folder.parent / "out.unjam"),
+    "drive": lambda folder: drive("ring", ["idm", f"pi+{folder}"]),
+    "assess": lambda folder: make_request(str(straight(folder.parent, FLOW)), [0.1], 20, 0.1, drivers=[str(folder)]),
+    "watch": lambda folder: run_command("watch", "ring", "--driver", str(folder), "--video", str(folder / "a.gif")),
+    "benchmark": lambda folder: benchmark(str(folder)),
+    "certify": lambda folder: run_command("certify", str(folder / "controller.unjam")),
+    "expert": lambda folder: check_config(small_config(expert=str(folder))),
+    "baseline": lambda folder: check_config(small_config(evaluation__baselines=[str(folder)])),
+}
+FLOW = '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>'
+
+
+@pytest.mark.parametrize("name", COMMANDS)
 def test_a_controller_that_is_not_in_the_checkpoint_is_refused_before_anything_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("unjam.worlds.worker_pool.WorkerPool.__init__", lambda *given: pytest.fail("it simulates"))
-    commands: dict[str, Callable[[Path], Any]] = {
-        "evaluate": evaluate_in_cli,
-        "export": partial(export_controller, out=tmp_path / "out.unjam"),
-        "drive": lambda folder: drive("ring", ["idm", f"pi+{folder}"]),
-    }
     folder = run_with_controllers(tmp_path / "run")
     (folder / "controller.unjam").write_bytes(controller(2))
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     with pytest.raises(
         InputError, match=rf"^{name}: '.*controller\.unjam' is not .*; resume with: unjam train --resume"
     ):
-        commands[name](folder)
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+        COMMANDS[name](folder)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert not (tmp_path / "out.unjam").exists()
 
 
 def test_controllers_of_the_checkpoint_are_accepted_also_with_a_certificate(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ from unjam.road_family import FAMILY_PREFIX
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.text import format_count, one_line
+from unjam.training.run_folder import check_controllers
 from unjam.worlds.backend import BackendLike, check_support, open_backend
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.batch.support import unsupported_reason
@@ -89,6 +90,8 @@ def benchmark(
     if not callable(progress):
         raise invalid_value("progress", progress, "a function of a line of text")
     drivers, reasons = _make_drivers(driver, scenarios)
+    if isinstance(driver, str):
+        check_controllers(driver, "benchmark")
     if backend != EXACT_BACKEND:
         with open_backend(backend) as simulator:
             check_support(simulator, *scenarios.values())

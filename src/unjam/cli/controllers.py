@@ -28,6 +28,7 @@ from unjam.files import check_parent_folder
 from unjam.processes import continue_in_limited_child
 from unjam.scenarios import scenario_from_recipe
 from unjam.training.export import export_controller, has_usual_car, measure_test_episode, read_in_car
+from unjam.training.run_folder import check_controller
 
 
 def export_command(
@@ -117,6 +118,7 @@ def certify_command(
         raise invalid_value("set", settings[0], "a packaged controller, or a file of unjam export --set")
     changes = parse_settings(settings)
     controller = _read_with_filter(str(file), changes) if is_packaged else read_controller(file)
+    check_controller(file, "certify")
     file = controller_file(file)
     target = out or (Path(file.name) if is_packaged else file).with_suffix(".html")
     check_parent_folder(target)

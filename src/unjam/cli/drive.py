@@ -24,7 +24,7 @@ from unjam.scenarios.user_network import ACC_SETTINGS
 from unjam.text import format_duration
 from unjam.training.drive import drive
 from unjam.training.evaluate import raise_failures
-from unjam.training.run_folder import lock_new_folder
+from unjam.training.run_folder import check_controllers, lock_new_folder
 from unjam.training.trial_log import REQUEST_FILE
 from unjam.worlds.backend import backend_notes, check_support, open_backend
 from unjam.worlds.episode import run_episode
@@ -138,6 +138,7 @@ def watch_command(
     (name,) = drivers
     road = make_scenario(scenario, opt.merge_settings(changes, opt.parse_settings(settings)))
     driver = make_driver(name, road.control_step)
+    check_controllers(name, "watch")
     output.print_notes(controller_notes(scenario_recipe(road), [name], {}))
     if video is None:
         episode = watch_in_window(road, driver, (seed,), pace)

@@ -11,6 +11,7 @@ from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.scenarios.user_network import ACC_SETTINGS, UserNetwork
 from unjam.text import format_count
+from unjam.training.run_folder import check_controllers
 from unjam.training.selection import (
     ACC_DRIVER,
     HUMAN_BASELINE,
@@ -115,6 +116,8 @@ def make_request(
     changes = {**ACC_SETTINGS, **(options or {}), "penetration_rate": ZERO_PENETRATION_RATE}
     road = cast(UserNetwork, make_scenario(file, changes))
     controllers = {name: make_driver(name, road.control_step) for name in drivers if name != ACC_DRIVER}
+    for name in controllers:
+        check_controllers(name, "assess")
     for name, driver in controllers.items():
         if driver.is_native:
             raise invalid_value("driver", name, "the human baseline is always included")

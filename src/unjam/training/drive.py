@@ -15,7 +15,6 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_names, unique_label
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, invalid_value, unknown_name
-from unjam.file_names import split_names
 from unjam.manifest import manifest
 from unjam.measures.effect import effects_by_driver
 from unjam.measures.feasibility import feasibility_by_driver
@@ -30,7 +29,7 @@ from unjam.scenarios import make_scenario, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import TRAINING_SEED_LIMIT, held_out_seeds
 from unjam.training.evaluate import Evaluation, controller_hashes, evaluate, rows_to_frame, save_evaluation
-from unjam.training.run_folder import check_controller, lock_new_folder
+from unjam.training.run_folder import check_controllers, lock_new_folder
 from unjam.worlds.backend import BackendLike, backend_notes, check_support, open_backend
 from unjam.worlds.checked_world import backend_label
 from unjam.worlds.episode import check_can_drive
@@ -217,8 +216,7 @@ def drive(
     for entry in [driver] if isinstance(driver, str) or not isinstance(driver, Sequence) else driver:
         if isinstance(entry, str):
             drivers[entry] = make_driver(entry, road.control_step)
-            for name in split_names(entry):
-                check_controller(Path(name), "drive")
+            check_controllers(entry, "drive")
         else:
             made = as_driver(entry, road.control_step)
             drivers[unique_label(made, drivers)] = made

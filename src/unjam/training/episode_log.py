@@ -7,7 +7,6 @@ from typing import Any
 
 from safetensors.numpy import save
 
-from unjam import __version__
 from unjam.drivers.driver import Driver
 from unjam.drivers.registry import driver_recipe, is_serializable
 from unjam.errors import InputError, NoCavError
@@ -29,8 +28,7 @@ class EpisodeLog(RowLog):
     def __init__(self, folder: Path, scenario: Scenario) -> None:
         """Begin in a new folder, or resume with the same scenario, files and version; `InputError` for others."""
         request = {"scenario": scenario_recipe(scenario), "files": file_hashes((), scenario)}
-        request |= {"unjam": __version__, "commit": manifest()["commit"]}
-        super().__init__(folder, request, EPISODES_FILE)
+        super().__init__(folder, request | {"commit": manifest()["commit"]}, EPISODES_FILE)
         self._call, self._lock = token_hex(16), Lock()
         self.episodes: dict[tuple[str, tuple[int, ...]], dict[str, Any]] = {}
         """rows by the hash of a setup and the seed"""

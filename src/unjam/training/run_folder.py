@@ -26,6 +26,7 @@ from unjam.drivers.registry import driver_recipe
 from unjam.drivers.requirements import merge_requirements
 from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import DiskError, InputError, invalid_value, resume_hint
+from unjam.file_names import split_names
 from unjam.files import sha256_of, to_json
 from unjam.folders import reject_unsafe_files
 from unjam.manifest import manifest, package_versions
@@ -74,6 +75,7 @@ def check_config(config: RunConfig) -> None:
     for task in config.task_configs().values():
         scenario = task.make_scenario()
         check_policy_inputs(task.policy.inputs, scenario, "policy.inputs")
+        check_controllers(task.expert, "expert")
         expert = task.make_expert()
         check_can_drive(expert, scenario)
         driver_recipe(expert)  # workers build it
@@ -84,6 +86,7 @@ def check_config(config: RunConfig) -> None:
         with open_backend(task.episode_backend) as backend:
             check_support(backend, scenario)
         for name in task.evaluation.baselines:
+            check_controllers(name, "baseline")
             baseline = make_driver(name, scenario.control_step)
             if can_drive(baseline, scenario):
                 check_can_drive(baseline, scenario, f"driver {name}")
@@ -366,11 +369,19 @@ def check_run_files(
         check_file_hashes(stored, current, command)
 
 
+def check_controllers(driver_name: str, command: str) -> None:
+    """Check the folders of runs that the name of a driver has, as `check_controller` does."""
+    for name in split_names(driver_name):
+        check_controller(Path(name), command)
+
+
 def check_controller(folder: Path, command: str) -> None:
     """Raise `InputError` if the controller in the folder of a run or task is not one of the newest checkpoint.
 
-    Other folders, runs without a checkpoint and runs that are being trained are not checked.
+    Other folders, runs without a checkpoint and runs that are being trained are not checked. It may be the path of the
+    controller in the folder.
     """
+    folder = folder.parent if folder.name == CONTROLLER_FILE else folder
     file, parent = folder / CONTROLLER_FILE, folder.absolute().parent
     tasks = [*_task_names(parent)]
     run, index = (parent, tasks.index(folder.absolute().name)) if folder.absolute().name in tasks else (folder, 0)

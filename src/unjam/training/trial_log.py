@@ -8,14 +8,17 @@ from pathlib import Path
 from reprlib import repr as short_repr
 from typing import Any
 
+from unjam import __version__
 from unjam.errors import InputError
 from unjam.files import append_line, atomic_write, read_json_lines, to_json
-from unjam.manifest import manifest
+from unjam.manifest import manifest, package_versions
 from unjam.parameters import flatten_keys
 from unjam.training.run_folder import make_new_folder
 
 REQUEST_FILE, TRIALS_FILE = "request.json", "trials.jsonl"
 FILES_PREFIX = "files."  # of the keys of hashes of files in a flat request
+VERSIONED_PACKAGES = ("eclipse-sumo", "libsumo")
+"""packages whose version, beside that of unjam, all rows of a log must share"""
 
 TrialVerdict = tuple[float | None, str]
 """score and reason; no score if the trial does not count"""
@@ -36,8 +39,13 @@ class RowLog:
     """Rows in the folder of a request, including those of earlier calls."""
 
     def __init__(self, folder: Path, request: dict[str, Any], file_name: str) -> None:
-        """Begin in a new folder, or resume in that of the same request; raise `InputError` for other folders."""
-        request, path, starts = json.loads(to_json(request)), folder / REQUEST_FILE, list[dict[str, Any]]()
+        """Begin in a new folder, or resume in that of the same request; raise `InputError` for other folders.
+
+        Versions of unjam and SUMO are part of the request.
+        """
+        versions = {"unjam": __version__, **{name: package_versions()[name] for name in VERSIONED_PACKAGES}}
+        request, path = json.loads(to_json(request | {"versions": versions})), folder / REQUEST_FILE
+        starts = list[dict[str, Any]]()
         if path.is_file():
             stored = {}
             with suppress(ValueError, RecursionError, OSError):

@@ -1,0 +1,26 @@
+"""Logs resume with equal requests and versions only."""
+
+from pathlib import Path
+
+import pytest
+
+from unjam.errors import InputError
+from unjam.training import trial_log
+from unjam.training.trial_log import VERSIONED_PACKAGES, RowLog
+
+
+@pytest.mark.parametrize("name", ["unjam", *VERSIONED_PACKAGES])
+def test_rows_of_other_versions_are_not_continued(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def open_log() -> RowLog:
+        return RowLog(tmp_path / "log", {"seed": 1}, "rows.jsonl")
+
+    open_log().append({"score": 1.0})
+    assert open_log().rows == [{"score": 1.0}]
+    versions = trial_log.package_versions()
+    if name == "unjam":
+        monkeypatch.setattr(trial_log, "__version__", "0.0")
+    monkeypatch.setattr(trial_log, "package_versions", lambda: versions | {name: "0.0"})
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=rf"made with other settings \(versions.{name}: '.+' there, '0.0' now\)"):
+        open_log()
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
