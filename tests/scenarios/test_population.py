@@ -59,6 +59,8 @@ def damaged(path: Path, **changes: object) -> Path:
         ({"drivers": [{"time_headway": 1.0}]}, "no 'desired_speed'"),
         ({"typical": {"time_headway": -1.0}}, r"population.typical.time_headway: -1.0 is not allowed"),
         ({"limits": [1.0]}, "not a population"),
+        ({"limits": ["-4", 2.0]}, "limits: '-4' is not allowed; allowed: a finite number"),
+        ({"limits": [-4.0, True]}, "limits: True is not allowed"),
         ({"residual": {"file": "../drivers.json", "sha256": "0", "authority": 1.0}}, "hash it names"),
         ({"residual": {"file": "gone.safetensors", "sha256": "0", "authority": 1.0}}, "not a population"),
     ],

@@ -180,8 +180,8 @@ def _read_cached(path: Path, modified_ns: int, size: int) -> Population:
         )
         if not drivers:
             raise InputError(f"population {path.name}: it has no drivers")
-        low, high = (float(limit) for limit in content["limits"])
-        if not (isfinite(low) and isfinite(high) and low < 0.0 < high):
+        low, high = (_as_number(limit, "limits") for limit in content["limits"])
+        if not low < 0.0 < high:
             raise ValueError(f"limits: [{low:g}, {high:g}] are not allowed; allowed: one below and one above 0")
         return Population(
             typical=build_dataclass(IDMParameters, content["typical"], "population.typical"),
@@ -196,6 +196,12 @@ def _read_cached(path: Path, modified_ns: int, size: int) -> Population:
         raise InputError(f"population {path.name}: not a population: {reason}") from None
 
 
+def _as_number(value: Any, name: str) -> float:
+    if type(value) not in (int, float) or not isfinite(value):
+        raise ValueError(f"{name}: {value!r:.60} is not allowed; allowed: a finite number")
+    return float(value)
+
+
 def _read_residual(path: Path, entry: dict[str, Any] | None) -> Network | None:
     if entry is None:
         return None
@@ -207,7 +213,7 @@ def _read_residual(path: Path, entry: dict[str, Any] | None) -> Network | None:
         raise InputError(f"population {path.name}: damaged: {weights_file.name} does not have the hash it names")
     arrays = load(weights)
     layers = ((arrays[f"{index}.weight"], arrays[f"{index}.bias"]) for index in range(len(arrays) // 2))
-    network = Network(tuple(layers), float(entry["authority"]))
+    network = Network(tuple(layers), _as_number(entry["authority"], "authority"))
     if network.input_size != len(RESIDUAL_INPUTS):
         raise InputError(f"population {path.name}: {network.input_size} inputs are not allowed; allowed: 3")
     return network
