@@ -15,6 +15,7 @@ from unjam.environments.slotted_vector_env import SlottedRoadVectorEnv, make_vec
 from unjam.errors import EpisodeError, InputError
 from unjam.measures.metrics import METRICS, mean_travel_time
 from unjam.measures.step_metrics import open_road_metrics, open_road_sums
+from unjam.physics.arrays import Floats
 from unjam.scenarios import make_scenario
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.record import Episode
@@ -146,25 +147,52 @@ def test_with_zero_actions_episodes_are_those_of_the_batch_alone(name: str) -> N
             assert metrics.keys() == {"return", "mean_speed", "travel_time", "insertion_backlog_veh"}
 
 
-@pytest.mark.slow
-def test_episodes_have_the_distribution_of_sumo() -> None:
-    road: Any = {"penetration_rate": 0.3, "expert": "cruise", "horizon": 320, "peak": (60.0, 300.0)}
-    environment = SlottedRoadVectorEnv(8, 4, **road)
-    observations, _ = environment.reset(seed=0)
-    speeds, returns, count = [], np.zeros(8), 8
+SHORT_ROAD: Any = {"penetration_rate": 0.3, "expert": "cruise", "horizon": 320, "peak": (60.0, 300.0)}
+
+
+def drive_short_road(count: int, exact: bool) -> tuple[Floats, Floats]:
+    """The speeds of all CAVs in all steps, and the returns."""
+    environment = SlottedRoadVectorEnv(count, 4, exact=exact, **SHORT_ROAD)
+    environment.reset(seed=0)
+    speeds, returns = [], np.zeros(count)
     for _ in range(320):
-        observations, rewards, *_, info = environment.step(np.zeros((8, 4)))
+        observations, rewards, *_, info = environment.step(np.zeros((count, 4)))
+        assert observations.dtype == np.float32
         speeds.append(observations[info["is_occupied"]][:, 0])
         returns += np.where(info["is_occupied"].any(1), rewards, 0.0)
+    return np.concatenate(speeds), returns
+
+
+def test_all_columns_have_single_precision_if_they_are_not_exact() -> None:
+    fast = SlottedRoadVectorEnv(2, 4, exact=False, **SHORT_ROAD)
+    fast.reset(seed=0)
+    for _ in range(100):
+        fast.step(np.zeros((2, 4)))
+    vehicles = fast._running_episodes.world._traffic.vehicles
+    assert {each.dtype for each in vehicles if each.dtype.kind == "f"} == {np.dtype(np.float32)}, "half of the time"
+
+
+def test_episodes_in_single_precision_are_others_of_the_same_distribution() -> None:
+    (speeds, returns), (others, other_returns) = (drive_short_road(24, exact) for exact in (True, False))
+    assert not np.allclose(returns, other_returns, rtol=1e-3)
+    assert others.mean() == pytest.approx(speeds.mean(), rel=0.03)
+    assert other_returns.mean() == pytest.approx(returns.mean(), rel=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exact", [True, False])
+def test_episodes_have_the_distribution_of_sumo(exact: bool) -> None:
+    count = 8
+    speeds, returns = drive_short_road(count, exact)
     sumo_speeds, sumo_returns = [], np.zeros(count)
-    with closing(unjam.parallel_env("on-ramp", slots=4, **road)) as single:
+    with closing(unjam.parallel_env("on-ramp", slots=4, **SHORT_ROAD)) as single:
         for seed in range(count):
             single.reset(seed=seed)
             while single.agents:
                 found, rewards, *_, infos = single.step(dict.fromkeys(single.agents, 0.0))
                 sumo_speeds += [found[slot][0] for slot in found if infos[slot]["is_occupied"]]
                 sumo_returns[seed] += min(rewards.values())
-    assert np.concatenate(speeds).mean() == pytest.approx(np.mean(sumo_speeds), rel=0.05)
+    assert speeds.mean() == pytest.approx(np.mean(sumo_speeds), rel=0.05)
     assert returns.mean() == pytest.approx(sumo_returns.mean(), rel=0.05)
 
 
@@ -280,7 +308,7 @@ def test_an_episode_without_cavs_is_refused_with_its_environment() -> None:
     ("arguments", "words"),
     [
         ({"slots": 0}, "slots: 0 is not allowed; allowed: an integer >= 1"),
-        ({"exact": False}, "exact: is not an option of motorways"),
+        ({"exact": 1}, "exact: 1 is not allowed; allowed: True or False"),
         ({"device": "cpu"}, "device: is not an option of motorways"),
         ({"backend": "sumo"}, "backend: is not an option of batches"),
         ({"scenario": "ring"}, "ring is not possible in a batch (its vehicles stay: slots are only allowed on"),

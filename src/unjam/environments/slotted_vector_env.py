@@ -85,7 +85,8 @@ class SlottedRoadVectorEnv(RoadVectorEnv):
     """W motorways with S slots each for CAVs that come and go, simulated together without SUMO.
 
     ``gymnasium.make_vec("unjam/OnRamp-v0", num_envs=64, slots=8)``. Slots are those of `SlottedRoadEnv`, seeds and
-    restarts those of `RoadVectorEnv`. Episodes have the same distribution as SUMO's.
+    restarts those of `RoadVectorEnv`. Episodes have the same distribution as SUMO's. With ``exact=False`` the errors of
+    all human drivers come from one generator, and vehicles have single precision.
 
     ============  ==================================================================================================
     Roads         motorways with 1 or 2 lanes and any number of on-ramps; their CAVs are a share of the cars
@@ -115,9 +116,8 @@ class SlottedRoadVectorEnv(RoadVectorEnv):
     ) -> None:
         """Prepare the environments with `slots` on each road; other arguments as of `RoadVectorEnv`."""
         slots = check_integer("slots", slots, 1)
-        for name in ("exact", "device"):
-            if name in changes:
-                raise InputError(f"{name}: is not an option of motorways; they are NumPy's, in double precision")
+        if "device" in changes:
+            raise InputError("device: is not an option of motorways; they are NumPy's")
         self._slots = slots
         super().__init__(num_envs, scenario, reward, expert, features, **changes)
 
@@ -132,7 +132,7 @@ class SlottedRoadVectorEnv(RoadVectorEnv):
         return cast(spaces.Box, batch_space(space, self._slots))
 
     def _make_world(self, kind: type[MotorwayBatch], seeds: list[tuple[int, ...]]) -> MotorwayBatch:
-        return kind(cast(Motorway, self._road.scenario), seeds, keep_record=False)
+        return kind(cast(Motorway, self._road.scenario), seeds, keep_record=False, draw=self._kind.draw)
 
     def _start_episodes(self, rows: list[int]) -> SlottedEpisodes:
         world: MotorwayBatch = self.make_batch(rows)

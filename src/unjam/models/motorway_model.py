@@ -126,7 +126,7 @@ def _speeds_after_step(
     for _ in range(scenario.steps_per_control_step):
         batch.step()
     after = batch.vehicles
-    row = find_rows(vehicle_numbers(vehicles), after)
+    row = find_rows(vehicle_numbers(vehicles), after, np.arange(len(after.road)))
     keeps_lane = (row >= 0) & (after.lane[row] == vehicles.lane)
     return np.where(keeps_lane, after.speed[row], np.nan)
 

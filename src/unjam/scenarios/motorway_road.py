@@ -90,7 +90,7 @@ class MotorwayGeometry(NamedTuple):
     def sections(self, lane: Array, position: Array) -> MotorwaySections:
         """Return the sections of n vehicles with these lanes and positions [m], arrays of shape (n,)."""
         ramps = self.ramps or (RampGeometry(self.length, self.length, 0.0, self.speed_limit),)
-        merge_starts, merge_ends, lengths, limits = np.array(ramps).T
+        merge_starts, merge_ends, lengths, limits = np.array(ramps, position.dtype).T
         # A vehicle that stands at the end of an acceleration lane is not yet on the next ramp.
         begins = merge_starts[1:] - lengths[1:] + self.vehicle_length
         ramp = (position[:, None] >= np.where(lane[:, None] == 0, begins, merge_ends[:-1])).sum(1)

@@ -106,7 +106,7 @@ def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: N
         torch.set_num_threads(1)
         driver = make_benchmark_driver(SCENARIOS["ring"].control_step)
         batches = {vehicles: start_batch(BATCH_VEHICLES // vehicles, vehicles, driver) for vehicles in RING_SIZES}
-        motorways = motorway_rates(MOTORWAYS)
+        motorways = [motorway_rates(MOTORWAYS, is_exact) for is_exact in (False, True)]
         vectors = list(itertools.starmap(VectorBenchmark, VECTOR_ENVIRONMENTS))
         with Simulation() as simulation:  # writes network files and fills caches
             episode, *_ = [_run_episode(SCENARIOS[name], 0, simulation) for name in BENCHMARK_SCENARIOS]
@@ -115,7 +115,7 @@ def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: N
             on_message(f"round {number} of {rounds}")
             vector_rates = itertools.chain.from_iterable(vector.measure() for vector in vectors)
             sumo_rates = _measure_round(number, driver, episode, batches)
-            for part, rate in itertools.chain(sumo_rates, vector_rates, itertools.islice(motorways, 1)):
+            for part, rate in itertools.chain(sumo_rates, vector_rates, map(next, motorways)):
                 rates[part].append(rate)
     finally:
         if cores is not None:
@@ -191,9 +191,9 @@ class VectorBenchmark:
         return _repetition_rate(step, STEPS_PER_ROUND, self.rings)
 
 
-def motorway_rates(roads: int) -> Iterator[tuple[Part, float]]:
+def motorway_rates(roads: int, is_exact: bool) -> Iterator[tuple[Part, float]]:
     """Yield the speed of a vector environment of busy on-ramps, in roads times steps per second, again and again."""
-    environment = SlottedRoadVectorEnv(roads, **BUSY_ON_RAMP)
+    environment = SlottedRoadVectorEnv(roads, exact=is_exact, **BUSY_ON_RAMP)
     environment.reset(seed=0)
     actions = np.zeros((roads, BUSY_ON_RAMP["slots"]), np.float32)
 
@@ -201,7 +201,7 @@ def motorway_rates(roads: int) -> Iterator[tuple[Part, float]]:
     _repetition_rate(step, FILLING_STEPS)
     while True:
         rate = _repetition_rate(step, MOTORWAY_STEPS, roads)
-        yield Part(f"vector environment of {roads:,} on-ramps", SLOTS_PART), rate
+        yield Part(f"vector environment of {roads:,} on-ramps{', exact' * is_exact}", SLOTS_PART), rate
 
 
 def _slots_rate(seed: int, simulation: Simulation) -> float:

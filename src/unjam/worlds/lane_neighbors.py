@@ -28,7 +28,12 @@ def find_neighbors(road: Array, lane: Array, lane_count: int) -> LaneNeighbors:
         distances = np.diff(np.concatenate([[-1], rows, [count]]))
         leaders[:] = np.concatenate([[NO_VEHICLE], rows]).repeat(distances)[:-1]
         followers[:] = np.concatenate([rows, [NO_VEHICLE]]).repeat(distances)[1:]
-    return LaneNeighbors(*np.where((found >= 0) & (road[found] == road), found, NO_VEHICLE))
+    vehicles_of_roads = np.bincount(road)
+    ends = vehicles_of_roads.cumsum()  # rows behind the last vehicle of each road
+    end, start = ends.repeat(vehicles_of_roads), (ends - vehicles_of_roads).repeat(vehicles_of_roads)
+    leaders, followers = found
+    is_leader, is_follower = leaders >= start, followers < end
+    return LaneNeighbors(np.where(is_leader, leaders, NO_VEHICLE), np.where(is_follower, followers, NO_VEHICLE))
 
 
 def find_road_neighbors(road: Array, lane: Array, position: Array, geometry: MotorwayGeometry) -> LaneNeighbors:
@@ -52,7 +57,7 @@ def find_unsorted_neighbors(lane: Array, position: Array, geometry: MotorwayGeom
 def neighbors_on_lane(neighbors: Array, lane: Array) -> Array:
     """Return each vehicle's neighbor on a lane given for each; `NO_VEHICLE` for lanes that do not exist."""
     lane_count, count = neighbors.shape
-    found = neighbors[clamp_max(clamp_min(lane, 0), lane_count - 1), np.arange(count)]
+    found = neighbors.take(clamp_max(clamp_min(lane, 0), lane_count - 1) * count + np.arange(count))
     return np.where((lane >= 0) & (lane < lane_count), found, NO_VEHICLE)
 
 

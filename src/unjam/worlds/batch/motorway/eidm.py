@@ -197,7 +197,7 @@ def finalize_eidm_speed(
     is_rolling = speed > 2.0 * CLUTCH_ENGAGE_SPEED
     change, previous_change = desired - speed, acceleration * step
     jerk = MAX_JERK * step * step
-    faster = np.where(MAX_JERK * step + acceleration < 0.0, 2.0 * jerk, jerk)
+    faster = np.where(MAX_JERK * step + acceleration < 0.0, 2.0 * jerk, jerk + 0.0 * speed)
     faster = np.minimum(change, previous_change + faster)
     slower = np.minimum(highest - speed, np.maximum(change, previous_change - jerk))
     up = (change > 0.0) & is_rolling & (start_time + START_UP_DURATION + EIDM_EPSILON < end_time)

@@ -114,7 +114,8 @@ def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: f
     vehicles, wants_change = _speed_gain_changes(vehicles, context, geometry, ~is_urgent & has_target)
     helps = is_asked & (vehicles.lane > 0) & (context.target_lane > vehicles.lane)
     changes = (is_urgent | wants_change | helps) & is_clear
-    bias = np.where(helps & ~is_clear, np.where(context.is_leader_blocking, -1.0, 1.0), vehicles.speed_bias)
+    helping_bias = np.where(context.is_leader_blocking, -1.0, 0.0 * speed + 1.0)
+    bias = np.where(helps & ~is_clear, helping_bias, vehicles.speed_bias)
     vehicles = vehicles._replace(speed_bias=bias)
     changes = changes & ~_has_change_conflict(vehicles, changes, geometry)
     initial = dict.fromkeys(("speed_gain", "keep_right", "look_ahead_speed", "speed_bias"), 0.0)
@@ -131,7 +132,8 @@ def mandatory_lane_changes(
     occupies = (vehicles.lane == 1) & (position >= geometry.origin)  # those ahead of vehicles that merge
     lengths = np.where(occupies, vehicles.minimum_gap + geometry.vehicle_length, 0.0 * position)
     total = lengths.cumsum(0)
-    first = np.searchsorted(vehicles.road, vehicles.road)
+    counts = np.bincount(vehicles.road)
+    first = (counts.cumsum() - counts)[vehicles.road]
     occupied = total - np.where(first > 0, total[first - 1], 0.0 * position)
     needed = vehicles.look_ahead_speed * (MERGE_LOOK_AHEAD_TIME * LEFT_LOOK_AHEAD_FACTOR)
     needed = needed + 2.0 * (vehicles.minimum_gap + geometry.vehicle_length)
@@ -250,7 +252,9 @@ def _yield_to_stuck(
     crawls = (vehicles.lane == 1) & sections.is_merging & (speed < vehicles.braking)
     if not bool(crawls.any()):
         return vehicles
-    index = np.searchsorted(stuck_rows, np.arange(len(position))) - 1
+    is_stuck = np.zeros(len(position), np.intp)
+    is_stuck[stuck_rows] = 1
+    index = is_stuck.cumsum() - is_stuck - 1  # of the next stuck vehicle ahead
     stuck = stuck_rows[clamp_min(index, 0)]
     gap = position[stuck] - geometry.vehicle_length - position - vehicles.minimum_gap
     yields = crawls & (index >= 0) & (vehicles.road[stuck] == vehicles.road) & (gap > SUMO_POSITION_TOLERANCE)
@@ -313,7 +317,7 @@ def _speed_gain_changes(
     # To the right.
     right = may_change & (context.target_lane < vehicles.lane)
     is_slower = here - RIGHT_SPEED_TOLERANCE > there
-    decay = np.where(right & is_slower & (gain < 0.0), 0.5**step, 1.0)
+    decay = np.where(right & is_slower & (gain < 0.0), 0.5**step, 0.0 * gain + 1.0)
     is_suitable = right & ~is_slower
     is_counted = is_suitable & ((gain < 0.0) | (relative > 0.0))
     gain = gain * decay - np.where(is_counted, step * relative, 0.0 * gain)
@@ -334,7 +338,7 @@ def _speed_gain_changes(
     wants_change = keeps_right | (right & (gain < -RIGHT_GAIN_THRESHOLD) & continues)
     # To the left.
     left = may_change & is_left
-    decay = np.where(here > there, 0.5**step, 0.8**step)
+    decay = np.where(here > there, 0.5**step, 0.0 * gain + 0.8**step)
     gain = np.where(left & (here >= there) & (gain > 0.0), gain * decay, gain)
     gain = gain + np.where(left & (here < there), step * relative, 0.0 * gain)
     gains = (gain > LEFT_GAIN_THRESHOLD) & ((relative > 1e-3) | must_brake_soon) & continues

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Self
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from unjam.physics.arrays import Array, clamp_min, replace_padded_rows
 from unjam.scenarios.motorway_road import MAIN_ROUTE, MotorwayRoad
@@ -152,10 +153,11 @@ class BatchMotorways:
         draw: DrawNormal,
         correction: LearnedCorrection | None = None,
         steps_per_control_step: int = 1,
+        precision: DTypeLike = np.float64,
     ) -> None:
         self._correction, self._steps_per_control_step = correction, steps_per_control_step
         self.geometry = roads[0].geometry
-        columns = dict.fromkeys(MotorwayVehicles._fields, np.zeros(0)) | {"is_eidm": np.zeros(0, bool)}
+        columns = dict.fromkeys(MotorwayVehicles._fields, np.zeros(0, precision)) | {"is_eidm": np.zeros(0, bool)}
         columns |= dict.fromkeys(("road", "entry", "lane"), np.zeros(0, np.int64))
         self.vehicles, self.time = MotorwayVehicles(**columns), 0.0
         self._cached_neighbors: tuple[Array, LaneNeighbors] | None = None

@@ -178,19 +178,19 @@ def _idm_stop_speed(speed: Array, distance: Array, parameters: IDMArrays, step: 
     return _idm_follow_speed(speed, distance, 0.0 * speed, near, step) * (distance >= MIN_IDM_STOP_DISTANCE)
 
 
-def vehicle_numbers(vehicles: MotorwayVehicles) -> Array:
-    """Return road and entry of each vehicle as one number."""
-    return vehicles.road * NUMBERS_PER_ROAD + vehicles.entry
+def vehicle_numbers(vehicles: MotorwayVehicles, rows: Any = slice(None)) -> Array:
+    """Return road and entry of vehicles as one number, by default of all."""
+    return vehicles.road[rows] * NUMBERS_PER_ROAD + vehicles.entry[rows]
 
 
-def find_rows(numbers: Array, vehicles: MotorwayVehicles) -> Array:
-    """Return the rows of the vehicles with these numbers; `NO_VEHICLE` for those that are not on a road."""
-    own = vehicle_numbers(vehicles)
-    if not len(own):
+def find_rows(numbers: Array, vehicles: MotorwayVehicles, candidates: Array) -> Array:
+    """Return the rows of the vehicles with these numbers among rows; `NO_VEHICLE` for those that are not there."""
+    if not len(candidates):
         return 0 * numbers + NO_VEHICLE
+    own = vehicle_numbers(vehicles, candidates)
     order = own.argsort()
-    rows = order[np.searchsorted(own[order], numbers).clip(0, len(own) - 1)]
-    return np.where(own[rows] == numbers, rows, NO_VEHICLE)
+    found = order[np.searchsorted(own[order], numbers).clip(0, len(own) - 1)]
+    return np.where(own[found] == numbers, candidates[found], NO_VEHICLE)
 
 
 def sorted_rows(vehicles: MotorwayVehicles) -> Array:

@@ -18,7 +18,7 @@ from unjam.worlds.batch.human_idm import CONTACT_GAP
 from unjam.worlds.batch.motorway.record import NO_END_STEP, MotorwayLog
 from unjam.worlds.batch.motorway.traffic import NO_SPEED_CAP, BatchMotorways, LearnedCorrection, enable_acc
 from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, find_rows, vehicle_numbers
-from unjam.worlds.batch.noise import ArrayFactory
+from unjam.worlds.batch.noise import ArrayFactory, DrawNormal
 from unjam.worlds.lane_neighbors import neighbors_on_lane, observe_lane
 from unjam.worlds.record import Episode
 from unjam.worlds.reward import Outcome, time_gap
@@ -52,8 +52,12 @@ class MotorwayBatch:
         explore: Sequence[float] | None = None,
         replay: ReplayOptions | None = None,
         keep_record: bool = True,
+        draw: DrawNormal | None = None,
     ) -> None:
-        """Take empty roads, one for each seed; whole episodes take 10 MB a road and 1,000 control steps."""
+        """Take empty roads, one for each seed; whole episodes take 10 MB a road and 1,000 control steps.
+
+        With `draw`, all roads share this noise of the drivers, and vehicles have single precision.
+        """
         self._exploration_scales = np.ones(len(seeds)) if explore is None else np.array(explore)
         self.scenario, self._seeds, self._replay, self._keep_record = scenario, seeds, replay, keep_record
         drawn = [scenario.draw_from_seed(seed) for seed in seeds]
@@ -62,7 +66,9 @@ class MotorwayBatch:
         self._human_generators, self._exploration_generators = (
             [np.random.default_rng(seed) for seed in each] for each in zip(*generator_seeds, strict=True)
         )
-        settings = replay and replay.correction, scenario.steps_per_control_step
+        self._draw = draw
+        precision = np.float64 if draw is None else np.float32
+        settings = replay and replay.correction, scenario.steps_per_control_step, precision
         self._traffic = BatchMotorways(self.roads, scenario.simulation_step, self._draw_errors, *settings)
         self._is_cav = np.zeros((len(seeds), max(len(road.entries) for road in self.roads)), bool)
         for number, road in enumerate(self.roads):
@@ -86,9 +92,11 @@ class MotorwayBatch:
         self._log = MotorwayLog(self.roads, scenario)
 
     def _draw_errors(self, shape: tuple[int, ...]) -> Floats:
-        """Return noise for the errors of all drivers in this step, which each road draws itself."""
+        """Return noise for the errors of all drivers in this step, which each road draws itself without `draw`."""
         if self._replay is not None and not self._replay.has_driver_errors:
             return np.zeros(shape)
+        if self._draw is not None:
+            return self._draw(shape)
         counts = np.bincount(self._traffic.vehicles.road, minlength=len(self.roads)).tolist()
         pairs = zip(self._human_generators, counts, strict=True)
         return np.concatenate([generator.standard_normal((shape[0], count)) for generator, count in pairs], 1)
@@ -180,11 +188,16 @@ class MotorwayBatch:
                 continue
             vehicles = traffic.vehicles
             leader_rows = neighbors_on_lane(traffic.neighbors.leaders, vehicles.lane)
-            cav_rows = find_rows(self._cav_numbers, vehicles)
+            cav_rows = self._cav_rows()
             cav_rows = cav_rows[(cav_rows >= 0) & self._is_controlled]
             self._log.record_step(vehicles, leader_rows, arrived, cav_rows)
         self.control_steps += 1
         self._update_cavs()
+
+    def _cav_rows(self) -> NDArray[np.intp]:
+        """Return the rows of the CAVs among the vehicles; `NO_VEHICLE` for those that have left."""
+        vehicles = self._traffic.vehicles
+        return find_rows(self._cav_numbers, vehicles, np.flatnonzero(self._is_cav[vehicles.road, vehicles.entry]))
 
     def _set_time_gaps(self, command: Command | None) -> None:
         """Set the time gaps of the CAVs' ACCs from the first command of one on, by default that of the scenario."""
@@ -192,13 +205,13 @@ class MotorwayBatch:
         if self._has_time_gap_commands:
             names = [str(number) for number in self._cav_numbers]
             time_gaps = commanded_time_gaps(command, self.scenario.cruise.time_gap, names, self.control_steps)
-            rows = find_rows(self._cav_numbers, self._traffic.vehicles)
+            rows = self._cav_rows()
             self._traffic.vehicles = self._traffic.vehicles.replace_rows(rows, time_headway=time_gaps)
 
     def _apply_set_speeds(self, accelerations: Floats) -> None:
         """Set the set speed of each CAV's ACC; it has no cap in a merging section."""
         vehicles, geometry, step = self._traffic.vehicles, self._traffic.geometry, self.scenario.simulation_step
-        rows = find_rows(self._cav_numbers, vehicles)
+        rows = self._cav_rows()
         is_present = rows >= 0
         rows, accelerations = rows[is_present], accelerations[is_present]
         speed = vehicles.speed[rows]
@@ -211,12 +224,11 @@ class MotorwayBatch:
     def _update_cavs(self) -> None:
         """Record the vehicles after a control step, and take control of the CAVs that have entered."""
         traffic, vehicles = self._traffic, self._traffic.vehicles
-        remains, numbers = find_rows(self._cav_numbers, vehicles) >= 0, vehicle_numbers(vehicles)
-        cav_rows = np.flatnonzero(self._is_cav[vehicles.road, vehicles.entry])
-        new = cav_rows[~np.isin(numbers[cav_rows], self._cav_numbers)]
-        new = new[np.argsort(numbers[new], kind="stable")]
+        remains, cav_rows = self._cav_rows() >= 0, np.flatnonzero(self._is_cav[vehicles.road, vehicles.entry])
+        new = cav_rows[~np.isin(vehicle_numbers(vehicles, cav_rows), self._cav_numbers)]
+        new = new[np.argsort(vehicle_numbers(vehicles, new), kind="stable")]
         self.remaining_rows = np.flatnonzero(remains).tolist() if len(new) or not remains.all() else None
-        self._cav_numbers = np.concatenate([self._cav_numbers[remains], numbers[new]])
+        self._cav_numbers = np.concatenate([self._cav_numbers[remains], vehicle_numbers(vehicles, new)])
         self.entered_count, self.cav_count = self.entered_count + len(new), len(self._cav_numbers)
         if self._is_controlled and len(new):
             vehicles = traffic.vehicles = enable_acc(vehicles, new, self.scenario.cruise)
@@ -236,7 +248,7 @@ class MotorwayBatch:
 
     def _exact_state(self) -> LocalState:
         traffic, vehicles = self._traffic, self._traffic.vehicles
-        rows, geometry = find_rows(self._cav_numbers, vehicles), traffic.geometry
+        rows, geometry = self._cav_rows(), traffic.geometry
         roads, _, lane, position, speed = (each[rows] for each in vehicles[:5])
         motion = vehicles.position, vehicles.speed, np.broadcast_to(geometry.vehicle_length, vehicles.speed.shape)
         own, left, right = (observe_lane(traffic.neighbors, rows, lane + each, *motion) for each in (0, 1, -1))
