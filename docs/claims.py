@@ -23,7 +23,7 @@ from verdicts import HELD, INCONSISTENT, NOT_HELD, UNDECIDED, Finding, Values, c
 from unjam.files import atomic_write
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.metric_table import HUMAN_LABEL
-from unjam.measures.statistics import Estimate, estimate_over_trainings
+from unjam.measures.statistics import Estimate, estimate_over_trainings, linearized_ratio
 from unjam_paper.comparison import PAPER_RESULTS
 from unjam_paper.study import NO_VALUE_TEXT, UNFILTERED_ROADS, interval_text
 from unjam_paper.variants import VARIANTS
@@ -48,8 +48,9 @@ corrected for their number, and many share trainings: Tables 1 and 2 and Figures
 of the method, and the rows with ten trainings contain them. Numbers are means over trainings, in Figure 5 and rows on
 collisions interquartile means, as in [tables and figures](docs/results.md).
 
-The paper's method without the safety filter, in short (95 % intervals over trainings). On ring and figure eight the
-result is another one with the last checkpoint, and with `paper-exact`, which has more steps and other settings:
+The paper's method without the safety filter, in short (95 % intervals over trainings). The verdict on the difference to
+TRPO is another one on the figure eight with the last checkpoint, and on all three roads with `paper-exact`, which has
+more steps and other settings:
 
 SHORT_ANSWER
 
@@ -62,14 +63,19 @@ with at most 6 m/s²). Verdicts are about trainings without it. Merges have no f
 - *Undecided*: the interval includes zero. Brackets have an interval, parentheses the range where there is none: of two
   values, of differences in two groups, and of differences with both signs where what is compared forms two groups.
 - *By the expert*: PI, its expert, which the paper does not evaluate alone, has at least 90 % of the difference without
-  learning, or the method is not shown to be better than PI (in Figure 5 also with a time constant of 3 s); in
+  learning, with the paper's time constant or with 3 s, or the method is not shown to be better than both; in
   validation, not better than at first, where its residual is nearly zero, or no training becomes better than PI.
 - *In training alone*: a return rises while exploration decreases, which is not shown in validation. That it rises
   faster than with other learners is not tested.
 - Values are *similar* where the interval of the difference lies within 10 % of the value. Percentages of training time
   and of Figure 9 hold if the cost is at most, or the gain at least, as large. Of other percentages the sign is judged.
-- *Convergence*: environment steps to 0.9 of TRPO's final return, in blocks of five points of the learning curve; all
-  steps if never. *Stable*: mean change of the return between points of the learning curve, in its second half.
+- *Convergence*: environment steps to 0.9 of TRPO's final return, in blocks of five points of the learning curve, 15,000
+  steps, by which intervals are widened at both ends; all steps if never. *Stable*: mean change of the return between
+  points of the learning curve, in its second half.
+- Rules without an interval: collisions are *rare* with fewer than 0.05 vehicles in an episode with each learner, *by
+  construction* if no other driver of the table collides either, since SUMO brakes; A2 holds if all trainings are within
+  5 % of the best one; a bound that is hundreds of times what it bounds *says nothing*; a percentage is *inconsistent* if
+  the paper's Table 1 has no such return. *Similar* is not held where the interval lies beyond 10 %.
 
 Numbers of verdicts:
 
@@ -93,6 +99,8 @@ BY_EXPLORATION = ", in training alone"
 CAUSES = BY_EXPERT, BY_CONSTRUCTION, SAYS_NOTHING, BY_EXPLORATION
 KINDS = (HELD, *(f"{HELD}{cause}" for cause in CAUSES), NOT_HELD, UNDECIDED, INCONSISTENT, NOT_MEASURED)
 """kinds of verdicts in the summary"""
+A1_EXPERT = "expert alone"
+"""row of the expert without a network in the study of A1"""
 RARE = 0.05
 """vehicles that collide in an episode, below which collisions are rare"""
 PAPER_ROADS = ("ring", "figure-eight", "merge")
@@ -240,25 +248,30 @@ def larger_return(study: str, road: str, variant: str, *others: str) -> Assessme
             return verdict, f"return on test seeds: {numbers}"
         gain = difference_to_expert(rows, variant, EXPERT)
         numbers = f"{numbers}; {list_values({EXPERT: rows[EXPERT]['return']['mean']})}"
+        gains = [gain, smooth_gain := difference_to_expert(rows, variant, SMOOTH_EXPERT)]
         if kept := rows[variant]["untrained_count"]:
             numbers += f", which {kept} of {rows[variant]['trainings']} trainings kept"
         numbers += f"; difference to it {interval_text(gain, 0, '+,')}"
-        gain = difference_to_expert(rows, variant, SMOOTH_EXPERT)
         smooth = list_values({SMOOTH_LABEL: rows[SMOOTH_EXPERT]["return"]["mean"]})
-        numbers += f"; {smooth}, difference {interval_text(gain, 0, '+,')}"
+        numbers += f"; {smooth}, difference {interval_text(smooth_gain, 0, '+,')}"
         if best := best_feasible(rows):
             numbers += f"; best feasible driver of the table without learning: {list_values(best)}"
         if verdict.startswith(HELD):
             means = {label: float(each.mean()) for label, each in returns.items()}
             own, best = means.pop(label_of(variant)), max(means.values())
-            share = (rows[EXPERT]["return"]["mean"] - best) / (own - best)
-            is_beyond = judge([Estimate(**gain)]) == HELD
-            numbers += f"; PI has {100 * share:.0f} % of the difference to the others" if share > 0 else ""
-            if share >= EXPERT_SHARE or not is_beyond:
+            shares = [(each - best) / (own - best) for each in expert_returns(rows)]
+            is_beyond = judge([Estimate(**each) for each in gains]) == HELD
+            numbers += f"; PI has {100 * shares[0]:.0f} % of the difference to the others" if shares[0] > 0 else ""
+            if max(shares) >= EXPERT_SHARE or not is_beyond:
                 verdict += BY_EXPERT
         return verdict, f"return on test seeds: {numbers}{feasible_trainings(rows, (variant, *others))}"
 
     return judge_returns
+
+
+def expert_returns(rows: dict[str, dict[str, Any]]) -> list[float]:
+    """Return the returns of PI without learning, with the time constant of the paper and with 3 s."""
+    return [rows[each]["return"]["mean"] for each in (EXPERT, SMOOTH_EXPERT)]
 
 
 def best_feasible(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
@@ -299,10 +312,15 @@ def curve_extreme(
         key = PAPER_QUANTITIES.get(quantity)
         if key is None or not verdict.startswith(HELD):
             return verdict, f"{what}: {numbers}"
-        expert = version.rows(study, road)[EXPERT]["paper_convention"][key]["mean"]
-        gain = estimate_over_trainings((values[label_of(variants[0])] - expert).tolist())
-        alone = "" if judge([gain], larger) == HELD else BY_EXPERT
-        return f"{verdict}{alone}", f"{what}: {numbers}; {list_values({EXPERT: expert}, digits)}"
+        rows = version.rows(study, road)
+        experts = {
+            label: rows[each]["paper_convention"][key]["mean"]
+            for label, each in ((EXPERT, EXPERT), (SMOOTH_LABEL, SMOOTH_EXPERT))
+        }
+        own = values[label_of(variants[0])]
+        gains = [estimate_over_trainings((own - each).tolist()) for each in experts.values()]
+        alone = "" if judge(gains, larger) == HELD else BY_EXPERT
+        return f"{verdict}{alone}", f"{what}: {numbers}; {list_values(experts, digits)}"
 
     return judge_means
 
@@ -452,10 +470,12 @@ def stated_gain(learner: str, percent: float) -> Assessment:
 
     def judge_gain(version: Version) -> Finding:
         without, within = version.returns("figure-9", "ring", (learner, f"proposed-{learner}")).values()
-        gain = estimate_over_trainings((100 * (within - without) / without.mean()).tolist())
+        gain = estimate_over_trainings((100 * linearized_ratio(within - without, without)).tolist())
         beyond = replace(gain, mean=gain.mean - percent, low=gain.low - percent, high=gain.high - percent)
         expert = version.rows("figure-9", "ring")[EXPERT]["return"]["mean"] / without.mean() - 1
         numbers = f"on test seeds {interval_text(asdict(gain), 0, '+')} %, with PI alone {100 * expert:+.0f} %"
+        if judge([estimate_over_trainings(without.tolist())]) != HELD:
+            numbers = f"on test seeds no percentage: the return alone, {without.mean():,.0f}, is not shown to be above 0"
         text = f"{stated:,.0f} × {1 + percent / 100:.2f} = {goal:,.0f}"
         if goal > largest:
             return INCONSISTENT, f"{text}, which its Table 1 does not have; {numbers}"
@@ -471,9 +491,9 @@ def lower_return(study: str, road: str, variant: str, other: str) -> Assessment:
         returns = version.returns(study, road, (variant, other))
         verdict, numbers = compare(returns, label_of(variant), larger=False)
         own, reference = (float(each.mean()) for each in returns.values())
-        expert = version.rows(study, road)[EXPERT]["return"]["mean"]
+        expert, smooth = expert_returns(version.rows(study, road))
         is_expert = other.startswith("proposed") and verdict.startswith(HELD)
-        if is_expert and (expert - own) / (reference - own) >= EXPERT_SHARE:
+        if is_expert and (max(expert, smooth) - own) / (reference - own) >= EXPERT_SHARE:
             verdict += BY_EXPERT
         share = 100 * (own / reference - 1)
         return verdict, f"return on test seeds: {numbers} ({share:+.0f} %); {list_values({EXPERT: expert})}"
@@ -584,27 +604,33 @@ def better_start(road: str) -> Assessment:
         }
         verdict, numbers = compare(values, "expert + random", unit="random networks")
         better = values["expert + random"] > values["random"]
-        return verdict, f"return before training: {numbers}, larger in {better.sum()} of {len(better)}"
+        expert = next(row["mean"] for row in rows if row["road"] == road_name and row["policy"] == A1_EXPERT)
+        own, other = (float(each.mean()) for each in (values["expert + random"], values["random"]))
+        gain = estimate_over_trainings((values["expert + random"] - expert).tolist())
+        if verdict.startswith(HELD) and ((expert - other) / (own - other) >= EXPERT_SHARE or judge([gain]) != HELD):
+            verdict += BY_EXPERT
+        numbers = f"{numbers}, larger in {better.sum()} of {len(better)}; {list_values({EXPERT: expert})}"
+        return verdict, f"return before training: {numbers}"
 
     return judge_untrained
 
 
-def near_best(quantity: str) -> Assessment:
-    """Return how to judge that the paper's method ends within 5 % of the best return of all trainings."""
-
-    def judge_ends(version: Version) -> Finding:
-        curves = version.curves("table-1-ring", "ring", (*TABLE_1, "without-model", "ours"), quantity)
-        best = max(float(curve.max()) for curve in curves.values())
-        ends = curves[label_of("proposed")][:, LAST].mean(1)
-        reached, count = int((ends >= best - 0.05 * abs(best)).sum()), len(ends)
-        verdict = HELD if reached == count else f"{NOT_HELD} within these steps"
-        cause = version.validation_cause(verdict, "table-1-ring", "ring", "proposed", quantity)
-        numbers = f"{reached} of {count} trainings end within 5 % of the best return of any training, {best:,.0f}"
-        feasible = best_feasible(version.rows("table-1-ring", "ring"))
-        numbers += f"; best feasible driver of the table without learning, test seeds: {list_values(feasible)}"
-        return f"{verdict} ({count} trainings){cause}", numbers
-
-    return judge_ends
+def near_best(version: Version, quantity: str = "") -> Finding:
+    """Do all trainings of the paper's method end within 5 % of the best one: in a `quantity` of curves, or the test?"""
+    place, variants = ("table-1-ring", "ring"), (*TABLE_1, "without-model", "ours")
+    if quantity:
+        ends = version.curve_means(*place, variants, quantity, LAST)
+    else:
+        ends = version.returns(*place, variants)
+    best = max(float(each.max()) for each in ends.values())
+    own = ends[label_of("proposed")]
+    reached, count = int((own >= best - 0.05 * abs(best)).sum()), len(own)
+    verdict = HELD if reached == count else f"{NOT_HELD} within these steps"
+    what = "in the last tenth" if quantity else "on test seeds"
+    numbers = f"{reached} of {count} trainings are within 5 % of the best return of any training, {what} {best:,.0f}"
+    feasible = best_feasible(version.rows(*place))
+    numbers += f"; best feasible driver of the table without learning, test seeds: {list_values(feasible)}"
+    return f"{verdict} ({count} trainings)", numbers
 
 
 def bound(version: Version) -> Finding:
@@ -681,6 +707,7 @@ PPO_LOSSES = {
 LEARNED_ROADS = ("ring", "figure-eight")
 """roads with ten trainings of TRPO and the paper's method"""
 PEOPLE_HEADING = "Figure 6: the model of human drivers"
+A2 = "A2: it converges to a policy as close to the optimal one as wanted (here: the best of all trainings)"
 CLAIMS: dict[str, Sequence[Claim]] = {
     "Table 1 and Figure 4: the proposed method, TRPO, PPO and SAC": (
         *of_table_1("largest return, {road}: {values}", lambda study, road: larger_return(study, road, *TABLE_1)),
@@ -834,10 +861,8 @@ CLAIMS: dict[str, Sequence[Claim]] = {
         ),
         *of_ring(
             "theory",
-            *both_returns(
-                "A2: it converges to a policy as close to the optimal one as wanted (here: the best of all trainings)",
-                near_best,
-            ),
+            (f"{A2}, in training", partial(near_best, quantity=TRAINED)),
+            (f"{A2}, on test seeds", near_best),
             ("A3: the model error falls during training, ring, preset `paper`", model_error_falls),
             (
                 "A3: with IDM the model starts with a smaller error (here SUMO's human drivers follow that IDM)",

@@ -20,6 +20,9 @@ from unjam_paper.variants import VARIANTS
 PRESETS = {"default": "", "`paper`": "paper", "`paper-exact`": "paper-exact"}
 """presets by their heading; the studies of tables and figures use `paper`"""
 NOT_MEASURED = "not measured"
+RING_STUDIES = {"table-1-ring-unfiltered": UNFILTERED_ROADS["ring"], "table-1-ring": "ring"}
+"""roads of the ring by study, without the filter and with it"""
+RING_SOURCES = ", ".join(f"`results/{study}.json`" for study in RING_STUDIES)
 
 
 @dataclass(frozen=True)
@@ -55,12 +58,12 @@ def filter_effect() -> str:
     texts = []
     for name in ("TRPO", "proposed"):
         values = []
-        for study, road in (("table-1-ring-unfiltered", UNFILTERED_ROADS["ring"]), ("table-1-ring", "ring")):
+        for study, road in RING_STUDIES.items():
             rows = {row["name"]: row for row in results_part(f"{study}/table") if row["road"] == road}
             best = rows[rows[name]["gain_reference"]["expert"]]["return"]["mean"]
             values.append(best + float(np.mean(rows[name]["gains"])))
         texts.append(f"{name} {values[0]:,.0f} without and {values[1]:,.0f} with it")
-    return f"return on test seeds, ring: {', '.join(texts)}"
+    return f"return on test seeds, ring: {', '.join(texts)} ({RING_SOURCES})"
 
 
 def noise_effect() -> str:
@@ -93,13 +96,15 @@ def expert_effect() -> str:
 
 def selection_effect() -> str:
     """Return the differences of the last to the best checkpoint."""
-    curves = results_part("table-1-ring/curves")["ring"]
-    texts = []
-    for name, label in (("trpo", "TRPO"), ("ppo", "PPO"), ("sac", "SAC"), ("proposed", "proposed")):
-        values = np.array(curves[name]["return_validation"])
-        texts.append(f"{label} {trainings_text(values[:, -1] - values.max(1), 0, '+')}")
+    versions = []
+    for study, road in RING_STUDIES.items():
+        curves, texts = results_part(f"{study}/curves")[road], []
+        for name, label in (("trpo", "TRPO"), ("ppo", "PPO"), ("sac", "SAC"), ("proposed", "proposed")):
+            values = np.array(curves[name]["return_validation"])
+            texts.append(f"{label} {trainings_text(values[:, -1] - values.max(1), 0, '+,')}")
+        versions.append(", ".join(texts))
     what = "return of the last checkpoint, difference to the best, on the seeds that select it (at most 0)"
-    return f"{what}: {', '.join(texts)} (`results/table-1-ring.json`)"
+    return f"{what}: {versions[0]}; with the filter {versions[1]} ({RING_SOURCES})"
 
 
 def exact_effect() -> str:
@@ -164,11 +169,12 @@ def data_effect() -> str:
 
 def speed_effect() -> str:
     """Return both speeds of a training."""
-    row = next(row for row in results_part("table-1-ring/table") if row["name"] == "TRPO")
-    own, fleet = row["paper_convention"]["speed"]["mean"], row["mean_speed"]["mean"]
-    return (
-        f"TRPO, ring: {own:.2f} m/s in the paper's convention, {fleet:.2f} on test seeds (`results/table-1-ring.json`)"
-    )
+    texts = []
+    for study in RING_STUDIES:
+        row = next(row for row in results_part(f"{study}/table") if row["name"] == "TRPO")
+        own, fleet = row["paper_convention"]["speed"]["mean"], row["mean_speed"]["mean"]
+        texts.append(f"{own:.2f} m/s in the paper's convention, {fleet:.2f} on test seeds")
+    return f"TRPO, ring: {texts[0]}; with the filter {texts[1]} ({RING_SOURCES})"
 
 
 NOISE_STEP = 0.2 * sqrt(0.1)
@@ -177,7 +183,7 @@ TRAFFIC = (
         "safety filter of the CAV",
         "none: only the box of ±1 m/s² (4.1.2)",
         ("scenario.safety.active", "scenario.safety.time_gap"),
-        effect=by_study("table-1-ring-unfiltered", filter_effect),
+        effect=filter_effect,
     ),
     Difference(
         "delay and lag of the CAV",

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from tables import results_part
-from verdicts import Finding, Values, compare, judge
+from verdicts import Finding, Values, compare, judge, list_values
 
 from unjam.measures.metric_table import estimate_cell
-from unjam.measures.statistics import estimate, estimate_over_trainings
+from unjam.measures.statistics import estimate, estimate_over_trainings, linearized_ratio
 from unjam_paper.study import interval_text
 
 NETWORKS = {"knowledge": "IDM + residual", "vanilla": "network alone", "nearest row": "nearest row"}
@@ -32,6 +32,8 @@ MODELS = {
 }
 
 FEW_DATA = (0.01, 0.1)
+MODELS_PAIR = "knowledge, IDM", "IDM"
+"""the calibrated IDM with a residual, and without"""
 
 
 def rows_of(name: str) -> pd.DataFrame:
@@ -183,7 +185,7 @@ def _final_loss(name: str, least: float = 0.0, is_above_noise: bool = False) -> 
     data = _all_data().values()
     noise = float(next(iter(data))["noise"].iloc[0]) ** 2 if is_above_noise else 0.0
     own, other = (np.array([curve[-1] for curve in found[name]]) - noise for found in data)
-    reduction = estimate_over_trainings((100 * (other - own) / other.mean()).tolist())
+    reduction = estimate_over_trainings((100 * linearized_ratio(other - own, other)).tolist())
     beyond = replace(reduction, low=reduction.low - least, high=reduction.high - least)
     means = f"with IDM {own.mean():.5f}, without {other.mean():.5f}"
     numbers = f"after the last pass [m²/s⁴]: {means}; smaller by {interval_text(asdict(reduction), 2)} %"
@@ -233,18 +235,33 @@ def _one_step() -> Finding:
         "without": _of_seeds("one_step", "vanilla"),
     }
     verdict, numbers = compare(values, "with IDM", larger=False, digits=3)
-    return verdict, f"error of one step, 218 drivers of NGSIM, IDM of the paper [m/s²]: {numbers}"
+    unclipped = _of_seeds("one_step", "knowledge, paper's IDM").mean()
+    what = f"IDM of the paper, clipped (not clipped: {unclipped:.2f})"
+    return verdict, f"error of one step, 218 drivers of NGSIM, {what} [m/s²]: {numbers}"
 
 
 def _residual_gain(name: str, what: str, unit: str) -> Finding:
-    own, idm = _of_seeds(name, "knowledge, IDM"), _of_seeds(name, "IDM")
+    own, idm = (_of_seeds(name, each) for each in MODELS_PAIR)
     values = {"with the residual": own, "calibrated IDM alone": np.full(len(own), idm.mean())}
     verdict, numbers = compare(values, "with the residual", larger=False, digits=2)
-    return verdict, f"{what}, 218 drivers of NGSIM [{unit}]: {numbers}"
+    over_drivers = (f"[{low:.2f}, {high:.2f}]" for low, high in (_drivers_interval(name, each) for each in MODELS_PAIR))
+    alone = list_values({"network alone": _of_seeds(name, "vanilla").mean()}, 2)
+    note = f"intervals over drivers {' and '.join(over_drivers)}; {alone}"
+    return verdict, f"{what}, 218 drivers of NGSIM [{unit}]: {numbers}; {note}"
+
+
+def _drivers_interval(name: str, model: str) -> tuple[float, float]:
+    """Return the interval of an error over the 218 other drivers, mean over the seeds."""
+    low, high = np.array(_other_drivers(model)[f"{name}_interval"].tolist()).mean(0)
+    return float(low), float(high)
 
 
 def _of_seeds(name: str, model: str) -> np.ndarray:
     """Return the error of a model on the 218 other drivers, for each seed."""
+    return _other_drivers(model)[name].to_numpy()
+
+
+def _other_drivers(model: str) -> pd.DataFrame:
     rows = rows_of("field/field")
     rows = rows[(rows["data_set"] == "ngsim") & (rows["test"] == "other drivers") & (rows["model"] == model)]
-    return rows.sort_values("seed")[name].to_numpy()
+    return rows.sort_values("seed")
