@@ -74,8 +74,8 @@ with at most 6 m/s²). Verdicts are about trainings without it. Merges have no f
   points of the learning curve, in its second half.
 - Rules without an interval: collisions are *rare* with fewer than 0.05 vehicles in an episode with each learner, *by
   construction* if no other driver of the table collides either, since SUMO brakes; A2 holds if all trainings are within
-  5 % of the best one; a bound that is hundreds of times what it bounds *says nothing*; a percentage is *inconsistent* if
-  the paper's Table 1 has no such return. *Similar* is not held where the interval lies beyond 10 %.
+  5 % of the best one; a bound that is hundreds of times what it bounds *says nothing*; a percentage is *inconsistent*
+  if the paper's Table 1 has no such return. *Similar* is not held where the interval lies beyond 10 %.
 
 Numbers of verdicts:
 
@@ -475,7 +475,8 @@ def stated_gain(learner: str, percent: float) -> Assessment:
         expert = version.rows("figure-9", "ring")[EXPERT]["return"]["mean"] / without.mean() - 1
         numbers = f"on test seeds {interval_text(asdict(gain), 0, '+')} %, with PI alone {100 * expert:+.0f} %"
         if judge([estimate_over_trainings(without.tolist())]) != HELD:
-            numbers = f"on test seeds no percentage: the return alone, {without.mean():,.0f}, is not shown to be above 0"
+            alone = f"{without.mean():,.0f}, is not shown to be above 0"
+            numbers = f"on test seeds no percentage: the return alone, {alone}"
         text = f"{stated:,.0f} × {1 + percent / 100:.2f} = {goal:,.0f}"
         if goal > largest:
             return INCONSISTENT, f"{text}, which its Table 1 does not have; {numbers}"
@@ -618,10 +619,7 @@ def better_start(road: str) -> Assessment:
 def near_best(version: Version, quantity: str = "") -> Finding:
     """Do all trainings of the paper's method end within 5 % of the best one: in a `quantity` of curves, or the test?"""
     place, variants = ("table-1-ring", "ring"), (*TABLE_1, "without-model", "ours")
-    if quantity:
-        ends = version.curve_means(*place, variants, quantity, LAST)
-    else:
-        ends = version.returns(*place, variants)
+    ends = version.curve_means(*place, variants, quantity, LAST) if quantity else version.returns(*place, variants)
     best = max(float(each.max()) for each in ends.values())
     own = ends[label_of("proposed")]
     reached, count = int((own >= best - 0.05 * abs(best)).sum()), len(own)
