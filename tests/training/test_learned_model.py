@@ -150,3 +150,23 @@ def test_the_example_of_the_documentation_runs(tmp_path: Path, monkeypatch: pyte
     code = page.partition("## Drive in the learned model")[2].partition("```python\n")[2].partition("```")[0]
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "virtual.md", "exec"), {"__name__": "example"})
+
+
+@pytest.mark.parametrize("default", [torch.float64, torch.device("meta")], ids=str)
+def test_a_model_does_not_depend_on_defaults_of_torch(default: Any, run: Path) -> None:
+    def roll_out() -> torch.Tensor:
+        model = unjam.load_world_model(run)
+        model.reset(5, seed=1)
+        model.step([0.1] * 5)
+        return model.roll_out(FOLLOWER, 20).rewards
+
+    expected = roll_out()
+    is_type = isinstance(default, torch.dtype)
+    (torch.set_default_dtype if is_type else torch.set_default_device)(default)
+    try:
+        found = roll_out()
+    finally:
+        torch.set_default_dtype(torch.float32)
+        torch.set_default_device(None)
+    assert (found.dtype, found.device) == (expected.dtype, expected.device)
+    assert torch.equal(found, expected)

@@ -44,7 +44,7 @@ def write_onnx_policy(
         raise invalid_value("file", str(file), f"a name that ends in {GRAPH_SUFFIX}")
     import_optional("onnxscript")
     check_parent_folder(path)
-    observations, rows = torch.zeros(2, len(inputs)), torch.export.Dim("rows")
+    observations, rows = torch.zeros(2, len(inputs), dtype=torch.float32, device="cpu"), torch.export.Dim("rows")
     was_training = network.training
     with torch.no_grad(), quiet_onnx_export():
         program = torch.onnx.export(network.eval(), (observations,), dynamic_shapes=({0: rows},), verbose=False)

@@ -72,10 +72,11 @@ def onnx_graph(driver: Driver, action_limit: float) -> bytes:
     exact = {torch.ops.aten.scalar_tensor.default: _float64_constant()}
     inputs, outputs = graph_names(driver)
     example_rows = 2  # the exported graph takes any number of rows
-    state = state_of_ones(driver.requirements().input_fields, partial(torch.ones, dtype=torch.float64), example_rows)
+    like: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}  # whatever the defaults of the program are
+    state = state_of_ones(driver.requirements().input_fields, partial(torch.ones, **like), example_rows)
     memory = driver.initial_memory(example_rows)
     arrays = [value for value in state if value is not None]
-    arrays += [torch.as_tensor(value, dtype=torch.float64) for _, value in leaves(memory)]
+    arrays += [torch.as_tensor(value, **like) for _, value in leaves(memory)]
     if driver.time_gaps(state, memory) is not None:
         raise InputError(f"onnx: {driver.describe()} is not allowed: a graph cannot command time gaps")
     options: dict[str, Any] = {"input_names": inputs, "output_names": outputs, "custom_translation_table": exact}

@@ -95,10 +95,10 @@ def _as_numpy_function(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def call(rows: Any) -> Any:
         first = rows[0]
-        like = next(module.parameters(), first if isinstance(first, torch.Tensor) else torch.zeros(()))
+        like = next(module.parameters(), first if isinstance(first, torch.Tensor) else torch.zeros((), device="cpu"))
 
         def as_own(values: Any) -> Any:
-            tensor = values if isinstance(values, torch.Tensor) else torch.tensor(values)
+            tensor = values if isinstance(values, torch.Tensor) else torch.tensor(values, device="cpu")
             return tensor.to(like) if tensor.is_floating_point() else tensor.to(like.device)
 
         is_record = hasattr(rows, "_fields")

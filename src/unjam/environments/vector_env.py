@@ -62,7 +62,7 @@ def _torch_kind(is_exact: bool, seed: Sequence[int], device: str) -> _ArrayKind:
     torch = import_optional("torch")
     to_array = partial(torch.as_tensor, dtype=torch.float64 if is_exact else torch.float32, device=device)
     generator = torch.Generator(device).manual_seed(int(np.random.SeedSequence(seed).generate_state(1)[0]))
-    draw = None if is_exact else partial(torch.randn, generator=generator, device=device)
+    draw = None if is_exact else partial(torch.randn, generator=generator, dtype=torch.float32, device=device)
     return _ArrayKind(to_array, draw, lambda values: values.float(), torch.no_grad)
 
 
@@ -372,9 +372,9 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         if not self._is_numpy:
             check_tensor_terms(reward, terms)
         is_valid = all(getattr(values, "shape", None) == (self.num_envs,) for values in terms.values())
-        if is_valid and (not self._is_numpy or np.isfinite(sum(terms.values())).all()):
-            return terms
-        return validate_reward_terms(reward, outcome, row_name="environment")
+        if not is_valid or (self._is_numpy and not np.isfinite(sum(terms.values())).all()):
+            terms = validate_reward_terms(reward, outcome, row_name="environment")
+        return {name: self._kind.to_array(values) for name, values in terms.items()}
 
     def _metrics(self, outcome: Outcome, ended: Array) -> dict[str, Array]:
         """Return the metrics of the episodes that have ended, zeros for others."""

@@ -322,10 +322,11 @@ class ModelWorld:
         """Return standard normal noise, shape (n,), or (n, episode_noise_size): each row is a road of its own."""
         speed = self.states[-1].speed
         if not episode_noise_size:
-            return torch.randn(len(speed), generator=self._generator, device=speed.device)
+            return torch.randn(len(speed), generator=self._generator, dtype=torch.float32, device=speed.device)
         if self._episode_noise is None:
             shape = len(speed), episode_noise_size
-            self._episode_noise = torch.randn(shape, generator=self._generator, device=speed.device).to(speed.dtype)
+            like = {"dtype": torch.float32, "device": speed.device}
+            self._episode_noise = torch.randn(shape, generator=self._generator, **like).to(speed.dtype)
         return self._episode_noise
 
     def record(self, driver_log: DriverLog) -> RolloutBatch:

@@ -17,6 +17,7 @@ from unjam.models.registry import RowWorldModel
 from unjam.models.rollouts import ModelDynamics, ModelTransition, draw_starts, tensor_driver, tensor_memory, to_device
 from unjam.parameters import check_integer
 from unjam.training.model_facts import TrainedModel, read_trained_model, trained_model_facts
+from unjam.training.random_state import torch_defaults
 from unjam.training.run_folder import read_config
 from unjam.worlds.episode import check_can_drive
 
@@ -108,7 +109,7 @@ class LearnedModel:
         After its collision a row still moves, with the reward zero; `crashed` says whether it had one so far.
         """
         observed, actuators, drawn, is_running, _ = self._state
-        acceleration = torch.as_tensor(acceleration)
+        acceleration = torch.as_tensor(acceleration, device=DEVICE)
         if tuple(acceleration.shape) != tuple(observed.speed.shape):
             raise invalid_value("acceleration: shape", tuple(acceleration.shape), str(tuple(observed.speed.shape)))
         if not bool((is_finite := acceleration.isfinite()).all()):
@@ -142,6 +143,7 @@ class LearnedModel:
         stacked = states[0].map(lambda *values: torch.stack(values, 1), *states[1:])
         return ModelTrajectories(stacked, torch.stack(rewards, 1), self._state.is_running == 0.0)
 
+    @torch_defaults()
     def error_report(self) -> dict[str, Any]:
         """Return how well the model agrees with episodes of which no network learned: the facts of `unjam model`.
 
@@ -150,6 +152,7 @@ class LearnedModel:
         return trained_model_facts(self._trained)
 
 
+@torch_defaults()
 def load_world_model(run: Path | str) -> LearnedModel:
     """Return the learned model in the newest checkpoint of a run folder.
 

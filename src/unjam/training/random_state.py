@@ -14,33 +14,37 @@ _training_lock = threading.Lock()
 
 
 @contextmanager
+def torch_defaults() -> Iterator[None]:
+    """Give torch its own defaults in the block: single precision, the CPU, gradients, no automatic precision."""
+    dtype, device = torch.get_default_dtype(), torch.get_default_device()
+    with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
+        torch.set_default_dtype(torch.float32)
+        torch.set_default_device(None)
+        try:
+            yield
+        finally:
+            torch.set_default_dtype(dtype)
+            torch.set_default_device(device if device.type != "cpu" else None)
+
+
+@contextmanager
 def exclusive_random_state() -> Iterator[None]:
     """Lend the global generators of Python, NumPy and torch to the block, with one thread for torch's operations.
 
-    In the block torch has its own defaults: single precision, the CPU, gradients, no automatic precision. All is
-    restored at the end. Raise `UnjamError` if another thread is in such a block.
+    It has `torch_defaults`, too. All is restored at the end. Raise `UnjamError` if another thread is in such a block.
     """
     if not _training_lock.acquire(blocking=False):
         raise UnjamError("train: another training runs in this process; allowed: one, or a process for each")
     try:
-        threads, dtype, device = torch.get_num_threads(), torch.get_default_dtype(), torch.get_default_device()
+        threads = torch.get_num_threads()
         python_state, numpy_state = random.getstate(), np.random.get_state()
         gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
-        with (
-            torch.random.fork_rng(gpus),
-            torch.inference_mode(False),
-            torch.enable_grad(),
-            torch.autocast("cpu", enabled=False),
-        ):
+        with torch.random.fork_rng(gpus), torch_defaults():
             torch.set_num_threads(1)  # more threads would compete with the workers for the cores
-            torch.set_default_dtype(torch.float32)
-            torch.set_default_device(None)
             try:
                 yield
             finally:
                 torch.set_num_threads(threads)
-                torch.set_default_dtype(dtype)
-                torch.set_default_device(device if device.type != "cpu" else None)
                 np.random.set_state(numpy_state)
                 random.setstate(python_state)
     finally:

@@ -70,8 +70,10 @@ def leaders(
     # A remainder takes longer than everything else here; the remainder of less than one loop needs no division.
     offsets = xp.stack([place - edge * lane_length for edge in range(RING_EDGES)])
     offsets = xp.where(offsets < 0.0, offsets + loop_length, offsets)
-    last, columns = offsets.argmin(1), xp.arange(speed.shape[1])
-    fronts, speeds = offsets[xp.arange(RING_EDGES)[:, None], last, columns], speed[last, columns]
+    # The user can have set another default device of torch.
+    rows, columns = (xp.arange(count, device=speed.device) for count in (RING_EDGES, speed.shape[1]))
+    last = offsets.argmin(1)
+    fronts, speeds = offsets[rows[:, None], last, columns], speed[last, columns]
     sees, seen_length = distance > 0.0, 0.0 * loop_length
     while bool(sees.any()):
         lane = xp.where(lane == RING_EDGES - 1.0, 0.0, lane + 1.0)
