@@ -236,7 +236,8 @@ def _one_step() -> Finding:
     }
     verdict, numbers = compare(values, "with IDM", larger=False, digits=3)
     unclipped = _of_seeds("one_step", "knowledge, paper's IDM").mean()
-    what = f"IDM of the paper, clipped (not clipped: {unclipped:.2f})"
+    alone = _of_seeds("one_step", "paper's IDM, clipped").mean()
+    what = f"IDM of the paper, clipped (alone {alone:.3f}; with IDM, not clipped: {unclipped:.2f})"
     return verdict, f"error of one step, 218 drivers of NGSIM, {what} [m/s²]: {numbers}"
 
 

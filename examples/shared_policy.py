@@ -37,7 +37,7 @@ for update in range(UPDATES):
         reward = column(rewards).float()
         end = column(observations), column(terminations), ended
         steps.append((observation, action, chosen.log_prob(action).detach(), reward, *end, is_occupied))
-        total += reward.max().item()  # the reward is common to all CAVs
+        total += reward[is_occupied].mean().item() if is_occupied.any() else 0.0  # common to all CAVs
     learn(*map(torch.stack, zip(*steps, strict=True)))
     rows = int(sum(step[-1].sum() for step in steps))
     print(f"unjam {unjam.__version__}, update {update}: {rows} rows, return {total:.1f}", flush=True)

@@ -8,34 +8,39 @@ from typing import TYPE_CHECKING, Any
 import tomli_w
 
 from unjam.adapters.onnx_file import DESCRIPTION_KEY, GRAPH_SUFFIX
-from unjam.drivers.observation import PolicyInput
+from unjam.drivers.car_following import Constant
+from unjam.drivers.observation import PolicyInput, observation_size
 from unjam.drivers.policy import PolicyOutput
-from unjam.errors import import_optional, invalid_value
+from unjam.drivers.registry import driver_from_name
+from unjam.errors import InputError, import_optional, invalid_value
 from unjam.files import atomic_write, check_parent_folder
 from unjam.onnx_models import quiet_onnx_export
+from unjam.text import one_line
 
 if TYPE_CHECKING:
-    from torch import nn
+    from torch import Tensor, nn
 
 
 def write_onnx_policy(
     network: "nn.Module",
     file: Path | str,
-    inputs: Sequence[PolicyInput],
+    inputs: Sequence[PolicyInput | str],
     output: PolicyOutput | None = None,
     time_step: float | None = None,
+    expert: str = "",
 ) -> None:
     """Write a network and its description into one file, which `unjam drive -d` and `onnx_driver` read.
 
     Args:
         network: returns numbers, shape (n,) or (n, 1), for observations in float32, shape (n, inputs).
         file: its name ends in .onnx.
-        inputs: quantities in the order of the columns.
+        inputs: quantities in the order of the columns, and names of features, such as `"local"`.
         output: the meaning of the numbers; None: accelerations [m/s2].
         time_step: control step of the policy [s]; None: that of the road.
+        expert: name of a driver to which the accelerations are added, such as `"pi"`; empty: none.
 
     Raises:
-        InputError: the name of the file is not allowed.
+        InputError: the name of the file is not allowed, or the network does not fit the inputs.
         DiskError: its folder does not exist, or the disk is full.
         MissingPartError: torch or onnxscript is not installed.
     """
@@ -44,19 +49,36 @@ def write_onnx_policy(
         raise invalid_value("file", str(file), f"a name that ends in {GRAPH_SUFFIX}")
     import_optional("onnxscript")
     check_parent_folder(path)
-    observations, rows = torch.zeros(2, len(inputs), dtype=torch.float32, device="cpu"), torch.export.Dim("rows")
+    size = observation_size(inputs, driver_from_name(expert or Constant.name, time_step or 0.1))
+    observations, rows = torch.zeros(2, size, dtype=torch.float32, device="cpu"), torch.export.Dim("rows")
     was_training = network.training
-    with torch.no_grad(), quiet_onnx_export():
-        program = torch.onnx.export(network.eval(), (observations,), dynamic_shapes=({0: rows},), verbose=False)
-    network.train(was_training)
+    try:
+        with torch.no_grad(), quiet_onnx_export():
+            _check_shapes(network.eval(), observations)
+            program = torch.onnx.export(network, (observations,), dynamic_shapes=({0: rows},), verbose=False)
+    finally:
+        network.train(was_training)
     from onnx_ir.passes import common
 
     common.ClearMetadataAndDocStringPass()(program.model)  # stack traces have paths of this machine
     graph = program.model_proto
-    description = {"inputs": list(map(_as_table, inputs)), "output": _as_table(output or PolicyOutput())}
+    tables = [each if isinstance(each, str) else _as_table(each) for each in inputs]
+    description: dict[str, Any] = {"inputs": tables, "output": _as_table(output or PolicyOutput())}
     description |= {} if time_step is None else {"time_step": time_step}
+    description |= {"expert": expert} if expert else {}
     graph.metadata_props.add(key=DESCRIPTION_KEY, value=tomli_w.dumps(description))
     atomic_write(path, graph.SerializeToString())
+
+
+def _check_shapes(network: "nn.Module", observations: "Tensor") -> None:
+    """Raise `InputError` unless a network takes the observations and returns a number for each row."""
+    rows, size = observations.shape
+    try:
+        shape = tuple(network(observations).shape)
+    except (RuntimeError, TypeError, AttributeError, IndexError) as error:
+        raise InputError(f"network: it does not take {size} inputs: {one_line(error, 120)}") from None
+    if shape not in ((rows,), (rows, 1)):
+        raise invalid_value(f"network: shape of its output for {rows} rows", shape, f"({rows},), ({rows}, 1)")
 
 
 def _as_table(value: PolicyInput | PolicyOutput) -> dict[str, Any]:

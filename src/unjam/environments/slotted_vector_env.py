@@ -102,6 +102,7 @@ class SlottedRoadVectorEnv(RoadVectorEnv):
     ============  ==================================================================================================
     """
 
+    _alternative = "allowed: motorways, or unjam.parallel_env with slots, which simulates in SUMO"
     _step_sums = staticmethod(open_road_sums)
 
     def __init__(

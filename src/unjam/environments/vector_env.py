@@ -129,6 +129,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         "render_modes": [],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
+    _alternative = OTHER_MODE
     _step_sums = staticmethod(step_metrics)  # returns what is summed over control steps, by name, shape (W,)
 
     def __init__(
@@ -164,7 +165,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
             raise invalid_value("exact", exact, "True or False")
         made = make_scenario(scenario, changes)
         if reason := statistically_unsupported_reason(made) or self._unsupported_reason(made):
-            raise InputError(f"scenario: {made.title} is not possible in a batch ({reason}); {OTHER_MODE}")
+            raise InputError(f"scenario: {made.title} is not possible in a batch ({reason}); {self._alternative}")
         self._road = RoadStepper(scenario, changes, reward, expert, features, "batch")
         made_expert = self._road.copy_driver().expert
         if device and made_expert.requirements().needs_numpy:
