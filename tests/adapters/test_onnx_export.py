@@ -58,10 +58,7 @@ def test_features_and_an_expert_are_those_of_the_environment(tmp_path: Path) -> 
     ("network", "message"),
     [
         (nn.Linear(4, 1), "network: it does not take 5 inputs: mat1 and mat2 shapes cannot be multiplied"),
-        (
-            nn.Linear(5, 2),
-            r"network: shape of its output for 2 rows: \(2, 2\) is not allowed; allowed: \(2,\), ",
-        ),
+        (nn.Linear(5, 2), r"network: shape of its output for 2 rows: \(2, 2\) is not allowed; allowed: \(2,\), "),
     ],
 )
 def test_a_network_that_does_not_fit_its_inputs_is_refused(network: nn.Module, message: str, tmp_path: Path) -> None:

@@ -445,3 +445,15 @@ def test_wrong_actions_are_refused_in_one_line_except_where_they_are_ignored(dev
     ends = [made.step(zeros)[3].all() for _ in range(5)]
     assert ends[-1]
     made.step(np.full((2, 1), np.nan))
+
+
+@pytest.mark.filterwarnings("error")
+def test_fast_recorded_roads_have_the_positions_of_exact_ones_without_a_warning() -> None:
+    found = []
+    for exact in (True, False):
+        environment = RoadVectorEnv(2, "recorded", exact=exact)
+        environment.reset(seed=1)
+        for _ in range(3):
+            environment.step(np.zeros((2, 1), np.float32))
+        found.append(environment._running_episodes.world.local_state().route_position)
+    np.testing.assert_allclose(*found, rtol=1e-4)

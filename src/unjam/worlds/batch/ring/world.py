@@ -7,6 +7,7 @@ are those of the first CAV of every ring, then of the second one, and so on.
 from collections.abc import Collection, Sequence
 from functools import reduce
 from itertools import product
+from math import isfinite
 from typing import Any, ClassVar, NamedTuple, Self, cast
 
 import numpy as np
@@ -267,7 +268,7 @@ class RingBatch:
     def exact_state(self) -> LocalState:
         """Return the exact local state of the CAVs now."""
         loop, position = self._cav_loop_lengths, self._rows_of(self._position, self._cav_indices)
-        if self._has_quick_noise:
+        if self._has_quick_noise and isfinite(self.roads[0].loop_length):
             place = position - loop * namespace(position).floor(position / loop)  # `%` takes ten times as long
         else:
             place = position % loop
