@@ -62,17 +62,19 @@ either column.
   the same seed paired, on one set of traffic seeds: other seeds would widen it. A claim about several others holds if
   each interval is on its side, and does not hold if one is on the other side; the difference that decides is shown.
 - *Undecided*: the interval includes zero. Brackets have an interval, parentheses the range where there is none: of two
-  values, of differences in two groups, and of differences with both signs where what is compared forms two groups.
+  values, of differences in two groups, and of differences with both signs where what is compared forms two groups: n
+  values with a gap of more than 1/3 + 2/n of their range, and two or more on each side.
 - *By the expert*: PI, its expert, which the paper does not evaluate alone, has at least 90 % of the difference without
-  learning, with the paper's time constant or with 3 s, or the method is not shown to be better than both; in
-  validation, not better than at first, where its residual is nearly zero, or no training becomes better than PI.
+  learning, with the paper's time constant or with 3 s (in A1 on the test seeds), or the method is not shown to be
+  better than both; in validation, not better than at first, where its residual is nearly zero, or no training becomes
+  better than PI.
 - *In training alone*: a return rises while exploration decreases, which is not shown in validation. That it rises
   faster than with other learners is not tested.
 - Values are *similar* where the interval of the difference lies within 10 % of the value. Percentages of training time
   and of Figure 9 hold if the cost is at most, or the gain at least, as large. Of other percentages the sign is judged.
 - *Convergence*: environment steps to 0.9 of TRPO's final return, in blocks of five points of the learning curve, 15,000
-  steps, by which intervals are widened at both ends; all steps if never. *Stable*: mean change of the return between
-  points of the learning curve, in its second half.
+  steps, or at a validation, every 30,000 steps; by this resolution intervals are widened at both ends; all steps if
+  never. *Stable*: mean change of the return between points of the learning curve, in its second half.
 - Rules without an interval: collisions are *rare* with fewer than 0.05 vehicles in an episode with each learner, *by
   construction* if no other driver of the table collides either, since SUMO brakes; A2 holds if all trainings are within
   5 % of the best training with the paper's settings, *by the expert* if PI is, too; a bound that is hundreds of times
@@ -126,6 +128,8 @@ RETURNS = {TRAINED: "in training", VALIDATED: "in validation"}
 """returns of learning curves: with exploration, and of the deterministic controller"""
 FIRST, LAST, THIRD_QUARTER, LAST_QUARTER = slice(0, 10), slice(90, 100), slice(50, 75), slice(75, 100)
 """parts of a learning curve of 100 points"""
+VALIDATION_STEPS = 30_000
+"""environment steps between two validations: five iterations of 6,000"""
 BLOCK = 5
 """points of a learning curve that are averaged before it counts as having reached a return"""
 
@@ -316,6 +320,8 @@ def curve_extreme(
         verdict, numbers = compare(values, label_of(variants[0]), larger=larger, digits=digits)
         verdict += version.validation_cause(verdict, study, road, variants[0], quantity)
         key = PAPER_QUANTITIES.get(quantity)
+        if quantity == VALIDATED and part == FIRST:
+            return verdict, f"return at the first validation, after {VALIDATION_STEPS:,} steps: {numbers}"
         if key is None or not verdict.startswith(HELD):
             return verdict, f"{what}: {numbers}"
         rows = version.rows(study, road)
@@ -364,10 +370,13 @@ def first_arrival(
         goal, values, resolution = final - 0.1 * abs(final), dict[str, np.ndarray](), 0.0
         for each, curve in zip((variant, *others), curves.values(), strict=True):
             steps = np.array(version.part(study, road, "curves")[version.study(study, road)[1]][each]["steps"])
-            blocks = curve.reshape(len(curve), -1, BLOCK).mean(2) >= goal
-            ends = steps[BLOCK - 1 :: BLOCK]
+            if quantity == VALIDATED:  # its curve is linear between validations
+                ends = np.arange(VALIDATION_STEPS, steps[-1] + 1, VALIDATION_STEPS)
+                reaches = np.array([np.interp(ends, steps, row) for row in curve]) >= goal
+            else:
+                ends, reaches = steps[BLOCK - 1 :: BLOCK], curve.reshape(len(curve), -1, BLOCK).mean(2) >= goal
             resolution = float(ends[1] - ends[0])
-            values[label_of(each)] = np.where(blocks.any(1), ends[blocks.argmax(1)], steps[-1])
+            values[label_of(each)] = np.where(reaches.any(1), ends[reaches.argmax(1)], steps[-1])
         verdict, numbers = compare(values, label_of(variant), larger=is_last, resolution=resolution)
         return verdict + version.validation_cause(verdict, study, road, variant, quantity), f"steps: {numbers}"
 
@@ -483,7 +492,7 @@ def stated_gain(learner: str, percent: float) -> Assessment:
         if judge([estimate_over_trainings(without.tolist())]) != HELD:
             alone = f"{without.mean():,.0f}, is not shown to be above 0"
             numbers = f"on test seeds no percentage: the return alone, {alone}"
-        text = f"{stated:,.0f} × {1 + percent / 100:.2f} = {goal:,.0f}"
+        text = f"{stated:,.1f} × {1 + percent / 100:.2f} = {goal:,.0f}"
         if goal > largest:
             return INCONSISTENT, f"{text}, which its Table 1 does not have; {numbers}"
         return f"{judge([beyond])} ({gain.count} trainings)", f"{text}; {numbers}"

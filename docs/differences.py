@@ -309,8 +309,8 @@ LEARNING = (
         "trainings of each learner",
         "3 (4.2.1)",
         (),
-        "5, ten of TRPO and the method, 3 on the merge; with the filter 5 in Tables 1 and 2 on the ring and to the "
-        "letter, else 3",
+        "5, ten of TRPO and the method, 3 on the merge; with the filter 5 in Tables 1 and 2 on the ring, with Eq. "
+        "16 and to the letter, else 3",
     ),
     Difference(
         "which checkpoint counts",
