@@ -105,7 +105,7 @@ def task_experience(spec: AgentSpec, task_index: int, episodes: Sequence[Episode
     pairs = [(episode, trajectory) for episode in episodes for trajectory in episode.trajectories]
     if not pairs:
         count = format_count(len(episodes), "episode")
-        raise InputError(f"no CAV was on the road in {count}: increase the share of CAVs")
+        raise InputError(f"penetration_rate: no CAV was on the road in {count}; allowed: a higher penetration rate")
     drawn_values = np.array([scenario.scale_drawn_values(episode.drawn_values) for episode, _ in pairs])
     critic_inputs, later = spec.privileged_inputs(task_index, drawn_values), None
     if policy.reward_after_exit:

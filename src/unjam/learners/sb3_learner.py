@@ -37,8 +37,8 @@ class SB3Learner(Learner):
         env = gymnasium.Env[np.ndarray, np.ndarray]()  # SB3 reads its spaces; it is never stepped
         env.observation_space, env.action_space = policy_spaces(spec.inputs, spec.critic_inputs, spec.authority)
         self.spec, self.gamma = spec, extra["gamma"]
-        residual = {"settings": spec.policy, "inputs": spec.inputs, "action_limit": spec.action_limit}
-        extra["policy_kwargs"] = residual | extra.get("policy_kwargs", {})
+        policy_kwargs = {"settings": spec.policy, "inputs": spec.inputs, "action_limit": spec.action_limit}
+        extra["policy_kwargs"] = policy_kwargs | extra.get("policy_kwargs", {})
         self.sb3 = algorithm(policy=policy, env=env, seed=spec.seed, device="cpu", **extra)
         self.sb3.set_logger(Logger(None, []))
 
@@ -56,7 +56,9 @@ class SB3Learner(Learner):
             if not parameter.isfinite().all():
                 raise UnjamError(f"learner: {name} is not finite in iteration {iteration}")
             if name == "log_std" and not parameter.exp().all():
-                raise UnjamError(f"learner: exploration has ended in iteration {iteration}: a smaller step helps")
+                raise UnjamError(
+                    f"learner: the exploration noise is zero in iteration {iteration}: a smaller step helps"
+                )
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return values and tensors to resume exactly; there is no random state, since each update is seeded."""
@@ -162,18 +164,18 @@ class MixedReplayBuffer(ReplayBuffer):
 
     def new_model_buffer(self, rows: int) -> ReplayBuffer:
         """Return an empty buffer for a number of model rows, which replaces the previous one."""
-        spaces = self.observation_space, self.action_space
-        self.model_buffer = ReplayBuffer(rows, *spaces, self.device, handle_timeout_termination=False)
+        arguments = self.observation_space, self.action_space, self.device
+        self.model_buffer = ReplayBuffer(rows, *arguments, handle_timeout_termination=False)
         return self.model_buffer
 
     def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
         """Return a random batch."""
         if self.model_buffer is None:
             return super().sample(batch_size, env)
-        real = round(self.real_ratio * batch_size)
-        parts = [super().sample(real)] if real else []
-        if real < batch_size:
-            parts.append(self.model_buffer.sample(batch_size - real))
+        environment_count = round(self.real_ratio * batch_size)
+        parts = [super().sample(environment_count)] if environment_count else []
+        if environment_count < batch_size:
+            parts.append(self.model_buffer.sample(batch_size - environment_count))
         return ReplayBufferSamples(*(torch.cat(part) for part in zip(*(each[:5] for each in parts), strict=True)))
 
 

@@ -54,7 +54,7 @@ def normalized_differences(rows: EpisodeRows, baseline: EpisodeRows, reference: 
 
 
 def is_gain_capped(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> bool:
-    """Return whether the gain is at most zero: the driver is infeasible or lowers flow, or there is nothing to gain."""
+    """Return whether positive gains count as zero: the driver is infeasible or lowers flow, or nothing can be gained."""
     flow = paired_difference(rows, baseline, FLOW_METRIC)
     lowers_flow = flow.high < -MAX_FLOW_LOSS * float(np.mean([row[FLOW_METRIC] for row in baseline]))
     return is_gain_negligible(baseline, reference) or lowers_flow or overall_feasibility(rows, baseline) != FEASIBLE
@@ -76,8 +76,8 @@ def normalized_gain(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequenc
 def gain_by_seed(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> Floats:
     """Return the gain on one road by seed; the mean over the seeds is that of `normalized_gain`.
 
-    From these values follows the CI of a mean over roads that share seeds. The arguments are those of
-    `normalized_gain`.
+    The CI of a mean over roads that share seeds is computed from these values, shape (seeds,). The arguments are those
+    of `normalized_gain`.
     """
     limit = 0.0 if is_gain_capped(rows, baseline, reference) else MAX_GAIN
     values = np.clip(normalized_differences(rows, baseline, reference), MIN_GAIN, limit)

@@ -18,7 +18,8 @@ from unjam.sandbox import limit_memory_growth
 from unjam.sumo_files.reader import BrokenFileError, XmlAttributes, parse_xml
 
 HEAD_BYTES, HEAD_LINES = 1 << 16, 20
-"""first bytes, from which the form of a file is detected (no line is longer), and lines, among which its header is"""
+"""number of first bytes from which the format of a file is detected (no line is longer), and of lines in which its header
+is searched"""
 MAX_TEXT_BYTES, MAX_CELLS, MAX_FCD_VEHICLES = 1 << 30, 1 << 27, 1 << 23
 """maximum size of a table: bytes of text (uncompressed, each cell of Parquet counted), cells, and `vehicle` elements of
 FCD output as XML; each takes about five times as much memory"""
@@ -38,7 +39,7 @@ NGSIM_COLUMN_ORDER = (
 )
 """columns of NGSIM's text files, which have no header, in their order"""
 HEADERLESS_COLUMNS = {len(names): list(names) for names in (RECONSTRUCTED_COLUMN_ORDER, NGSIM_COLUMN_ORDER)}
-"""by their number"""
+"""header of each format without one, by its number of columns"""
 FCD_ATTRIBUTES = ("id", "speed", "leaderID", "leaderSpeed", "leaderGap")
 """attributes of a vehicle in SUMO's FCD output that are read; as CSV, their names begin with `vehicle_`"""
 FCD_PART_ROWS = 1 << 16
@@ -60,7 +61,7 @@ def read_table(path: Path) -> pd.DataFrame:
             head = file.read(HEAD_BYTES)
             if head.startswith(b"PAR1"):
                 return _read_parquet(path)
-            _check_size(path, file, head)
+            _check_text_size(path, file, head)
             file.seek(0)
             if head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<"):
                 return _read_fcd_xml(path, file, head)
@@ -68,19 +69,19 @@ def read_table(path: Path) -> pd.DataFrame:
     except (ValueError, NotImplementedError, OSError, EOFError, zlib.error) as error:
         raise InputError(f"{path.name}: cannot be read: {' '.join(str(error).split())}") from None
     except MemoryError:
-        raise _refused_file(path, f"it takes more than {MAX_PARQUET_MEMORY / 2**30:g} GiB of memory") from None
+        raise _unreadable_file_error(path, f"it takes more than {MAX_PARQUET_MEMORY / 2**30:g} GiB of memory") from None
     except BrokenFileError as error:
         raise InputError(str(error)) from None
 
 
-def _check_size(path: Path, file: Any, head: bytes) -> None:
+def _check_text_size(path: Path, file: Any, head: bytes) -> None:
     """Raise `InputError` if a text is too large, before it takes memory: packed files can be tiny."""
     size, cells, chunk = 0, 0, head
     while chunk and size <= MAX_TEXT_BYTES and cells <= MAX_CELLS:
         size += len(chunk)
         cells += max(len(chunk.split()), sum(map(chunk.count, (b"\n", b",", b";", b"\t"))))
         chunk = file.read(HEAD_BYTES)
-    _check_sizes(path, size, cells)
+    _check_table_limits(path, size, cells)
 
 
 def _read_parquet(path: Path) -> pd.DataFrame:
@@ -104,18 +105,18 @@ def _read_parquet(path: Path) -> pd.DataFrame:
     chunks = [(group, chunk) for group, chunk in chunks if chunk.path_in_schema in names]
     has_same_rows = all(chunk.num_values == group.num_rows for group, chunk in chunks)
     if not has_same_rows or sum(group.num_rows for group in groups) != metadata.num_rows:
-        raise _refused_file(path, "its numbers of rows contradict each other")
-    _check_sizes(path, cells=metadata.num_rows * metadata.num_columns)
+        raise _unreadable_file_error(path, "its numbers of rows contradict each other")
+    _check_table_limits(path, cells=metadata.num_rows * metadata.num_columns)
     text_bytes = sum(chunk.total_uncompressed_size for _, chunk in chunks if chunk.path_in_schema in texts)
     total_bytes = sum(chunk.total_uncompressed_size for _, chunk in chunks)
-    _check_sizes(path, text_bytes, (total_bytes - text_bytes) // MAX_BINARY_LENGTH)
-    # The data can unpack to more than the footer says.
+    _check_table_limits(path, text_bytes, (total_bytes - text_bytes) // MAX_BINARY_LENGTH)
+    # The data can be larger after decompression than the footer says.
     with ParquetFile(path, read_dictionary=sorted(texts)) as file, limit_memory_growth(MAX_PARQUET_MEMORY):
         table = file.read([each.name for each in flat], use_threads=False)
         dictionaries = [number for number, kind in enumerate(table.schema.types) if pa.types.is_dictionary(kind)]
         arrays = [array for number in dictionaries for array in table.column(number).chunks]
         lengths = (call_function("binary_length", [each.dictionary]).take(each.indices) for each in arrays)
-        _check_sizes(path, sum(each.sum().as_py() or 0 for each in lengths))
+        _check_table_limits(path, sum(each.sum().as_py() or 0 for each in lengths))
         for number in dictionaries:
             kind = table.schema.field(number).type.value_type
             table = table.set_column(number, table.column_names[number], table.column(number).cast(kind))
@@ -123,14 +124,14 @@ def _read_parquet(path: Path) -> pd.DataFrame:
     return frame.assign(line=np.arange(len(frame)) + 2)
 
 
-def _check_sizes(path: Path, text_bytes: int = 0, cells: int = 0) -> None:
+def _check_table_limits(path: Path, text_bytes: int = 0, cells: int = 0) -> None:
     if text_bytes > MAX_TEXT_BYTES:
-        raise _refused_file(path, f"it has more than {MAX_TEXT_BYTES:,} bytes of text")
+        raise _unreadable_file_error(path, f"it has more than {MAX_TEXT_BYTES:,} bytes of text")
     if cells > MAX_CELLS:
-        raise _refused_file(path, f"it has more than {MAX_CELLS:,} cells")
+        raise _unreadable_file_error(path, f"it has more than {MAX_CELLS:,} cells")
 
 
-def _refused_file(path: Path, reason: str) -> InputError:
+def _unreadable_file_error(path: Path, reason: str) -> InputError:
     return InputError(f"{path.name}: cannot be read: {reason}; allowed: {ALLOWED_FILES}")
 
 
@@ -143,7 +144,7 @@ def check_unique(path: Path, columns: Iterable[str]) -> None:
 
 def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     if b"<fcd-export" not in head:
-        raise _refused_file(path, "it is XML, but not SUMO's FCD output")
+        raise _unreadable_file_error(path, "it is XML, but not SUMO's FCD output")
     parser, time = expat.ParserCreate(), ""
     names = ["timestep_time", *(f"vehicle_{name}" for name in FCD_ATTRIBUTES)]
     rows, parts = list[tuple[Any, ...]](), list[pd.DataFrame]()
@@ -158,7 +159,7 @@ def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
             time = attributes.get("time", "")
         elif tag == "vehicle":
             if len(parts) * FCD_PART_ROWS + len(rows) == MAX_FCD_VEHICLES:
-                raise _refused_file(path, f"it has more than {MAX_FCD_VEHICLES:,} elements 'vehicle'")
+                raise _unreadable_file_error(path, f"it has more than {MAX_FCD_VEHICLES:,} elements 'vehicle'")
             rows.append((time, *map(attributes.get, FCD_ATTRIBUTES), parser.CurrentLineNumber))
             if len(rows) == FCD_PART_ROWS:
                 store_rows()
@@ -172,18 +173,18 @@ def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
 def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     lines = head.decode("utf-8-sig", errors="ignore").splitlines()[:HEAD_LINES] or [""]
     if b"\0" in head:
-        raise _refused_file(path, "it is not text in UTF-8")
+        raise _unreadable_file_error(path, "it is not text in UTF-8")
     if lines[0].lstrip().startswith(("{", "[")):
-        raise _refused_file(path, "it is JSON")
+        raise _unreadable_file_error(path, "it is JSON")
     header, attributes = _find_header(lines)
     if len(lines) <= header + 2 and len(head) == HEAD_BYTES:
-        raise _refused_file(path, f"line {len(lines)} is longer than {HEAD_BYTES:,} bytes")
+        raise _unreadable_file_error(path, f"line {len(lines)} is longer than {HEAD_BYTES:,} bytes")
     separator = max(",;\t", key=lines[header].count)
     separator = separator if separator in lines[header] else r"\s+"
     cells, options = re.split(separator, lines[header].strip()), dict[str, Any](skiprows=header)
     if all(re.fullmatch(r"\s*-?[\d.eE+-]+\s*", cell) for cell in cells):
         if len(cells) not in HEADERLESS_COLUMNS:
-            raise _refused_file(path, "its first line is not the names of its columns")
+            raise _unreadable_file_error(path, "its first line is not the names of its columns")
         header, options = -1, {"names": HEADERLESS_COLUMNS[len(cells)], "header": None}
     else:
         check_unique(path, cells if separator == r"\s+" else next(csv.reader([lines[header]], delimiter=separator)))
@@ -197,7 +198,9 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
         options = {"header": 0, **options, "names": [*names, *surplus]}
     frame = pd.read_csv(file, sep=separator, encoding="utf-8-sig", skipinitialspace=True, **options)
     if (is_filled := frame[surplus].notna().any(axis=1)).any():
-        raise _refused_file(path, f"line {header + 2 + int(is_filled.argmax())} has more cells than columns have names")
+        raise _unreadable_file_error(
+            path, f"line {header + 2 + int(is_filled.argmax())} has more cells than columns have names"
+        )
     frame = frame.drop(columns=surplus)
     frame = pd.concat([frame, pd.Series(np.arange(len(frame)) + header + 2, frame.index, name="line")], axis=1)
     frame.attrs = attributes
