@@ -61,9 +61,9 @@ either column.
 - *Held* and *not held*: the 95 % interval of the difference lies on one side of zero. It is over trainings, those of
   the same seed paired, on one set of traffic seeds: other seeds would widen it. A claim about several others holds if
   each interval is on its side, and does not hold if one is on the other side; the difference that decides is shown.
-- *Undecided*: the interval includes zero. Brackets have an interval, parentheses the range where there is none: of two
-  values, of differences in two groups, and of differences with both signs where what is compared forms two groups: n
-  values with a gap of more than 1/3 + 2/n of their range, and two or more on each side.
+- *Undecided*: the interval includes zero, or there is none. Brackets have an interval, parentheses the range where there
+  is none: of two values, of differences in two groups, and of differences with both signs where what is compared forms
+  two groups: n values with a gap of more than 1/3 + 2/n of their range, and two or more on each side.
 - *By the expert*: PI, its expert, which the paper does not evaluate alone, has at least 90 % of the difference without
   learning, with the paper's time constant or with 3 s (in A1 on the test seeds), or the method is not shown to be
   better than both; in validation, not better than at first, where its residual is nearly zero, or no training becomes
@@ -72,8 +72,9 @@ either column.
   faster than with other learners is not tested.
 - Values are *similar* where the interval of the difference lies within 10 % of the value. Percentages of training time
   and of Figure 9 hold if the cost is at most, or the gain at least, as large. Of other percentages the sign is judged.
+- *Learning curves* have 100 points; in validation, which is about every 30,000 steps, with lines between validations.
 - *Convergence*: environment steps to 0.9 of TRPO's final return, in blocks of five points of the learning curve, 15,000
-  steps, or at a validation, every 30,000 steps; by this resolution intervals are widened at both ends; all steps if
+  steps, in validation at multiples of 30,000; by this resolution intervals are widened at both ends; all steps if
   never. *Stable*: mean change of the return between points of the learning curve, in its second half.
 - Rules without an interval: collisions are *rare* with fewer than 0.05 vehicles in an episode with each learner, *by
   construction* if no other driver of the table collides either, since SUMO brakes; A2 holds if all trainings are within
@@ -316,12 +317,13 @@ def curve_extreme(
     """Return how to judge that the first variant has the largest (smallest) value in a part of the training."""
 
     def judge_means(version: Version) -> Finding:
-        values = version.curve_means(study, road, variants, quantity, part)
+        is_first = quantity == VALIDATED and part == FIRST
+        values = version.curve_means(study, road, variants, quantity, slice(1) if is_first else part)
         verdict, numbers = compare(values, label_of(variants[0]), larger=larger, digits=digits)
         verdict += version.validation_cause(verdict, study, road, variants[0], quantity)
         key = PAPER_QUANTITIES.get(quantity)
-        if quantity == VALIDATED and part == FIRST:
-            return verdict, f"return at the first validation, after {VALIDATION_STEPS:,} steps: {numbers}"
+        if is_first:
+            return verdict, f"return at the first validation, after about {VALIDATION_STEPS:,} steps: {numbers}"
         if key is None or not verdict.startswith(HELD):
             return verdict, f"{what}: {numbers}"
         rows = version.rows(study, road)

@@ -92,7 +92,7 @@ def selection_effect() -> str:
             values = np.array(curves[name]["return_validation"])
             texts.append(f"{label} {trainings_text(values[:, -1] - values.max(1), 0, '+,')}")
         versions.append(", ".join(texts))
-    what = "return of the last checkpoint, difference to the best, on the seeds that select it (at most 0)"
+    what = "return of the last checkpoint, difference to the best of its curve, on the seeds that select it (at most 0)"
     return f"{what}: {versions[0]}; with the filter {versions[1]} ({RING_SOURCES})"
 
 

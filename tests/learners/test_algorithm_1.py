@@ -165,7 +165,7 @@ def test_vanished_exploration_raises_error(agent: str, monkeypatch: pytest.Monke
     task = Toy(agent=agent)
     log_std = dict(task.learner.sb3.policy.named_parameters())["log_std"]
     monkeypatch.setattr(task.learner, "learn", lambda update: log_std.data.fill_(-200.0))
-    with pytest.raises(UnjamError, match="learner: exploration has ended in iteration 1: a smaller step"):
+    with pytest.raises(UnjamError, match="learner: the exploration noise is zero in iteration 1: a smaller step"):
         task.learn(1)
 
 

@@ -54,7 +54,7 @@ def normalized_differences(rows: EpisodeRows, baseline: EpisodeRows, reference: 
 
 
 def is_gain_capped(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> bool:
-    """Return whether positive gains count as zero: the driver is infeasible or lowers flow, or nothing can be gained."""
+    """Return whether positive gains are zero: the driver is infeasible or lowers flow, or nothing can be gained."""
     flow = paired_difference(rows, baseline, FLOW_METRIC)
     lowers_flow = flow.high < -MAX_FLOW_LOSS * float(np.mean([row[FLOW_METRIC] for row in baseline]))
     return is_gain_negligible(baseline, reference) or lowers_flow or overall_feasibility(rows, baseline) != FEASIBLE

@@ -18,8 +18,8 @@ from unjam.sandbox import limit_memory_growth
 from unjam.sumo_files.reader import BrokenFileError, XmlAttributes, parse_xml
 
 HEAD_BYTES, HEAD_LINES = 1 << 16, 20
-"""number of first bytes from which the format of a file is detected (no line is longer), and of lines in which its header
-is searched"""
+"""number of first bytes from which the format of a file is detected (no line is longer), and of lines in which its
+header is searched"""
 MAX_TEXT_BYTES, MAX_CELLS, MAX_FCD_VEHICLES = 1 << 30, 1 << 27, 1 << 23
 """maximum size of a table: bytes of text (uncompressed, each cell of Parquet counted), cells, and `vehicle` elements of
 FCD output as XML; each takes about five times as much memory"""
