@@ -62,8 +62,8 @@ either column.
   the same seed paired, on one set of traffic seeds: other seeds would widen it. A claim about several others holds if
   each interval is on its side, and does not hold if one is on the other side; the difference that decides is shown.
 - *Undecided*: the interval includes zero, or there is none. Brackets have an interval, parentheses the range where
-  there is none: of two values, of differences in two groups, and of differences with both signs where what is compared forms
-  two groups: n values with a gap of more than 1/3 + 2/n of their range, and two or more on each side.
+  there is none: of two values, of differences in two groups, and of differences with both signs where what is compared
+  forms two groups: n values with a gap of more than 1/3 + 2/n of their range, and two or more on each side.
 - *By the expert*: PI, its expert, which the paper does not evaluate alone, has at least 90 % of the difference without
   learning, with the paper's time constant or with 3 s (in A1 on the test seeds), or the method is not shown to be
   better than both; in validation, not better than at first, where its residual is nearly zero, or no training becomes

@@ -1,6 +1,7 @@
 """What a program asks of files of others."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -34,6 +35,18 @@ def test_code_that_a_folder_names_runs_only_if_it_is_trusted(tmp_path: Path, mon
         unjam.verify_controller(tmp_path)
     found = unjam.verify_controller(tmp_path, trust_code=True)
     assert [each.status for each in found if each.part == "code"] == ["checked"]
+
+
+def test_a_key_is_never_taken_for_trust(tmp_path: Path) -> None:
+    path: Any = tmp_path / "it.unjam"
+    path.write_bytes(content_of())
+    verify: Any = unjam.verify_controller
+    with pytest.raises(TypeError):
+        verify(path, "maker.pub")
+    with pytest.raises(InputError, match=r"trust_code: 'maker\.pub' is not allowed; allowed: True or False"):
+        verify(path, trust_code="maker.pub")
+    with pytest.raises(InputError, match="signer: True is not allowed; allowed: the file of a public key"):
+        verify(path, signer=True)
 
 
 @pytest.mark.long

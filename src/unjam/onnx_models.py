@@ -44,6 +44,8 @@ ALLOWED_FIELDS = {
 ONNX_DOMAINS = "", "ai.onnx"  # both names of the domain of ONNX itself
 TEXT_FIELDS = {"doc_string", "metadata_props", "model_version", "producer_name", "producer_version", "denotation"}
 """fields with texts for readers, which change no number"""
+EXPORT_NOTE = "the first axis is the row of the CAV"
+"""part of the note in a graph that `unjam export` writes"""
 MAX_MODEL_BYTES = 64 * 2**20
 MAX_TENSOR_NUMBERS = MAX_MODEL_BYTES // 4  # of a constant
 MAX_TRIAL_SECONDS = 10.0  # of all trial runs of a model; a network of the usual size needs milliseconds

@@ -8,11 +8,13 @@ from typing import Any
 
 from unjam.child_processes import child_environment, python_command
 from unjam.controller.verify import PartCheck
-from unjam.errors import UnjamError
+from unjam.errors import UnjamError, invalid_value
 from unjam.trust import TRUST_CODE_OPTION
 
 
-def verify_controller(path: Path | str, trust_code: bool = False, signer: Path | str | None = None) -> list[PartCheck]:
+def verify_controller(
+    path: Path | str, *, trust_code: bool = False, signer: Path | str | None = None
+) -> list[PartCheck]:
     """Return the check of each part of a `.unjam` file or a run folder; only trusted code runs.
 
     Each is `checked`, `absent`, or `stated` by the maker alone; no part that is there is left unchecked. As in `unjam
@@ -27,6 +29,10 @@ def verify_controller(path: Path | str, trust_code: bool = False, signer: Path |
         InputError: the first problem, in one line; also code that is not trusted, or a missing signature of `signer`.
         MissingPartError: a part could not be checked, as a package is not installed.
     """
+    if not isinstance(trust_code, bool):
+        raise invalid_value("trust_code", trust_code, "True or False")
+    if not (signer is None or isinstance(signer, Path | str)):
+        raise invalid_value("signer", signer, "the file of a public key")
     options = [*([TRUST_CODE_OPTION] if trust_code else []), *([] if signer is None else [f"--signer={signer}"])]
     parts = _run_json_command("verify", *options, "--", str(path))["parts"]
     return [PartCheck(**part) for part in parts]

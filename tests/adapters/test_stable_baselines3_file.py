@@ -146,6 +146,15 @@ def test_a_pickle_of_millions_of_operations_is_refused_before_they_run(tmp_path:
         policy_driver(file)
 
 
+def test_an_archive_is_not_larger_than_it_states(tmp_path: Path) -> None:
+    file, content = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path), io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr("archive/data.pkl", bytes(100_000_000))
+    change(file, policy_pth=lambda _: content.getvalue())
+    with pytest.raises(InputError, match=r"'archive/data\.pkl' is compressed by another method than deflate"):
+        policy_driver(file)
+
+
 def test_serialized_parts_of_the_data_are_not_read(tmp_path: Path) -> None:
     file = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path)
 

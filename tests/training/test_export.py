@@ -278,6 +278,10 @@ def test_files_that_belong_to_no_controller_are_not_overwritten(
     with pytest.raises(InputError, match=rf"out: .*mine\{suffix} exists and belongs to no mine.unjam"):
         export_controller(run, tmp_path / "mine.unjam", **options)
     assert mine.read_text() == "mine"
+    export_controller(run, tmp_path / "mine.unjam")
+    with pytest.raises(InputError, match=rf"out: .*mine\{suffix} exists and belongs to no mine.unjam"):
+        export_controller(run, tmp_path / "mine.unjam", **options)
+    assert mine.read_text() == "mine"
     mine.unlink()
     for _ in range(2):  # its own files are replaced
         export_controller(run, tmp_path / "mine.unjam", **options)

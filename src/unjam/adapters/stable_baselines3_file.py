@@ -109,11 +109,17 @@ def read_policy(path: Path) -> SavedPolicy:
 
 
 def _read_parts(content: bytes, names: Sequence[str] | None = None) -> dict[str, bytes]:
-    """Return parts of an archive, None: all; raise `ValueError` if it is too large."""
+    """Return parts of an archive, None: all; raise `ValueError` if it is too large, whatever sizes it states."""
+    parts, total = dict[str, bytes](), 0
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        if sum(part.file_size for part in archive.infolist()) > MAX_ARCHIVE_BYTES:
-            raise ValueError(f"larger than {MAX_ARCHIVE_BYTES} bytes")
-        return {name: archive.read(name) for name in (archive.namelist() if names is None else names)}
+        for part in archive.infolist() if names is None else map(archive.getinfo, names):
+            if part.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"{part.filename!r:.60} is compressed by another method than deflate")
+            with archive.open(part) as file:
+                parts[part.filename] = file.read(MAX_ARCHIVE_BYTES - total + 1)
+            if (total := total + len(parts[part.filename])) > MAX_ARCHIVE_BYTES:
+                raise ValueError(f"larger than {MAX_ARCHIVE_BYTES} bytes")
+    return parts
 
 
 def _check_pickles(parts: dict[str, bytes]) -> None:

@@ -18,7 +18,7 @@ from unjam.drivers.driver import Driver
 from unjam.drivers.local_state import LocalState, state_of_ones
 from unjam.drivers.speed_history import CircularWindow
 from unjam.errors import InputError, import_optional
-from unjam.onnx_models import parse_model, quiet_onnx_export
+from unjam.onnx_models import EXPORT_NOTE, parse_model, quiet_onnx_export
 from unjam.tree import leaves, replace_leaves
 
 
@@ -108,7 +108,7 @@ def describe_graph(part: bytes, driver: Driver, action_limit: float, time_step: 
         ],
     }
     model = parse_model(part)
-    model.doc_string = f"{driver.describe()}: a control step of {time_step:g} s; the first axis is the row of the CAV"
+    model.doc_string = f"{driver.describe()}: a control step of {time_step:g} s; {EXPORT_NOTE}"
     model.metadata_props.add(key=DESCRIPTION_KEY, value=tomli_w.dumps(description))
     units = {each["name"]: each["unit"] for each in (*interface["observation"], action)}
     for value in (*model.graph.input, *model.graph.output):

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from unjam.adapters.stable_baselines3_file import read_policy
 from unjam.controller import SUFFIX, controller_bytes, controller_path, make_driver
 from unjam.controller.file import (
     GRAPH_PART,
@@ -29,6 +30,7 @@ from unjam.errors import InputError, import_optional, invalid_value, raise_failu
 from unjam.files import atomic_write, check_parent_folder, make_folder
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import summarize
+from unjam.onnx_models import EXPORT_NOTE, parse_model
 from unjam.processes import PrivateFolder
 from unjam.reports.results import CONTROLLER_FILE, EVALUATION_FILE, is_outdated, read_evaluation
 from unjam.scenarios import example_scenario, make_scenario, scenario_from_recipe, scenario_recipe
@@ -143,7 +145,8 @@ def export_controller(
     siblings = [
         out.with_suffix(suffix) for suffix, is_asked in ((".onnx", onnx), (".zip", stable_baselines3)) if is_asked
     ]
-    if not out.exists() and (others := [str(file) for file in siblings if os.path.lexists(file)]):
+    is_new = not out.exists()
+    if others := [str(file) for file in siblings if os.path.lexists(file) and (is_new or not _is_exported(file))]:
         raise InputError(f"out: {', '.join(others)} exists and belongs to no {out.name}; allowed: another name")
     read_origin = _read_run_origin if source.is_dir() else _read_driver_origin
     road, driver, metadata = read_origin(str(source), scenario, settings or {})
@@ -183,6 +186,15 @@ def export_controller(
         atomic_write(model_file, model)
     car = driver.actuator.describe() if isinstance(driver, FilteredDriver) else ""
     return ExportResult(out, graph_file, model_file, driver.describe(), len(states.speed), car)
+
+
+def _is_exported(file: Path) -> bool:
+    """Return whether an export wrote a graph or a model of Stable-Baselines3."""
+    with suppress(InputError, OSError):
+        if file.suffix == ".zip":
+            return bool(read_policy(file).unjam)
+        return file.is_file() and EXPORT_NOTE in parse_model(file.read_bytes()).doc_string
+    return False
 
 
 def read_in_car(source: str, settings: dict[str, Any], scenario: str = "") -> Controller:
