@@ -146,12 +146,19 @@ def test_a_pickle_of_millions_of_operations_is_refused_before_they_run(tmp_path:
         policy_driver(file)
 
 
-def test_an_archive_is_not_larger_than_it_states(tmp_path: Path) -> None:
+def test_parts_of_an_archive_are_read_up_to_a_common_limit(tmp_path: Path) -> None:
     file, content = save(PPO("MlpPolicy", Space(), device="cpu"), tmp_path), io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_BZIP2) as archive:
-        archive.writestr("archive/data.pkl", bytes(100_000_000))
+        archive.writestr("archive/data.pkl", bytes(1000))
     change(file, policy_pth=lambda _: content.getvalue())
     with pytest.raises(InputError, match=r"'archive/data\.pkl' is compressed by another method than deflate"):
+        policy_driver(file)
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for number in range(3):
+            archive.writestr(f"archive/{number}", bytes(30_000_000))
+    change(file, policy_pth=lambda _: content.getvalue())
+    with pytest.raises(InputError, match="ValueError: larger than 67108864 bytes"):
         policy_driver(file)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from unjam.drivers.safety import Actuator, ActuatorState, FollowingState, SafetyFilter
@@ -151,11 +151,12 @@ def test_without_the_filter_the_same_cars_crash() -> None:
     assert (pursuit.ahead.gap < 0).any()
 
 
-@given(SPEEDS, SPEEDS, GAPS | st.just(inf), st.floats(-3.0, 3.0), STEPS)
+@given(SPEEDS, SPEEDS, GAPS | st.just(inf), st.floats(-3.0, 3.0), STEPS, st.sampled_from([1.0, 0.3, 0.0]))
+@example(2.27840919390205, 0.0, 4.03725439536899, 0.0455, 1.0, 0.3)  # a time gap shorter than a step
 def test_one_car_in_plain_numbers_is_told_what_rows_and_tensors_are(
-    speed: float, leader: float, gap: float, wanted: float, step: float
+    speed: float, leader: float, gap: float, wanted: float, step: float, time_gap: float
 ) -> None:
-    ahead, safety = FollowingState(speed, leader, gap), SafetyFilter()
+    ahead, safety = FollowingState(speed, leader, gap), SafetyFilter(time_gap=time_gap)
     limited = safety.limit(wanted, ahead, step)
     rows = safety.limit(np.array([wanted]), FollowingState(*(np.array([value]) for value in ahead)), step)
     tensors = safety.limit(

@@ -171,7 +171,8 @@ class SafetyFilter(Subclassable):
         """
         if not self.active:
             return acceleration
-        if type(acceleration) is float and actuation is None:
+        # With a time gap shorter than a step, the formulas below allow less than these bounds.
+        if type(acceleration) is float and actuation is None and not 0.0 < self.time_gap < step:
             speed = next_speed(state.speed, acceleration, step)
             leader = clamp_min(state.leader_speed - self.speed_error, 0.0)
             gap = state.gap - (self.gap_error + self.standstill_gap) - step * speed

@@ -95,7 +95,8 @@ def _as_numpy_function(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def call(rows: Any) -> Any:
         first = rows[0]
-        like = next(module.parameters(), first if isinstance(first, torch.Tensor) else torch.zeros((), device="cpu"))
+        is_tensor = isinstance(first, torch.Tensor)
+        like = next(module.parameters(), first if is_tensor else torch.zeros((), dtype=torch.float32, device="cpu"))
 
         def as_own(values: Any) -> Any:
             tensor = values if isinstance(values, torch.Tensor) else torch.tensor(values, device="cpu")
@@ -103,7 +104,7 @@ def _as_numpy_function(function: Callable[..., Any]) -> Callable[..., Any]:
 
         is_record = hasattr(rows, "_fields")
         own = type(rows)(*(None if each is None else as_own(each) for each in rows)) if is_record else as_own(rows)
-        if isinstance(first, torch.Tensor):
+        if is_tensor:
             return map_leaves(lambda tensor: tensor.to(first), module(own))
         with torch.no_grad():
             return map_leaves(lambda tensor: tensor.cpu().numpy(), module(own))

@@ -109,6 +109,8 @@ class LearnedModel:
         After its collision a row still moves, with the reward zero; `crashed` says whether it had one so far.
         """
         observed, actuators, drawn, is_running, _ = self._state
+        if not isinstance(acceleration, Tensor):  # the program can have set another default type
+            acceleration = np.asarray(acceleration, np.float64)
         acceleration = torch.as_tensor(acceleration, device=DEVICE)
         if tuple(acceleration.shape) != tuple(observed.speed.shape):
             raise invalid_value("acceleration: shape", tuple(acceleration.shape), str(tuple(observed.speed.shape)))

@@ -3,7 +3,7 @@
 import random
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import torch
@@ -16,15 +16,14 @@ _training_lock = threading.Lock()
 @contextmanager
 def torch_defaults() -> Iterator[None]:
     """Give torch its own defaults in the block: single precision, the CPU, gradients, no automatic precision."""
-    dtype, device = torch.get_default_dtype(), torch.get_default_device()
-    with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
+    dtype, cpu = torch.get_default_dtype(), torch.device("cpu")
+    on_cpu = nullcontext() if torch.get_default_device() == cpu else cpu  # which makes each operation slower
+    with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False), on_cpu:
         torch.set_default_dtype(torch.float32)
-        torch.set_default_device(None)
         try:
             yield
         finally:
             torch.set_default_dtype(dtype)
-            torch.set_default_device(device if device.type != "cpu" else None)
 
 
 @contextmanager
