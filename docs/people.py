@@ -32,7 +32,7 @@ MODELS = {
 }
 
 FEW_DATA = (0.01, 0.1)
-MODELS_PAIR = "knowledge, IDM", "IDM"
+COMPARED_MODELS = "knowledge, IDM", "IDM"
 """the calibrated IDM with a residual, and without"""
 
 
@@ -242,10 +242,11 @@ def _one_step() -> Finding:
 
 
 def _residual_gain(name: str, what: str, unit: str) -> Finding:
-    own, idm = (_of_seeds(name, each) for each in MODELS_PAIR)
+    own, idm = (_of_seeds(name, each) for each in COMPARED_MODELS)
     values = {"with the residual": own, "calibrated IDM alone": np.full(len(own), idm.mean())}
     verdict, numbers = compare(values, "with the residual", larger=False, digits=2)
-    over_drivers = (f"[{low:.2f}, {high:.2f}]" for low, high in (_drivers_interval(name, each) for each in MODELS_PAIR))
+    intervals = (_drivers_interval(name, each) for each in COMPARED_MODELS)
+    over_drivers = (f"[{low:.2f}, {high:.2f}]" for low, high in intervals)
     alone = list_values({"network alone": _of_seeds(name, "vanilla").mean()}, 2)
     note = f"intervals over drivers {' and '.join(over_drivers)}; {alone}"
     return verdict, f"{what}, 218 drivers of NGSIM [{unit}]: {numbers}; {note}"

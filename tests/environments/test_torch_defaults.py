@@ -1,6 +1,6 @@
 """Other defaults of torch in the program of the user change no number."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,23 +10,13 @@ import pytest
 import torch
 
 import unjam
+from tests.torch_defaults import other_default
 from unjam.adapters import PolicyInput, write_onnx_policy
 from unjam.controller import make_driver
 from unjam.controller.onnx_graph import onnx_graph
 from unjam.drivers.user_driver import as_driver
 
 CPU: Any = {"dtype": torch.float32, "device": "cpu"}
-
-
-@pytest.fixture(params=[torch.float64, torch.float16, torch.device("meta")], ids=str)
-def other_default(request: pytest.FixtureRequest) -> Iterator[Callable[[], None]]:
-    def set_default() -> None:
-        is_type = isinstance(request.param, torch.dtype)
-        (torch.set_default_dtype if is_type else torch.set_default_device)(request.param)
-
-    yield set_default
-    torch.set_default_dtype(torch.float32)
-    torch.set_default_device(None)
 
 
 def drive_rings() -> Any:
@@ -81,13 +71,14 @@ CASES: dict[str, Callable[[Path], Any]] = {
 }
 
 
+@pytest.mark.parametrize("default", [torch.float64, torch.float16, torch.device("meta")], ids=str)
 @pytest.mark.parametrize("name", CASES)
 def test_results_do_not_depend_on_defaults_of_torch(
-    name: str, other_default: Callable[[], None], tmp_path: Path
+    name: str, default: torch.dtype | torch.device, tmp_path: Path
 ) -> None:
     expected = CASES[name](tmp_path)
-    other_default()
-    found = CASES[name](tmp_path)
+    with other_default(default):
+        found = CASES[name](tmp_path)
     for one, other in zip(found, expected, strict=True):
         assert (one.dtype, one.device) == (other.dtype, other.device)
         assert torch.equal(one, other)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import unjam
+from tests.torch_defaults import other_default
 from tests.training.test_model_facts import CONFIG, run
 from unjam.controller import make_driver
 from unjam.drivers.network import Network
@@ -161,12 +162,7 @@ def test_a_model_does_not_depend_on_defaults_of_torch(default: Any, run: Path) -
         return model.roll_out(FOLLOWER, 20).rewards
 
     expected = roll_out()
-    is_type = isinstance(default, torch.dtype)
-    (torch.set_default_dtype if is_type else torch.set_default_device)(default)
-    try:
+    with other_default(default):
         found = roll_out()
-    finally:
-        torch.set_default_dtype(torch.float32)
-        torch.set_default_device(None)
     assert (found.dtype, found.device) == (expected.dtype, expected.device)
     assert torch.equal(found, expected)

@@ -37,6 +37,8 @@ from unjam.training.run_folder import (
 )
 from unjam.training.train import train
 
+FLOW = '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>'
+
 
 def test_empty_folder_is_allowed(tmp_path: Path) -> None:
     create_run_folder(tmp_path, small_config())
@@ -68,7 +70,7 @@ def test_row_model_is_refused_for_inputs_that_it_cannot_continue(tmp_path: Path)
     assert load_config(changes={"scenario": "on-ramp", "model.kind": "road"}).model.model_ratio > 0.0
     with pytest.raises(InputError, match="not allowed on motorway, where CAVs use their own ACC"):
         check_config(load_config(changes={"scenario": "on-ramp", "model.model_ratio": 5.0}))
-    file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
+    file = straight(tmp_path, FLOW)
     asked = {"scenario": str(file), "scenario_options.penetration_rate": 0.5, "expert": "jam-ahead"}
     with pytest.raises(InputError, match=r"jam-ahead and the network use .*lane_speeds"):
         check_config(load_config(changes=asked))
@@ -81,7 +83,7 @@ def test_simulator_is_refused_as_an_expert() -> None:
 
 
 def test_user_networks_have_no_route_position(tmp_path: Path) -> None:
-    file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>')
+    file = straight(tmp_path, FLOW)
     changes = {"scenario": str(file), "scenario_options.cav_types": ["car"], "policy.inputs": ["route_position"]}
     with pytest.raises(InputError, match="'route_position' is not allowed on user-network: it needs positions"):
         check_config(load_config(changes=changes))
@@ -280,7 +282,6 @@ COMMANDS: dict[str, Callable[[Path], Any]] = {
     "expert": lambda folder: check_config(small_config(expert=str(folder))),
     "baseline": lambda folder: check_config(small_config(evaluation__baselines=[str(folder)])),
 }
-FLOW = '<flow id="f" type="car" route="along" begin="0" end="60" period="3"/>'
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from tests.pictures import empty_pictures
+from tests.torch_defaults import other_default
 from tests.training.test_run import STEPS, learn_with, outcome, small_config
 from unjam.controller import load_controller
 from unjam.drivers import ResidualDriver
@@ -255,17 +256,12 @@ def test_training_is_the_same_whatever_defaults_of_torch_the_program_has_set() -
             return torch.stack([loss.detach(), *weights.grad])
 
     expected = make_gradient()
-    torch.set_default_dtype(torch.float64)
-    torch.set_default_device("meta")
-    try:
+    with other_default(torch.float64), other_default(torch.device("meta")):
         with torch.inference_mode(), torch.autocast("cpu", dtype=torch.bfloat16):
             found = make_gradient()
             assert torch.is_inference_mode_enabled()
         assert torch.get_default_dtype() == torch.float64
         assert torch.get_default_device() == torch.device("meta")
-    finally:
-        torch.set_default_dtype(torch.float32)
-        torch.set_default_device(None)
     assert found.dtype == expected.dtype
     assert torch.equal(found, expected)
 

@@ -16,10 +16,9 @@ def test_rows_of_other_versions_are_not_continued(name: str, tmp_path: Path, mon
 
     open_log().append({"score": 1.0})
     assert open_log().rows == [{"score": 1.0}]
-    versions = trial_log.package_versions()
-    if name == "unjam":
-        monkeypatch.setattr(trial_log, "__version__", "0.0")
-    monkeypatch.setattr(trial_log, "package_versions", lambda: versions | {name: "0.0"})
+    current = trial_log.manifest()
+    (current if name == "unjam" else current["packages"])[name] = "0.0"
+    monkeypatch.setattr(trial_log, "manifest", lambda: current)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match=rf"made with other settings \(versions.{name}: '.+' there, '0.0' now\)"):
         open_log()

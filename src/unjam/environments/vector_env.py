@@ -129,7 +129,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         "render_modes": [],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
-    _alternative = OTHER_MODE
+    _alternative = OTHER_MODE  # end of the message that refuses a scenario
     _step_sums = staticmethod(step_metrics)  # returns what is summed over control steps, by name, shape (W,)
 
     def __init__(

@@ -116,9 +116,8 @@ def make_request(
     changes = {**ACC_SETTINGS, **(options or {}), "penetration_rate": ZERO_PENETRATION_RATE}
     road = cast(UserNetwork, make_scenario(file, changes))
     controllers = {name: make_driver(name, road.control_step) for name in drivers if name != ACC_DRIVER}
-    for name in controllers:
-        check_controllers(name, "assess")
     for name, driver in controllers.items():
+        check_controllers(name, "assess")
         if driver.is_native:
             raise invalid_value("driver", name, "the human baseline is always included")
         check_can_drive(driver, road, f"driver {name}")

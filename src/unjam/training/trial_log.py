@@ -8,17 +8,16 @@ from pathlib import Path
 from reprlib import repr as short_repr
 from typing import Any
 
-from unjam import __version__
 from unjam.errors import InputError
 from unjam.files import append_line, atomic_write, read_json_lines, to_json
-from unjam.manifest import manifest, package_versions
+from unjam.manifest import manifest
 from unjam.parameters import flatten_keys
 from unjam.training.run_folder import make_new_folder
 
 REQUEST_FILE, TRIALS_FILE = "request.json", "trials.jsonl"
 FILES_PREFIX = "files."  # of the keys of hashes of files in a flat request
 VERSIONED_PACKAGES = ("eclipse-sumo", "libsumo")
-"""packages whose version, beside that of unjam, all rows of a log must share"""
+"""packages of which, as of unjam, all rows of a log have the same version"""
 
 TrialVerdict = tuple[float | None, str]
 """score and reason; no score if the trial does not count"""
@@ -43,7 +42,8 @@ class RowLog:
 
         Versions of unjam and SUMO are part of the request.
         """
-        versions = {"unjam": __version__, **{name: package_versions()[name] for name in VERSIONED_PACKAGES}}
+        current = manifest()
+        versions = {"unjam": current["unjam"], **{name: current["packages"][name] for name in VERSIONED_PACKAGES}}
         request, path = json.loads(to_json(request | {"versions": versions})), folder / REQUEST_FILE
         starts = list[dict[str, Any]]()
         if path.is_file():
@@ -59,7 +59,6 @@ class RowLog:
                 raise InputError(f"out: {REQUEST_FILE} in {str(folder)!r} is damaged; allowed: a new folder")
         else:
             make_new_folder(folder, ", or that of the same request")
-        current = manifest()
         self.starts = [*starts, {"commit": current["commit"], "started": current["started"]}]
         atomic_write(path, to_json({"request": request, "starts": self.starts}, indent=1))
         self._path = folder / file_name

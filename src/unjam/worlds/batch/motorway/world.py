@@ -224,7 +224,9 @@ class MotorwayBatch:
     def _update_cavs(self) -> None:
         """Record the vehicles after a control step, and take control of the CAVs that have entered."""
         traffic, vehicles = self._traffic, self._traffic.vehicles
-        remains, cav_rows = self._cav_rows() >= 0, np.flatnonzero(self._is_cav[vehicles.road, vehicles.entry])
+        is_cav = self._is_cav[vehicles.road, vehicles.entry]
+        cav_rows = np.flatnonzero(is_cav)
+        remains = find_rows(self._cav_numbers, vehicles, cav_rows) >= 0
         new = cav_rows[~np.isin(vehicle_numbers(vehicles, cav_rows), self._cav_numbers)]
         new = new[np.argsort(vehicle_numbers(vehicles, new), kind="stable")]
         self.remaining_rows = np.flatnonzero(remains).tolist() if len(new) or not remains.all() else None
@@ -233,7 +235,6 @@ class MotorwayBatch:
         if self._is_controlled and len(new):
             vehicles = traffic.vehicles = enable_acc(vehicles, new, self.scenario.cruise)
         self._cav_entry_counts += np.bincount(vehicles.road[new], minlength=len(self.roads))
-        is_cav = self._is_cav[vehicles.road, vehicles.entry]
         measured = MeasuredVehicles(vehicles.lane, vehicles.position, vehicles.speed, is_cav, vehicles.road)
         self._messages.send(self._measurement.update(measured))
         self._local_state = self._exact_state()
