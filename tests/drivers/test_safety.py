@@ -262,6 +262,7 @@ def test_a_car_with_lag_drives_no_farther_than_its_equivalent(
     ("values", "line"),
     [
         ({"leader_braking": 5.0}, "leader_braking: 5 is not allowed; allowed: >= braking, 6"),
+        ({"leader_braking": 1e308}, "leader_braking: 1e+308 is not allowed; allowed: <= 100"),
         ({"time_gap_braking": 7.0}, "time_gap_braking: 7 is not allowed; allowed: 0.5 to braking, 6"),
         ({"time_gap_braking": 1e-6}, "time_gap_braking: 1e-06 is not allowed; allowed: 0.5 to braking, 6"),
         ({"time_gap": -1.0}, "time_gap: -1.0 is not allowed; allowed: greater than or equal to 0"),

@@ -100,6 +100,15 @@ def test_a_signed_file_is_not_certified(unjam: Run, tmp_path: Path, maker: str) 
     assert not (tmp_path / "it.html").exists()
 
 
+def test_a_certificate_does_not_replace_a_page_of_the_user(unjam: Run, tmp_path: Path, maker: str) -> None:
+    page = tmp_path / "it.html"
+    page.write_text("<title>Certificate: my notes</title>")
+    before = (tmp_path / "it.unjam").read_bytes()
+    assert "out: 'it.html' exists and is no certificate" in refusal_message(unjam, "certify", "it.unjam")
+    assert page.read_text() == "<title>Certificate: my notes</title>"
+    assert (tmp_path / "it.unjam").read_bytes() == before
+
+
 def test_a_signature_of_another_key_is_replaced_only_on_demand(unjam: Run, maker: str) -> None:
     other = json.loads(unjam("keys", "other", "--json").stdout)["fingerprint"]
     assert unjam("sign", "it.unjam", "--key", "maker.key").returncode == 0

@@ -1,6 +1,7 @@
 """Training on several roads at once."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 import torch
 
 from tests.training.test_run import Stop, collected_episodes, learn_with, outcome, progress, small_config, stop_after
+from tests.worlds.sumo.user_networks import SPARSE, straight
 from unjam.controller import load_controller
 from unjam.drivers import PISaturation, ResidualDriver
 from unjam.errors import InputError
@@ -16,7 +18,7 @@ from unjam.learners.algorithm_1 import Algorithm1
 from unjam.learners.experience import environment_experience
 from unjam.learners.settings import AGENT_NAMES
 from unjam.reports.results import read_progress
-from unjam.training.config import RunConfig, load_config, planned_steps, to_toml
+from unjam.training.config import RunConfig, TaskConfig, load_config, planned_steps, to_toml
 from unjam.training.run_folder import check_config, read_config
 from unjam.training.train import Trainer, train
 from unjam.worlds.worker_pool import WorkerPool
@@ -54,6 +56,13 @@ def test_missing_task_entries_are_those_of_the_run() -> None:
     assert [task.weight for task in tasks] == [2.0, 1.0, 1.0, 1.0]
     assert [task.reward for task in tasks] == ["eq16"] * 4
     assert [task.scenario.warmup for task in tasks] == [0, 0, 750, 0]
+
+
+@pytest.mark.parametrize(("file", "name"), [("..sumocfg", "road"), ("...sumocfg", "road"), ("my.sumocfg", "my")])
+def test_a_task_never_has_the_folder_of_the_run_or_its_parent(file: str, name: str, tmp_path: Path) -> None:
+    scenario = straight(tmp_path, SPARSE).rename(tmp_path / file)
+    config = replace(small_config(), scenario_options={}, tasks=(TaskConfig(str(scenario)),))
+    assert list(config.task_configs()) == [name]
 
 
 def test_single_road_is_one_task() -> None:

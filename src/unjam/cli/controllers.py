@@ -23,7 +23,7 @@ from unjam.controller.file import (
 )
 from unjam.controller.verify import check_parts, require_complete
 from unjam.drivers.wrappers import FilteredDriver
-from unjam.errors import invalid_value
+from unjam.errors import InputError, invalid_value
 from unjam.files import check_parent_folder
 from unjam.processes import continue_in_limited_child
 from unjam.scenarios import scenario_from_recipe
@@ -123,7 +123,10 @@ def certify_command(
     target = out or (Path(file.name) if is_packaged else file).with_suffix(".html")
     check_parent_folder(target)
     check_unsigned(controller)
-    from unjam.reports.certificate import write_certificate_page  # loads matplotlib
+    from unjam.reports.certificate import is_certificate_page, write_certificate_page  # loads matplotlib
+
+    if out is None and os.path.lexists(target) and not is_certificate_page(target):
+        raise InputError(f"out: {str(target)!r} exists and is no certificate; allowed: --out with the page to write")
 
     certificate = make_certificate(controller)
     assert isinstance(controller.driver, FilteredDriver)  # only such drivers are certified

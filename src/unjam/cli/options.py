@@ -1,5 +1,6 @@
 """Options that several commands share."""
 
+import atexit
 import inspect
 import os
 from collections.abc import Callable, Iterable
@@ -12,7 +13,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from unjam.errors import InputError, invalid_value
-from unjam.files import PACKAGED_PREFIX
+from unjam.files import PACKAGED_PREFIX, make_folder, remove_if_empty
 from unjam.learners.settings import AGENT_NAMES
 from unjam.parameters import parse_assignments
 from unjam.training.executors import Executor
@@ -196,12 +197,28 @@ def parse_settings(texts: list[str] | None, option: str = "--set") -> dict[str, 
 
 
 def new_folder(out: Path | None, name: str) -> Path:
-    """Return the folder for new results: `out`, or the next free one under `runs/`."""
+    """Return the folder for new results: `out`, or the next free one under `runs/`, made for this process alone."""
     if out is not None:
         return out
     stem = Path(name).stem  # a scenario may be a file
-    folders = (Path("runs") / f"{stem}-{number:03d}" for number in count(1))
-    return next(folder for folder in folders if not os.path.lexists(folder))
+    folders = (Path("runs") / f"{stem}-{index:03d}" for index in count(1))
+    return next(folder for folder in folders if _claim_folder(folder))
+
+
+def _claim_folder(folder: Path) -> bool:
+    """Make a folder unless it exists, and remove it at the end of the process if it stays empty.
+
+    Return whether it is free: of processes that start at the same time, only one can make it.
+    """
+    make_folder(folder.parent)
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        return False
+    except OSError:  # the command says why it cannot be made
+        return True
+    atexit.register(remove_if_empty, folder)
+    return True
 
 
 def merge_settings(options: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:

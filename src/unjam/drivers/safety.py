@@ -35,6 +35,8 @@ MAX_RESPONSE_STEPS = 1000
 """most steps that a command can take to arrive, or that the time constant of a lag can last"""
 MIN_TIME_GAP_BRAKING = 0.5
 """smallest braking with which a filter can keep a time gap: it follows the plan to standstill step by step [m/s2]"""
+MAX_LEADER_BRAKING = 100.0
+"""largest braking of a leader, ten times that of a car on a dry road [m/s2]; squares of far larger ones overflow"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -153,6 +155,8 @@ class SafetyFilter(Subclassable):
         own, leader, time_gap = self.braking, self.leader_braking, self.time_gap_braking
         if leader < own:  # else the gap may be smallest before both stand
             raise ValueError(f"leader_braking: {leader:g} is not allowed; allowed: >= braking, {own:g}")
+        if leader > MAX_LEADER_BRAKING:
+            raise ValueError(f"leader_braking: {leader:g} is not allowed; allowed: <= {MAX_LEADER_BRAKING:g}")
         if not MIN_TIME_GAP_BRAKING <= time_gap <= own:
             allowed = f"{MIN_TIME_GAP_BRAKING:g} to braking, {own:g}"
             raise ValueError(f"time_gap_braking: {time_gap:g} is not allowed; allowed: {allowed}")

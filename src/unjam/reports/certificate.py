@@ -14,6 +14,8 @@ from unjam.reports.html import render_template
 
 DOMAIN_QUANTITIES = (("own speed", "speed", "m/s"), ("leader speed", "leader_speed", "m/s"), ("gap", "leader_gap", "m"))
 
+MAX_PAGE_HEAD = 2_000  # of a page, with its generator and title [bytes]
+
 
 def write_certificate_page(
     name: str, driver: FilteredDriver, certificate: dict[str, Any], verdict: str, target: Path
@@ -40,6 +42,15 @@ def write_certificate_page(
         domain=[(label, certificate["domain"][key], unit) for label, key, unit in DOMAIN_QUANTITIES],
     )
     atomic_write(target, text)
+
+
+def is_certificate_page(path: Path) -> bool:
+    """Return whether a file is a page of `write_certificate_page`."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(MAX_PAGE_HEAD)
+    return b'content="unjam ' in head and b"<title>Certificate: " in head
 
 
 def _max_gain(result: dict[str, Any]) -> float:

@@ -192,7 +192,7 @@ class RunConfig(AgentSettings):
         configs: dict[str, RunConfig] = {}
         for task in self.tasks:
             scenario = task.scenario or self.scenario
-            name = base = task.name or Path(scenario).stem
+            name = base = task.name or Path(scenario).stem.strip(".") or "road"
             number = 1
             while name in configs:
                 number += 1
