@@ -175,6 +175,17 @@ def make_folder(path: Path) -> None:
             raise
 
 
+def claim_folder(folder: Path) -> bool:
+    """Make a folder and its parents; return False if it exists: only one of several processes can claim it."""
+    make_folder(folder.parent)
+    with suppress(OSError):  # the function that writes into it reports the reason
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            return False
+    return True
+
+
 def parse_json(content: bytes | str) -> Any:
     """Return the document in strict JSON.
 

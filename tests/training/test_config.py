@@ -32,6 +32,7 @@ def test_default_configuration() -> None:
 def test_later_sources_override_earlier_ones(tmp_path: Path) -> None:
     file = written(tmp_path, "steps = 7\nseed = 7\n[trpo]\ngamma = 0.7\ngae_lambda = 0.7\n")
     made = load_config(file, "paper", {"seed": 8, "trpo.gamma": 0.8})
+    assert load_config(str(file), "paper", {"seed": 8, "trpo.gamma": 0.8}) == made
     assert made.seed == 8  # changes before file
     assert made.trpo.gamma == 0.8
     assert made.steps == 7  # file before preset

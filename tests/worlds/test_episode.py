@@ -91,6 +91,14 @@ def test_an_episode_without_a_simulation_closes_its_own(my_drivers: Path) -> Non
     Simulation().close()
 
 
+def test_an_episode_takes_a_scenario_by_name_and_class(sumo: SumoBackend) -> None:
+    expected = fingerprint(run_episode(Ring(), Human(), 3, backend=sumo))
+    for scenario in ("ring", Ring):
+        assert fingerprint(run_episode(scenario, Human(), 3, backend=sumo)) == expected
+    with pytest.raises(InputError, match=r"^scenario: 'rign' .*ring"):
+        run_episode("rign", Human(), 3, backend=sumo)
+
+
 def test_other_seeds_give_other_roads_and_other_noise(sumo: SumoBackend) -> None:
     seeds = [(0,), (1,), (2,), (0, 1), (1, 1), (1, 2, 3)]
     fixed = replace(RING, length=(230, 230))

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from unjam.errors import InputError, invalid_value
-from unjam.files import PACKAGED_PREFIX, make_folder, remove_if_empty
+from unjam.files import PACKAGED_PREFIX, claim_folder, remove_if_empty
 from unjam.learners.settings import AGENT_NAMES
 from unjam.parameters import parse_assignments
 from unjam.training.executors import Executor
@@ -202,23 +202,9 @@ def new_folder(out: Path | None, name: str) -> Path:
         return out
     stem = Path(name).stem  # a scenario may be a file
     folders = (Path("runs") / f"{stem}-{index:03d}" for index in count(1))
-    return next(folder for folder in folders if _claim_folder(folder))
-
-
-def _claim_folder(folder: Path) -> bool:
-    """Make a folder unless it exists, and remove it at the end of the process if it stays empty.
-
-    Return whether it is free: of processes that start at the same time, only one can make it.
-    """
-    make_folder(folder.parent)
-    try:
-        folder.mkdir()
-    except FileExistsError:
-        return False
-    except OSError:  # the command says why it cannot be made
-        return True
+    folder = next(folder for folder in folders if claim_folder(folder))
     atexit.register(remove_if_empty, folder)
-    return True
+    return folder
 
 
 def merge_settings(options: dict[str, Any], settings: dict[str, Any]) -> dict[str, Any]:

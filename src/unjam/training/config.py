@@ -245,13 +245,14 @@ def planned_steps(config: RunConfig) -> int:
     return ceil(config.steps / steps) * steps
 
 
-def load_config(file: Path | None = None, preset: str = "", changes: dict[str, Any] | None = None) -> RunConfig:
+def load_config(file: Path | str | None = None, preset: str = "", changes: dict[str, Any] | None = None) -> RunConfig:
     """Return a configuration: the defaults, changed by a preset, a TOML file and `changes`, in this order.
 
     Keys of `changes` may have dots: `trpo.gamma`. Raise `InputError` for an unknown key or preset, a value out of
     range, an unreadable file, a file in a run folder that names untrusted Python code, and a function, a class or a
     driver, because a training imports them in other processes, by `path.py:name`.
     """
+    file = None if file is None else Path(file)
     file_values = read_values(file) if file is not None else {}
     if file is not None and _is_in_run_folder(file):  # other files are the user's own
         check_trusted_values(f"config file {file}", file_values)

@@ -19,6 +19,7 @@ from unjam.drivers.requirements import Requirements
 from unjam.drivers.user_driver import DriverLike, as_driver
 from unjam.errors import InputError, NoCavError
 from unjam.parameters import check_integer
+from unjam.scenarios import ScenarioLike, make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.text import format_count
 from unjam.worlds.backend import BackendLike, WorldOptions, check_support, open_backend, open_world
@@ -50,7 +51,7 @@ class Task:
 
 
 def run_episode(
-    scenario: Scenario,
+    scenario: ScenarioLike,
     driver: DriverLike,
     seed: SupportsIndex | Sequence[int],
     reward: RewardLike = "",
@@ -66,7 +67,7 @@ def run_episode(
     process, earlier episodes in it, or the clock. For the user's code the global generators are seeded meanwhile.
 
     Args:
-        scenario: road, traffic and horizon.
+        scenario: road, traffic and horizon: a `Scenario`, its class or its name, as in `unjam.make_scenario`.
         driver: of every CAV: a driver, an object with `act` and `initial_memory`, a class of them, or a function of the
             state.
         seed: an integer or several; all random numbers come from them.
@@ -86,7 +87,7 @@ def run_episode(
             stepped or closed a simulation through libsumo meanwhile (`LostWorkerError`).
         UnjamError: another episode runs in the backend.
     """
-    seed = as_seed(seed)
+    scenario, seed = make_scenario(scenario), as_seed(seed)
     with seeded_generators(seed):
         driver = as_driver(driver, scenario.control_step)  # makes an object of a class
     check_can_drive(driver, scenario)
