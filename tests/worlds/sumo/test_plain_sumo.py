@@ -167,6 +167,32 @@ def test_vehicles_that_wait_for_persons_who_never_come_wait_until_the_end(
     assert plain.depart_delay.max() == 300.0
 
 
+STOP = '<stop lane="road_0" startPos="300" endPos="320" parking="true" {}/>'
+STOPPED = '<vehicle id="stopped" type="car" route="along" depart="0">{}</vehicle>'
+TAXI_TYPE = '<vType id="cab" vClass="taxi"><param key="has.taxi.device" value="true"/></vType>'
+TAXI = f'{TAXI_TYPE}<vehicle id="taxi" type="cab" depart="0" departPos="200"><route edges="road"/></vehicle>'
+VEHICLES_WITHOUT_EXPECTATION = {
+    "idle taxi": TAXI,
+    "taxi after its ride": f'{TAXI}<person id="p" depart="60" departPos="400"><ride from="road" to="road" '
+    'arrivalPos="700" lines="taxi"/></person>',
+    "no passenger": STOPPED.format(STOP.format('triggered="true"')),
+    "no vehicle to join": STOPPED.format(STOP.format('triggered="join" join="other"')),
+}
+
+
+@pytest.mark.parametrize("name", VEHICLES_WITHOUT_EXPECTATION)
+def test_vehicles_that_sumo_does_not_expect_are_simulated_until_the_end(
+    name: str, tmp_path: Path, simulation: Simulation
+) -> None:
+    flow = '<flow id="f" type="car" route="along" begin="1" period="5" number="3"/>'
+    path = straight(tmp_path, VEHICLES_WITHOUT_EXPECTATION[name] + flow, end=600.0, step=0.5)
+    episode, sumo_seed = human_baseline(path, simulation)
+    plain = trips_of_plain_sumo(path, sumo_seed, 600.0)
+    check_same_trips(episode.trips, plain)
+    assert plain.duration.max() == 600.0
+    assert episode.control_steps == 1199
+
+
 def test_trips_of_any_type_have_its_class(tmp_path: Path, simulation: Simulation) -> None:
     vehicles = "".join(
         f'<vType id="{kind}" vClass="{name}"/><vehicle id="{kind}-v@1" type="{kind}" route="along" depart="{n}"/>'

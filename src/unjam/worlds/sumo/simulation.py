@@ -212,7 +212,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         return poses
 
     def expects_vehicles(self) -> bool:
-        """Return whether vehicles are on the road or will enter."""
+        """Return whether SUMO expects vehicles: on the road, without those that wait for an event, or still to enter."""
         return self._sumo.simulation.getMinExpectedNumber() > 0
 
     def route_of(self, name: str) -> tuple[str, ...]:

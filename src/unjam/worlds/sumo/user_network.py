@@ -129,9 +129,11 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
             vehicles.add_removals(self._teleport_totals[1] - jam_total)
 
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
-        # SUMO does not expect the vehicles that calibrators will add.
-        until, simulation = self.road.files.calibrated_until, self._simulation
-        self.is_finished = not simulation.expects_vehicles() and (not until or simulation.now() >= until)
+        # SUMO expects neither vehicles that calibrators will add, nor idle taxis and stopped vehicles that wait for a
+        # passenger or another vehicle; plain SUMO simulates these until --end.
+        simulation = self._simulation
+        may_change = simulation.expects_vehicles() or simulation.vehicle_count() > 0
+        self.is_finished = not may_change and simulation.now() >= self.road.files.calibrated_until
         if self.options.record_details:
             self._route_counts.update(simulation.route_of(name) for name in entered_names)
 
