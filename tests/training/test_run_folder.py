@@ -134,6 +134,7 @@ def test_run_out_of_patience_takes_no_more_steps(tmp_path: Path) -> None:
     create_run_folder(tmp_path, config)
     rows = [{"iteration": n, "return_expert": 5.0, "return_validation": 4.0} for n in (1, 2, 3)]
     (tmp_path / "progress.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    save_checkpoint(tmp_path / "checkpoint", {"iteration": 3}, {})
     resume_run_folder(tmp_path, config)
     with pytest.raises(InputError, match=rf"^steps: {9 * STEPS} is not allowed: evaluation.patience"):
         resume_run_folder(tmp_path, replace(config, steps=9 * STEPS))
@@ -247,6 +248,26 @@ def test_progress_older_than_the_checkpoint_is_refused_and_nothing_changes(
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.parametrize("content", ["two iterations", "evaluation", "evaluation of a task"])
+@pytest.mark.parametrize("has_folder", [True, False])
+def test_a_run_that_has_lost_its_checkpoint_is_not_started_anew(content: str, has_folder: bool, tmp_path: Path) -> None:
+    config = small_config(tasks=[{"name": "first"}] if "task" in content else [])
+    create_run_folder(tmp_path, config)
+    rows = [f'{{"iteration": {iteration}}}\n' for iteration in range(1, 3 if "two" in content else 2)]
+    (tmp_path / "progress.jsonl").write_text("".join(rows))
+    if has_folder:
+        (tmp_path / "checkpoint").mkdir()
+    if len(rows) == 1:
+        resume_run_folder(tmp_path, config)  # it was stopped before its first checkpoint
+    if "evaluation" in content:
+        (tmp_path / "first").mkdir()
+        (tmp_path / ("first" if "task" in content else "") / "evaluation.json").write_text("{}")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=r"^resume: .* has no checkpoint .*; allowed: the run with its checkpoint/"):
+        resume_run_folder(tmp_path, replace(config, steps=9 * STEPS))
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
 def controller(seed: int) -> bytes:
     driver = ResidualDriver(PISaturation(), random_network(seed=seed), 3.0)
     return controller_bytes(driver, {"time_step": 0.1, "iteration": seed})
@@ -300,7 +321,9 @@ def test_a_controller_that_is_not_in_the_checkpoint_is_refused_before_anything_r
     assert not (tmp_path / "out.unjam").exists()
 
 
-def test_controllers_of_the_checkpoint_are_accepted_also_with_a_certificate(tmp_path: Path) -> None:
+def test_controllers_of_the_checkpoint_are_accepted_also_with_a_certificate(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     folder = run_with_controllers(tmp_path / "run")
     file = folder / "controller.unjam"
     for number in (11, 1):
@@ -315,6 +338,10 @@ def test_controllers_of_the_checkpoint_are_accepted_also_with_a_certificate(tmp_
     for checkpoint in (folder / "checkpoint").iterdir():
         checkpoint.unlink()
     check_controller(folder, "evaluate")
+    assert not caplog.text
+    (folder / "progress.jsonl").write_text('{"iteration": 1}\n')
+    check_controller(folder, "evaluate")
+    assert "cannot be compared with the training: the run has no checkpoint" in caplog.text
     file.unlink()
     check_controller(folder, "evaluate")
     check_controller(tmp_path / "nowhere", "evaluate")

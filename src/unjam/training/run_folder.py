@@ -5,6 +5,7 @@ imported for checkpoints, so that errors are reported quickly.
 """
 
 import json
+import logging
 import os
 import re
 from collections.abc import Collection, Iterable, Iterator
@@ -32,7 +33,7 @@ from unjam.folders import reject_unsafe_files
 from unjam.manifest import manifest, package_versions
 from unjam.parameters import build_dataclass, check_integer, read_toml
 from unjam.processes import LOCK_FILE, is_locked, lock_folder
-from unjam.reports.results import CONTROLLER_FILE, read_progress
+from unjam.reports.results import CONTROLLER_FILE, EVALUATION_FILE, read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.training.config import CONFIG_FILE, MANIFEST_FILE, RunConfig, load_config, read_values, to_toml
@@ -45,6 +46,8 @@ from unjam.worlds.reward import make_reward
 
 if TYPE_CHECKING:
     from unjam.learners.algorithm import Tensors
+
+_LOG = logging.getLogger(__name__)
 
 CHECKPOINT_FORMAT = 7
 """format of run folders and their checkpoints; other formats are refused"""
@@ -213,7 +216,8 @@ def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
 def resume_run_folder(folder: Path, config: RunConfig) -> None:
     """Write the new budget of `config` into the run in `folder`.
 
-    Raise `InputError` if more than steps and workers differs, or if the folder belongs to one task of a run.
+    Raise `InputError` if more than steps and workers differs, if the folder belongs to one task of a run, or if the run
+    has lost its checkpoints.
     """
     parent = folder.absolute().parent
     if folder.name in _task_names(parent):
@@ -228,6 +232,10 @@ def resume_run_folder(folder: Path, config: RunConfig) -> None:
     if config.steps < min(before.steps, done):
         raise invalid_value("steps", config.steps, f">= {done}, which are done")
     check_run_files(folder, config, "resume", ignored_prefixes=())
+    is_evaluated = any((folder / task / EVALUATION_FILE).is_file() for task in before.task_configs())
+    if (is_evaluated or len(progress) > 1) and not _checkpoint_files(folder / "checkpoint"):
+        reason = "has no checkpoint to continue from, and a new start would overwrite its results"
+        raise InputError(f"resume: {str(folder)!r} {reason}; allowed: the run with its checkpoint/, or a new run")
     if config != before:  # names of files remain as they are
         changed = {**read_toml(folder / CONFIG_FILE), "steps": config.steps, "workers": config.workers}
         files.atomic_write(folder / CONFIG_FILE, tomli_w.dumps(changed))
@@ -378,15 +386,19 @@ def check_controllers(driver_name: str, command: str) -> None:
 def check_controller(folder: Path, command: str) -> None:
     """Raise `InputError` if the controller in the folder of a run or task is not one of the newest checkpoint.
 
-    Other folders, runs without a checkpoint and runs that are being trained are not checked. It may be the path of the
-    controller in the folder.
+    Other folders and runs that are being trained are not checked; for a run without a checkpoint a warning is logged.
+    `folder` may be the path of the controller in the folder.
     """
     folder = folder.parent if folder.name == CONTROLLER_FILE else folder
     file, parent = folder / CONTROLLER_FILE, folder.absolute().parent
     tasks = [*_task_names(parent)]
     run, index = (parent, tasks.index(folder.absolute().name)) if folder.absolute().name in tasks else (folder, 0)
     newest, *_ = next(_valid_checkpoints(run / "checkpoint"), (None,))
-    if newest is None or not file.is_file() or is_locked(run):
+    if not file.is_file() or is_locked(run):
+        return
+    if newest is None:
+        if read_progress(run):
+            _LOG.warning("%s: %s cannot be compared with the training: the run has no checkpoint", command, file)
         return
     stored: list[bytes] = []
     with suppress(*files.INVALID_DATA_ERRORS), safe_open(newest, "np") as tensors:

@@ -212,7 +212,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         return poses
 
     def expects_vehicles(self) -> bool:
-        """Return whether SUMO expects vehicles: on the road, without those that wait for an event, or still to enter."""
+        """Return whether vehicles that wait for no passenger or other vehicle are on the road or will enter."""
         return self._sumo.simulation.getMinExpectedNumber() > 0
 
     def route_of(self, name: str) -> tuple[str, ...]:
