@@ -186,6 +186,18 @@ def claim_folder(folder: Path) -> bool:
     return True
 
 
+def read_json_object(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file that unjam wrote; raise `InputError` if it is damaged."""
+    try:
+        content = parse_json(path.read_bytes())
+        if isinstance(content, dict):
+            return content
+        reason = "it has no object"
+    except (ValueError, RecursionError) as error:
+        reason = str(error)
+    raise InputError(f"{path}: the file is damaged: {reason}; allowed: the file as unjam wrote it")
+
+
 def parse_json(content: bytes | str) -> Any:
     """Return the document in strict JSON.
 

@@ -1,6 +1,5 @@
 """Run the trainings that studies need, each once, and write the studies: `unjam reproduce`."""
 
-import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -18,13 +17,13 @@ from unjam.drivers.network import network_weights
 from unjam.drivers.registry import driver_recipe
 from unjam.drivers.residual import ResidualDriver
 from unjam.errors import InputError, unknown_name
-from unjam.files import make_folder, sha256_of, sha256_of_file, to_json
+from unjam.files import make_folder, read_json_object, sha256_of, sha256_of_file, to_json
 from unjam.manifest import manifest, package_versions
 from unjam.reports.results import read_results
 from unjam.scenarios import SCENARIOS, scenario_recipe
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
-from unjam.training.config import RunConfig, load_config
+from unjam.training.config import MANIFEST_FILE, RunConfig, load_config
 from unjam.training.evaluate import evaluate, raise_failures, save_evaluation
 from unjam.training.executors import CommandLine, Executor, run_all, training_command
 from unjam.training.run_folder import read_config
@@ -183,7 +182,7 @@ def _has_current_references(road: str, study_folder: StudyFolder) -> bool:
 
 
 def _training_record(run: PlannedRun, study_folder: StudyFolder) -> dict[str, Any]:
-    commit = json.loads((study_folder.run_folder(run) / "manifest.json").read_text(encoding="utf-8"))["commit"]
+    commit = read_json_object(study_folder.run_folder(run) / MANIFEST_FILE).get("commit", "")
     driver = load_controller(study_folder.controller_folder(run))
     assert isinstance(driver, ResidualDriver)
     return {"run": run.name, "commit": commit, "weights_sha256": sha256_of(save(network_weights(driver.network)))}

@@ -13,6 +13,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,8 @@ from matplotlib.figure import Figure
 
 from unjam.child_processes import initialize_pool_process, isolated_start
 from unjam.controller import controller_hash
-from unjam.files import atomic_write, make_folder, sha256_of, to_json
+from unjam.errors import InputError
+from unjam.files import atomic_write, make_folder, read_json_object, sha256_of, to_json
 from unjam.reports.figures import png_bytes
 
 COLUMNS = "columns"
@@ -151,13 +153,15 @@ def measure_parts(folder: Path, parts: Mapping[str, StudyPart], workers: int) ->
     files = {name: folder / f"{name}.json" for name in parts}
 
     def stored_part(name: str) -> dict[str, Any]:
-        return json.loads(files[name].read_text(encoding="utf-8")) if files[name].is_file() else {"stamp": ""}
+        with suppress(InputError):  # a damaged part is measured again
+            return read_json_object(files[name]) if files[name].is_file() else {}
+        return {}
 
     def save_part(name: str, result: Any) -> None:
         make_folder(files[name].parent)
         atomic_write(files[name], to_json({"stamp": stamps[name], "result": result}))
 
-    missing = {name: part for name, part in parts.items() if stored_part(name)["stamp"] != stamps[name]}
+    missing = {name: part for name, part in parts.items() if stored_part(name).get("stamp") != stamps[name]}
     count = max(1, min(workers, len(missing)))
     if count == 1:
         for name, (function, arguments) in missing.items():

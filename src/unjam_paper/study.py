@@ -1,7 +1,7 @@
 """Building blocks of studies: planned and finished runs, the folder that holds them, and the table of drivers."""
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from itertools import product
@@ -15,20 +15,20 @@ from matplotlib.figure import Figure
 
 from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
-from unjam.errors import raise_failure
-from unjam.files import atomic_write, make_folder
+from unjam.errors import InputError, raise_failure
+from unjam.files import atomic_write, make_folder, read_json_object, remove
 from unjam.manifest import manifest, without_folders
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import estimate_cell, with_no_break_spaces
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, estimate, estimate_on_shared_seeds, estimate_over_trainings, format_ci
-from unjam.reports.results import CONTROLLER_FILE, EVALUATION_FILE, read_rows
+from unjam.reports.results import CONTROLLER_FILE, EVALUATION_FILE, is_outdated, read_evaluation, read_rows
 from unjam.road_family import NO_LATENCY
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import held_out_seeds
 from unjam.training.config import RunConfig, load_config
 from unjam.training.evaluate import TRAINED_LABEL, evaluate, raise_failures
-from unjam.training.run_folder import read_complete_progress, read_config
+from unjam.training.run_folder import check_controller, read_complete_progress, read_config
 from unjam.worlds.batch.run import run_batches
 from unjam.worlds.record import Episode, Floats
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
@@ -130,22 +130,30 @@ class StudyFolder:
 
     def copy_controllers(self, runs: Iterable[PlannedRun], study: Path) -> None:
         """Copy the controllers of trainings into the folder of a study, as controllers/VARIANT-SEED.unjam."""
+        controllers = {f"{run.variant}-{run.seed}.unjam": self.controller_folder(run) / CONTROLLER_FILE for run in runs}
         make_folder(study / CONTROLLERS)
-        for run in runs:
-            content = (self.controller_folder(run) / CONTROLLER_FILE).read_bytes()
-            atomic_write(study / CONTROLLERS / f"{run.variant}-{run.seed}.unjam", content)
+        for file in (study / CONTROLLERS).glob("*.unjam"):
+            if file.name not in controllers:  # more trainings were in the study before
+                remove(file)
+        for name, controller in controllers.items():
+            atomic_write(study / CONTROLLERS / name, controller.read_bytes())
 
     def reference_folder(self, road: str) -> Path:
         """Return the folder with the evaluation of the reference drivers on a road."""
         return self.folder / "references" / road
 
     def is_finished(self, run: PlannedRun) -> bool:
-        """Return whether a training with these settings is finished; raise `InputError` if its progress is cut."""
+        """Return whether a training with these settings is finished, and its controller is evaluated.
+
+        Raise `InputError` if its progress is cut, or if a controller is not the one that it trained.
+        """
         folder = self.run_folder(run)
-        files = [folder / road / EVALUATION_FILE for road in run.config.task_configs()]
-        if not all(file.is_file() for file in files) or read_config(folder) != run.config:
+        evaluated = [folder / road for road in run.config.task_configs()]
+        if not all((part / EVALUATION_FILE).is_file() for part in evaluated) or read_config(folder) != run.config:
             return False
-        return bool(read_complete_progress(folder))
+        for part in evaluated:
+            check_controller(part, "reproduce")
+        return bool(read_complete_progress(folder)) and all(_has_evaluation(part, run.config) for part in evaluated)
 
     def trained_runs(self, road: str, variants: Iterable[str], seeds: int) -> dict[str, list[TrainedRun]]:
         """Return the finished trainings on a road by variant, one for each seed."""
@@ -195,6 +203,15 @@ class Study:
             write_figure(folder, name, draw(folder))
 
 
+def _has_evaluation(folder: Path, config: RunConfig) -> bool:
+    """Return whether a folder has an evaluation of the controller in it with the episodes of the configuration."""
+    with suppress(InputError):  # it is damaged
+        metadata, rows = read_evaluation(folder)
+        episodes = len(rows.get(TRAINED_LABEL, ()))
+        return episodes == config.evaluation.episodes and not is_outdated(folder, metadata)
+    return False
+
+
 def write_manifest(folder: Path, **metadata: Any) -> None:
     """Write the manifest of a study: that of its first call with this `metadata`, and all resumptions."""
     make_folder(folder)
@@ -202,7 +219,7 @@ def write_manifest(folder: Path, **metadata: Any) -> None:
     about["command"] = without_folders(about["command"])
     if file.is_file():
         resumption = {name: about[name] for name in ("commit", "started")}
-        about = json.loads(file.read_text(encoding="utf-8"))
+        about = read_json_object(file)
         about["resumptions"] = [*about.get("resumptions", []), resumption]
     write_part(folder, "manifest", {**about, **metadata})
 

@@ -1,7 +1,8 @@
 import json
 import math
 import pickle
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 
 from unjam.controller import make_driver
 from unjam.errors import InputError
-from unjam.files import atomic_write
+from unjam.files import atomic_write, to_json
 from unjam.reports.results import PLOT_EPISODES_FILE
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
@@ -232,6 +233,63 @@ def test_a_training_with_other_settings_is_refused(reproduced: Made) -> None:
             make_plan(["small"], 2, StudyFolder(folder))
     finally:
         atomic_write(config, before)
+
+
+CHANGES: dict[str, Callable[[bytes], bytes]] = {
+    "fewer episodes": lambda content: to_json(
+        (document := json.loads(content)) | {"rows": document["rows"][:-1]}
+    ).encode(),
+    "another controller": lambda content: re.sub(rb'"weights": "[0-9a-f]{8}', b'"weights": "00000000', content),
+    "damaged": lambda content: content[:-9],
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_training_without_its_own_evaluation_is_evaluated_again(reproduced: Made, change: str) -> None:
+    folder, _ = reproduced
+    run = PlannedRun("small", "plain", 1)
+    file = folder / "runs" / run.name / "evaluation.json"
+    before = file.read_bytes()
+    changed = CHANGES[change](before)
+    assert changed != before
+    try:
+        atomic_write(file, changed)
+        assert make_plan(["small"], 2, StudyFolder(folder)).runs == [run]
+    finally:
+        atomic_write(file, before)
+    assert make_plan(["small"], 2, StudyFolder(folder)).runs == []
+
+
+def test_a_foreign_controller_in_a_training_is_refused(reproduced: Made) -> None:
+    folder, _ = reproduced
+    file, other = (folder / "runs/small" / variant / "0/controller.unjam" for variant in ("plain", "with-model"))
+    before = file.read_bytes()
+    try:
+        atomic_write(file, other.read_bytes())
+        with pytest.raises(InputError, match=r"^reproduce: '.*controller\.unjam' is not a controller of the newest"):
+            make_plan(["small"], 2, StudyFolder(folder))
+    finally:
+        atomic_write(file, before)
+
+
+@pytest.mark.parametrize("name", ["runs/small/plain/0/manifest.json", "small/manifest.json"])
+def test_a_damaged_manifest_is_named(reproduced: Made, name: str) -> None:
+    folder, _ = reproduced
+    before = (folder / name).read_bytes()
+    try:
+        atomic_write(folder / name, before[:-9])
+        with pytest.raises(InputError, match=rf"{name}: the file is damaged: .*; allowed: "):
+            run_plan(make_plan(["small"], 2, StudyFolder(folder)), 1)
+    finally:
+        atomic_write(folder / name, before)
+
+
+def test_a_study_of_fewer_trainings_has_only_their_controllers(reproduced: Made, tmp_path: Path) -> None:
+    folder, _ = reproduced
+    for seeds in (2, 1):
+        StudyFolder(folder).copy_controllers([PlannedRun("small", "plain", seed) for seed in range(seeds)], tmp_path)
+        names = sorted(file.name for file in (tmp_path / "controllers").iterdir())
+        assert names == [f"plain-{seed}.unjam" for seed in range(seeds)]
 
 
 @pytest.mark.long

@@ -99,6 +99,9 @@ def test_a_part_is_measured_again_only_if_its_arguments_changed(tmp_path: Path) 
     changed: dict[str, StudyPart] = {**parts(2), "of-1": (square, (3,))}
     assert measure_parts(tmp_path, changed, 1) == {"of-0": {"square": 0}, "of-1": {"square": 9}}
     assert MEASURED == [0, 1, 3]
+    (tmp_path / "of-0.json").write_text('{"stamp": "')  # damaged
+    assert measure_parts(tmp_path, changed, 1)["of-0"] == {"square": 0}
+    assert MEASURED == [0, 1, 3, 0]
 
 
 def test_a_part_is_measured_again_if_a_controller_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,7 +175,8 @@ def test_a_finished_training_with_cut_progress_is_refused(kept: list[int], tmp_p
     studies, run = StudyFolder(tmp_path), PlannedRun("ring", "trpo", 0)
     folder = studies.run_folder(run)
     create_run_folder(folder, run.config)
-    (folder / "evaluation.json").write_text(json.dumps({"rows": [{"driver": "trained"}]}))
+    rows_of_driver = [{"driver": "trained"}] * run.config.evaluation.episodes
+    (folder / "evaluation.json").write_text(json.dumps({"rows": rows_of_driver}))
     save_checkpoint(folder / "checkpoint", {"iteration": 3}, {})
     rows = {number: {"iteration": number, "return_mean": float(number)} for number in (1, 2, 3)}
     (folder / "progress.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows.values()))

@@ -254,12 +254,12 @@ def _task_names(folder: Path) -> Collection[str]:
 def append_lineage(folder: Path, iteration: int) -> None:
     """Add to a run's manifest the environment in which it is resumed after an iteration."""
     path = folder / MANIFEST_FILE
-    try:
-        made = json.loads(path.read_text())
-        lineage = [*made.get("lineage", []), {"iteration": iteration, **manifest()}]
-    except (ValueError, AttributeError, TypeError) as error:
-        raise InputError(f"run: {path} cannot be read: {error}") from None
-    files.atomic_write(path, to_json({**made, "lineage": lineage}, indent=1))
+    facts = files.read_json_object(path)
+    lineage = facts.get("lineage", [])
+    if not isinstance(lineage, list):
+        raise InputError(f"{path}: lineage is no list; allowed: the file as unjam wrote it")
+    facts["lineage"] = [*lineage, {"iteration": iteration, **manifest()}]
+    files.atomic_write(path, to_json(facts, indent=1))
 
 
 def controller_origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
