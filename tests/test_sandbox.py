@@ -1,5 +1,6 @@
 """What a process that reads files of others can still do."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -125,6 +126,17 @@ def test_a_limited_child_that_fails_is_reported_in_one_line(what: str, code: int
     assert (ran.returncode, words in ran.stderr) == (code, True), ran.stderr
     if words == TOO_LONG:
         assert len(ran.stderr.splitlines()) == 1
+
+
+def test_a_temporary_folder_of_a_library_is_removed_by_the_parent_of_a_limited_child(tmp_path: Path) -> None:
+    """matplotlib makes one if it cannot write below HOME, and the child is not allowed to remove it."""
+    environment = {**os.environ, "HOME": "/proc/none", "TMPDIR": str(tmp_path), "MPLCONFIGDIR": ""}
+    code = "import matplotlib; matplotlib.get_cachedir()\n" + LIMITED
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
+    assert (ran.returncode, ran.stdout != "") == (0, True)
+    assert "temporary cache directory" in ran.stderr
+    assert "Traceback" not in ran.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])

@@ -1,9 +1,11 @@
 """Processes that end with their parent, and folders that only one process at a time can write."""
 
+import atexit
 import ctypes
 import json
 import os
 import platform
+import shutil
 import signal
 import socket
 import stat
@@ -126,6 +128,7 @@ def continue_in_limited_child(description: str, *writable: Path) -> None:
     parent = os.getpid()
     child = os.fork()
     if child == 0:
+        atexit.unregister(shutil.rmtree)  # this process removes temporary folders of libraries, such as matplotlib's
         follow_parent(parent)
         limit_resources(MAX_CHILD_MEMORY, MAX_CHILD_TIME)
         confine_process(*writable)

@@ -8,6 +8,12 @@ import typer
 from unjam import cli
 
 
+def caused_by(cause: BaseException, as_context: bool) -> RuntimeError:
+    error = RuntimeError("Error calling __set_name__ on 'property' instance")
+    error.__cause__, error.__context__ = (None, cause) if as_context else (cause, None)
+    return error
+
+
 def raising(error: BaseException) -> Callable[..., None]:
     def app(**options: object) -> None:
         raise error
@@ -20,6 +26,9 @@ def raising(error: BaseException) -> Callable[..., None]:
     [
         (typer.Abort(), 130, "interrupted"),
         (KeyboardInterrupt(), 130, "interrupted"),
+        (caused_by(KeyboardInterrupt(), as_context=False), 130, "interrupted"),
+        (caused_by(caused_by(KeyboardInterrupt(), as_context=False), as_context=True), 130, "interrupted"),
+        (caused_by(cli._Terminated(15), as_context=False), 143, "terminated"),
         (MemoryError(), 2, "memory: there is not enough for this command"),
         (RuntimeError("can't start new thread"), 2, "memory: there is not enough for this command"),
         (RecursionError("maximum recursion depth exceeded"), 2, "input: it is nested too deeply"),

@@ -137,7 +137,7 @@ def _run_app() -> int:
         for text in sys.argv[1:]:
             if any("\ud800" <= letter <= "\udfff" for letter in text):  # bytes that are not UTF-8
                 raise invalid_value("arguments", text, "text in UTF-8")
-        code = app(standalone_mode=False) or 0
+        code = _call_app()
         # typer returns this code without a message
         return _print_error("interrupted", code) if code == INTERRUPTED_EXIT_CODE else code
     except UnjamError as error:
@@ -166,6 +166,18 @@ def _run_app() -> int:
             return _print_error(TOO_LITTLE_MEMORY, InputError.exit_code)
         if hasattr(error, "format_message"):
             return _print_error(_usage_text(error), InputError.exit_code)
+        raise
+
+
+def _call_app() -> int:
+    """Run the command and return its exit code; an interruption is raised even if other code has replaced it."""
+    try:
+        return app(standalone_mode=False) or 0
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause := cause.__cause__ or cause.__context__:  # Python replaces it while it defines classes
+            if isinstance(cause, KeyboardInterrupt | _Terminated):
+                raise cause from None
         raise
 
 
