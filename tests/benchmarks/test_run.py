@@ -70,6 +70,8 @@ def test_a_second_call_drives_only_the_missing_roads(
     assert not result.missing_roads
     monkeypatch.setattr("unjam.benchmarks.run._drive_road", None)  # nothing is driven
     assert unjam.benchmark("pi", suite, file) == result
+    unjam.benchmark("pi", suite, file, progress=lines.append, roads=ROADS[:1])
+    assert lines[-1] == "1 of 1 road in a.json; not driven again"
 
 
 def test_a_trial_on_some_roads_cannot_be_compared_and_can_be_continued(suite: str, tmp_path: Path) -> None:

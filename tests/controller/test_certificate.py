@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from unjam.cli import app
 from unjam.controller import certificate as certificates
 from unjam.controller import string_stability
 from unjam.controller.certificate import (
@@ -22,6 +24,7 @@ from unjam.controller.file import (
     CERTIFICATE_PART,
     MANIFEST_PART,
     SAMPLE_PART,
+    Controller,
     add_certificate,
     controller_bytes,
     pack_parts,
@@ -289,3 +292,23 @@ def test_states_that_no_cav_observes_are_not_certified(change: dict[str, Any], w
         certify_driver(filter_driver(PISaturation()), visited_states()._replace(**change), PAPER_IDM)
     with pytest.raises(InputError, match="certify: a sample of 5 states is not allowed; allowed: 21 or more"):
         certify_driver(filter_driver(PISaturation()), visited_states(5), PAPER_IDM)
+
+
+@pytest.mark.parametrize("page", [None, "<html>"])
+def test_a_certificate_that_is_not_stored_leaves_no_page(
+    page: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, target = written(tmp_path), tmp_path / "page.html"
+    certificate = make_certificate(read_controller(file))
+    if page:
+        target.write_text(page)
+
+    def change_controller(controller: Controller) -> dict[str, Any]:
+        written(tmp_path, filter_driver(ACC()))
+        return certificate
+
+    monkeypatch.setattr(certificates, "make_certificate", change_controller)
+    ran = CliRunner().invoke(app, ["certify", str(file), "--out", str(target)])
+    assert isinstance(ran.exception, InputError)
+    assert "changed" in str(ran.exception)
+    assert (target.read_text() if target.exists() else None) == page

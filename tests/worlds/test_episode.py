@@ -305,6 +305,12 @@ def late(outcome):
     speed = outcome.speeds.mean(-1)
     return {"good": speed, "bad": np.where(np.arange(len(speed)) == 7, np.inf, speed)}
 
+def large(outcome):
+    return {"good": outcome.speeds.mean(-1), "bad": np.full(len(outcome.speeds), -1e308)}
+
+def empty(outcome):
+    return {}
+
 def total(outcome):
     return outcome.speeds.mean()
 
@@ -325,6 +331,12 @@ def test_a_reward_that_is_not_finite_is_refused_with_its_term_and_step(
     file.write_text(BAD_REWARDS)
     with pytest.raises(InputError, match=r"reward rewards\.py:late: step 7: term 'bad' is inf; allowed: finite"):
         run_episode(RING, IDM(), (0,), f"{file}:late", backend=sumo)
+    with pytest.raises(InputError, match=r"large: step 0: term 'bad' is -1e\+308; allowed: finite, at most 1e\+100"):
+        run_episode(RING, IDM(), (0,), f"{file}:large", backend=sumo)
+    with pytest.raises(InputError, match=r"empty: it has no terms; allowed: at least one"):
+        run_episode(RING, IDM(), (0,), f"{file}:empty", backend=sumo)
+    with pytest.raises(InputError, match=r"term 'speed' is .*e\+20\d; allowed: finite, at most 1e\+100"):
+        run_episode(RING, IDM(), (0,), "released:speed=1e208", backend=sumo)
 
 
 @pytest.mark.parametrize("name", ["total", "each_vehicle"])

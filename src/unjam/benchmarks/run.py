@@ -120,9 +120,10 @@ def benchmark(
     with lock, WorkerPool(workers or os.cpu_count() or 1) as pool:
         if path is not None and os.path.lexists(path):
             result = _stored_result(path, result)
-            progress(f"{len(result.roads)} of {format_count(len(scenarios), 'road')} in {path.name}; not driven again")
+            stored = len({*chosen} - {*result.missing_roads})
+            progress(f"{stored} of {format_count(len(chosen), 'road')} in {path.name}; not driven again")
         remaining = [name for name in result.missing_roads if name in chosen]
-        for number, name in enumerate(remaining, len(result.roads) + 1):
+        for number, name in enumerate(remaining, len(chosen) - len(remaining) + 1):
             scenario = scenarios[name]
             human = make_driver(HUMAN_LABEL, scenario.control_step)
             used, rows = human_used, baseline = _drive_road(scenario, human, backend, pool)

@@ -24,7 +24,7 @@ from unjam.controller.file import (
 from unjam.controller.verify import check_parts, require_complete
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.errors import InputError, invalid_value
-from unjam.files import check_parent_folder
+from unjam.files import atomic_write, check_parent_folder, remove
 from unjam.processes import continue_in_limited_child
 from unjam.scenarios import scenario_from_recipe
 from unjam.training.export import export_controller, has_usual_car, measure_test_episode, read_in_car
@@ -131,10 +131,15 @@ def certify_command(
     certificate = make_certificate(controller)
     assert isinstance(controller.driver, FilteredDriver)  # only such drivers are certified
     verdict = describe_string_stability(certificate, controller.driver)
+    previous_page = target.read_bytes() if target.is_file() else None
     # If the page cannot be written, the controller must stay unchanged.
     write_certificate_page(file.name, controller.driver, certificate, verdict, target)
     if not is_packaged:
-        add_certificate(file, controller, certificate)
+        try:
+            add_certificate(file, controller, certificate)
+        except BaseException:  # the page would certify what the controller does not contain
+            remove(target) if previous_page is None else atomic_write(target, previous_page)
+            raise
     if json:
         print_json({"file": str(file), "page": str(target), "certificate": certificate})
         return

@@ -1,7 +1,7 @@
 """Rewards as sums of named terms, used both in the environment and in the learned model."""
 
 from collections.abc import Callable, Sequence
-from math import isfinite, isnan
+from math import isnan
 from sys import float_info
 from typing import Any, NamedTuple
 
@@ -38,6 +38,8 @@ STEADY_FUEL = 0.05
 """fuel of a mid-size car at a constant speed of 10 to 25 m/s [ml/m]"""
 STANDSTILL_SPEED = 1e-3
 """lower limit of the speed in time gaps [m/s]"""
+MAX_REWARD_TERM = 1e100
+"""limit of a term in one control step, so that no return overflows"""
 MAX_REWARD_CELLS = 4_000_000
 """control steps times vehicles in one call of a reward function: hours of traffic need not be in memory at once"""
 
@@ -324,14 +326,18 @@ def _step_outcomes(
 def validate_reward_terms(
     reward: Reward, outcome: Outcome, start: int = 0, row_name: str = "step"
 ) -> dict[str, Floats]:
-    """Return the terms in steps from `start` on; raise `InputError` unless each has a finite value per step."""
+    """Return the terms in steps from `start` on; raise `InputError` unless each has an allowed value per step."""
     label, terms = f"reward {object_label(reward)}", dict[str, Floats]()
-    for name, answer in reward(outcome).items():
+    answers = reward(outcome)
+    if not answers:
+        raise InputError(f"{label}: it has no terms; allowed: at least one")
+    for name, answer in answers.items():
         row = "control step" if row_name == "step" else row_name
         values = answer_as_array(answer, len(outcome.speeds), label, f"term {name!r}", row)
-        if not np.isfinite(values).all():
-            row = int(np.argmax(~np.isfinite(values)))
-            raise InputError(f"{label}: {row_name} {start + row}: term {name!r} is {values[row]}; allowed: finite")
+        is_allowed = abs(values) <= MAX_REWARD_TERM
+        if not is_allowed.all():
+            row, allowed = int(np.argmin(is_allowed)), f"finite, at most {MAX_REWARD_TERM:g}"
+            raise InputError(f"{label}: {row_name} {start + row}: term {name!r} is {values[row]:g}; allowed: {allowed}")
         terms[name] = values
     return terms
 
@@ -351,7 +357,7 @@ def step_reward_terms(reward: Reward, outcome: Outcome, step: int, needs_rows: b
     """
     if not needs_rows:
         terms = {name: float(value) for name, value in reward(outcome).items()}
-        if all(map(isfinite, terms.values())):
+        if all(abs(value) <= MAX_REWARD_TERM for value in terms.values()):  # NaN is refused, too
             return terms
     rows = Outcome(*(np.array(values, ndmin=axes) for values, axes in zip(outcome, (2, 2, 2, 1, 1, 2), strict=True)))
     if step == 0:  # a constant of one number would be right for one step only
