@@ -127,5 +127,7 @@ def test_infeasible_trials_of_an_expert_with_an_amplifying_default_end_in_one_li
     monkeypatch.setattr("unjam.training.tune._score_rows", lambda rows, human_rows: (None, "brakes too hard"))
     monkeypatch.setattr(OperatingPoint, "string_gain", lambda self, driver: 1.0 + float(driver.catch_up_speed == 1.0))
     space: SearchSpace = {"catch_up_speed": FloatDistribution(2.0, 3.0)}
+    lines, roads, limit = list[str](), {"ring": SMALL}, MAX_STRING_GAIN
     with WorkerPool(1) as workers, pytest.raises(UnjamError, match="all 2 settings of pi are infeasible"):
-        tune({"ring": SMALL}, "pi", space, STEPS, tmp_path, workers, max_string_gain=MAX_STRING_GAIN)
+        tune(roads, "pi", space, STEPS, tmp_path, workers, on_message=lines.append, max_string_gain=limit)
+    assert lines[-1] == "pi: not selected: a string gain of 2; allowed: at most 1.02"

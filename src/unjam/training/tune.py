@@ -241,6 +241,9 @@ def tune(
     best_values = list({each.driver: each.values for each in ranked}.values())[:TUNING_FINALISTS]
     *finalists, default = score_settings([*best_values, {}], episodes, 2 * episodes, sumo_runners)
     is_default_allowed = not points or string_gain(default.driver) <= max_string_gain
+    if not is_default_allowed:
+        gain = string_gain(default.driver)
+        on_message(f"{default.driver}: not selected: a string gain of {gain:.4g}; allowed: at most {max_string_gain:g}")
     best = max((*finalists, default) if is_default_allowed else finalists, key=_score_of, default=None)
     if best is None or best.score is None:
         raise UnjamError(f"all {trial_count} settings of {expert} are infeasible: {default.verdict}")
