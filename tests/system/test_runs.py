@@ -37,9 +37,12 @@ def test_remove_asks_and_refuses_other_folders(unjam: Run, tmp_path: Path) -> No
     assert elsewhere.returncode == 2
     assert "allowed: after it, as in unjam runs remove --folder studies" in elsewhere.stderr
     assert (tmp_path / "runs" / "ring-001").is_dir()
+    (tmp_path / "runs" / "ring-002" / "notes.txt").write_text("mine")
+    kept = unjam("runs", "remove", "ring-002", "--yes")
+    assert kept.stderr == "removed runs/ring-002, except files that unjam did not write: notes.txt\n"
     assert unjam("runs", "remove", "ring-001", "runs/ring-001", "--yes").returncode == 0
     assert not (tmp_path / "runs" / "ring-001").exists()
-    assert (tmp_path / "runs" / "ring-002").is_dir()
+    assert [path.name for path in (tmp_path / "runs" / "ring-002").iterdir()] == ["notes.txt"]
 
 
 def test_an_empty_list_suggests_a_training(unjam: Run) -> None:

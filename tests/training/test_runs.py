@@ -12,7 +12,7 @@ from unjam.files import append_line, to_json
 from unjam.measures.metrics import METRICS
 from unjam.processes import lock_folder
 from unjam.reports.results import CONTROLLER_FILE, weights_id
-from unjam.training.config import RunConfig, load_config
+from unjam.training.config import RunConfig, TaskConfig, load_config
 from unjam.training.run_folder import create_run_folder
 from unjam.training.runs import config_differences, read_run, remove_run
 
@@ -112,9 +112,23 @@ def test_only_the_run_is_removed(under: Path, monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(InputError, match="has the working folder"):
         remove_run(Path("."))
     monkeypatch.chdir(under)
-    remove_run(under / "ring-001")
+    assert remove_run(under / "ring-001") == []
     assert not (under / "ring-001").exists()
     assert (under / "notes" / "config.toml").is_file()
+
+
+def test_files_of_the_user_in_a_run_are_not_removed(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    config = replace(CONFIG, tasks=(TaskConfig(name="first"), TaskConfig(name="second")))
+    write_run(folder, config, 400)
+    notes = [folder / "notes.txt", folder / "second" / "data" / "mine.csv"]
+    parts = [folder / "first" / "report.html", folder / "checkpoint" / "a.safetensors", folder / ".a1.part"]
+    for path in (*notes, *parts):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("")
+    assert sorted(remove_run(folder)) == notes
+    assert sorted(path for path in folder.rglob("*") if path.is_file()) == notes
+    assert not (folder / "first").exists()
 
 
 def test_missing_root_folder_is_refused() -> None:

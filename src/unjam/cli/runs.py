@@ -18,7 +18,7 @@ from unjam.errors import InputError, resume_hint
 from unjam.measures.statistics import format_difference
 from unjam.processes import check_not_locked, continue_in_limited_child, lock_folder
 from unjam.reports.results import CONTROLLER_FILE, read_progress, read_results
-from unjam.text import printable
+from unjam.text import printable, shorten_list
 from unjam.training.evaluate import evaluate_run, evaluation_steps, gain_over_expert
 from unjam.training.run_folder import check_controller, check_run_files, lock_new_folder, read_config
 from unjam.training.runs import config_differences, find_run, list_runs, read_run, remove_run
@@ -305,7 +305,8 @@ def remove_command(
 ) -> None:
     """Remove runs and their folders permanently, after confirmation.
 
-    Runs that are being trained, and folders that are not run folders, are refused.
+    Files in them that unjam did not write stay. Runs that are being trained, and folders that are not run folders, are
+    refused.
 
     Example:
 
@@ -321,8 +322,9 @@ def remove_command(
         size = sum(path.stat().st_size for path in run.folder.rglob("*") if path.is_file()) / 1e6
         question = f"Remove {run.folder} ({run.state}, {run.steps:,} steps, {size:.0f} MB)?"
         if yes or typer.confirm(printable(question)):
-            remove_run(run.folder)
-            err_console.print(f"removed {run.folder}")
+            others = [str(path.relative_to(run.folder)) for path in remove_run(run.folder)]
+            kept = f", except files that unjam did not write: {shorten_list(others)}" if others else ""
+            err_console.print(f"removed {run.folder}{kept}", soft_wrap=True)
     if json:
         print_json({"removed": [str(run.folder) for run in runs]})
 

@@ -8,17 +8,32 @@ from pathlib import Path
 from typing import Any, Literal
 
 from unjam.errors import InputError, UnjamError
-from unjam.files import INVALID_DATA_ERRORS, remove
+from unjam.files import INVALID_DATA_ERRORS, is_leftover, remove, remove_if_empty
 from unjam.measures.feasibility import RowsByDriver
 from unjam.measures.statistics import Estimate, paired_difference
 from unjam.parameters import flatten_keys
-from unjam.processes import check_not_locked, is_locked
-from unjam.reports.results import EVALUATION_FILE, damaged_results_error, is_outdated, read_evaluation, read_progress
+from unjam.processes import LOCK_FILE, check_not_locked, is_locked
+from unjam.reports.results import (
+    CONTROLLER_FILE,
+    EVALUATION_FILE,
+    MODEL_FILE,
+    PLOT_EPISODES_FILE,
+    damaged_results_error,
+    is_outdated,
+    read_evaluation,
+    read_progress,
+)
 from unjam.training.config import CONFIG_FILE, MANIFEST_FILE, RunConfig
-from unjam.training.run_folder import read_config
+from unjam.training.run_folder import PROGRESS_FILE, read_config
+from unjam.training.tensorboard import TENSORBOARD_FOLDER
 
 _LOG = logging.getLogger(__name__)
 
+RUN_PARTS = {
+    *(CONFIG_FILE, MANIFEST_FILE, PROGRESS_FILE, CONTROLLER_FILE, EVALUATION_FILE, PLOT_EPISODES_FILE, MODEL_FILE),
+    *("checkpoint", "episodes.parquet", "report.html", LOCK_FILE, TENSORBOARD_FOLDER),
+}
+"""names of the files and folders that trainings and evaluations write into the folder of a run"""
 RunState = Literal["running", "finished", "stopped", "damaged"]
 
 
@@ -121,10 +136,18 @@ def config_differences(runs: Sequence[Run]) -> dict[str, list[Any]]:
     return {name: each for name, each in values.items() if any(value != each[0] for value in each)}
 
 
-def remove_run(folder: Path) -> None:
-    """Remove a run folder permanently; raise `InputError` if it is none, in use, a link or the working folder."""
-    read_run(folder)
+def remove_run(folder: Path) -> list[Path]:
+    """Remove the files of a run permanently, and its folder unless it has others; return the other files.
+
+    Raise `InputError` if it is no run folder, in use, a link or the working folder.
+    """
+    run = read_run(folder)
     if folder.is_symlink() or Path.cwd().is_relative_to(folder.resolve()):
         raise InputError(f"run: {str(folder)!r} is a link or has the working folder; allowed: a run folder elsewhere")
     check_not_locked(folder)
-    remove(folder)
+    for part in dict.fromkeys([*(folder / task for task in run.config.task_configs()), folder]):
+        paths = [path for path in part.glob("*") if path.name in RUN_PARTS or is_leftover(path)]
+        for path in sorted(paths, key=lambda path: path.name == CONFIG_FILE):  # last: a killed process leaves a run
+            remove(path)
+        remove_if_empty(part)
+    return [path for path in folder.rglob("*") if not path.is_dir()]
