@@ -82,14 +82,14 @@ def check_model(model: Any, size: int, opsets: range, ir_versions: range) -> Non
         raise InputError("graph: it contains bytes that ONNX does not know; allowed: fields of ONNX, each once")
     if model.ir_version not in ir_versions:
         raise invalid_value("graph: ir_version", model.ir_version, f"{ir_versions[0]} to {ir_versions[-1]}")
-    imported = [(each.domain, each.version) for each in model.opset_import]
+    imported = [(entry.domain, entry.version) for entry in model.opset_import]
     if len(imported) != 1 or imported[0][0] not in ONNX_DOMAINS or imported[0][1] not in opsets:
         allowed = f"[('', {opsets[0]})]" + (f" to [('', {opsets[-1]})]" if len(opsets) > 1 else "")
         raise invalid_value("graph: opset_import", imported, allowed)
     graph = model.graph
-    if fixed := {each.name for each in graph.initializer} & {each.name for each in graph.input}:
+    if fixed := {tensor.name for tensor in graph.initializer} & {tensor.name for tensor in graph.input}:
         raise invalid_value("graph: initializer", min(fixed), "constants, not inputs")
-    measured = {each.name for each in graph.input}  # what depends on values of inputs, not on their shapes alone
+    measured = {tensor.name for tensor in graph.input}  # what depends on values of inputs, not on their shapes alone
     for node in graph.node:
         _check_node(node, imported[0][1])
         if node.op_type != "Shape" and measured.intersection(node.input):

@@ -76,7 +76,7 @@ class Subclassable:
             _apply_decorator(base)
         if not is_dataclass(cls):
             return
-        inherited, replaced = {each.name: each.type for each in fields(cls)}, dict[str, Any]()
+        inherited, replaced = {entry.name: entry.type for entry in fields(cls)}, dict[str, Any]()
         first = next(base for base in cls.__mro__[1:] if is_dataclass(base))
         for base in cls.__mro__[: cls.__mro__.index(first)]:  # itself, and plain classes that precede the first one
             own = get_annotations(base)
@@ -100,7 +100,7 @@ class Subclassable:
 @cache
 def changed_members(kind: type[Any], base: type[Any]) -> list[str]:
     """Return the members of a class that differ from those of its base, other than values of the base's fields."""
-    kinds, values, missing = kind.__mro__, {each.name for each in fields(base)}, object()
+    kinds, values, missing = kind.__mro__, {entry.name for entry in fields(base)}, object()
     changed = list[str]()
     for name in sorted({name for each in kinds[: kinds.index(base)] for name in (*get_annotations(each), *vars(each))}):
         own, inherited = (getattr_static(each, name, missing) for each in (kind, base))

@@ -47,7 +47,7 @@ def ring_options(
     vehicles: int, cavs: int, warmup: int, spacing: tuple[float, float] = (10.0, 12.27), **extra: Any
 ) -> dict[str, Any]:
     """Return the options of a ring of ideal vehicles; `spacing`: road length per vehicle [m], the paper's."""
-    length = [round(vehicles * each) for each in spacing]
+    length = [round(vehicles * length_per_vehicle) for length_per_vehicle in spacing]
     return {"vehicles": vehicles, "cavs": cavs, "warmup": warmup, "length": length, **IDEAL_VEHICLES, **extra}
 
 

@@ -104,7 +104,7 @@ def _block_sockets(libc: ctypes.CDLL) -> None:
         (answer, 0, 0, 0x7FFF0000),  # allowed
         (answer, 0, 0, 0x00050000 | EPERM),
     )
-    code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *each) for each in instructions))
+    code = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *instruction) for instruction in instructions))
     program = struct.pack("HP", len(instructions), ctypes.addressof(code))
     libc.prctl(SET_SECCOMP, SECCOMP_FILTER_MODE, program, 0, 0)
 

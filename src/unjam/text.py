@@ -22,7 +22,7 @@ def one_line(value: object, length: int = 200) -> str:
 def printable(text: str) -> str:
     """Return a text with `?` for characters that move the cursor, turn the direction of text or are invisible."""
     letters = set(text) - {"\n"}
-    hidden = {each for each in letters if not each.isprintable() and category(each) != "Zs"}
+    hidden = {letter for letter in letters if not letter.isprintable() and category(letter) != "Zs"}
     hidden |= letters & INVISIBLE_LETTERS
     return "".join("?" if letter in hidden else letter for letter in text) if hidden else text
 

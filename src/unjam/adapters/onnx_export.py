@@ -62,7 +62,7 @@ def write_onnx_policy(
 
     common.ClearMetadataAndDocStringPass()(program.model)  # stack traces have paths of this machine
     graph = program.model_proto
-    tables = [each if isinstance(each, str) else _as_table(each) for each in inputs]
+    tables = [entry if isinstance(entry, str) else _as_table(entry) for entry in inputs]
     description: dict[str, Any] = {"inputs": tables, "output": _as_table(output or PolicyOutput())}
     description |= {} if time_step is None else {"time_step": time_step}
     description |= {"expert": expert} if expert else {}

@@ -71,7 +71,7 @@ def _read_described(path: Path) -> tuple[bytes, dict[str, Any]]:
         return _read(path.with_name(name), MAX_MODEL_BYTES), table
     content = _read(path, MAX_MODEL_BYTES)
     with naming(f"driver {path.name}: "):
-        texts = {each.key: each.value for each in parse_model(content).metadata_props}
+        texts = {entry.key: entry.value for entry in parse_model(content).metadata_props}
     if DESCRIPTION_KEY not in texts:
         needed = f"{description_file.name}, with the inputs and the output of the graph"
         raise InputError(f"driver {path.name}: its description is missing; needed: {needed}")

@@ -35,7 +35,7 @@ class SB3VecEnv(VecEnv):
     def reset(self) -> Array:
         """Start an episode in each environment, of the seeds and with the options that were set before."""
         options = self._options[0]
-        if any(each != options for each in self._options):
+        if any(option != options for option in self._options):
             raise InputError("options: different ones are not allowed; allowed: the same for all environments")
         seeds: Any = None if all(seed is None for seed in self._seeds) else self._seeds
         observations, self.reset_infos = self._environment.reset(seed=seeds, options=dict(options))

@@ -219,5 +219,5 @@ def _check_roads(result: BenchmarkResult, suite: Suite) -> None:
                 raise InputError(f"roads.{name}: the metric {wrong[0]:.50} is missing or unknown")
             for key, values in columns.items():
                 is_text = key == "status"
-                if unfit := [each for each in values if isinstance(each, str) is not is_text]:
+                if unfit := [value for value in values if isinstance(value, str) is not is_text]:
                     raise invalid_value(f"roads.{name}.{key}", unfit[0], "texts" if is_text else "numbers")

@@ -186,7 +186,7 @@ def _usage_text(error: Any) -> str:
     words = getattr(getattr(error, "param", None), "opts", ())
     values = [f"; given: {value!r}" for word, value in pairwise(sys.argv) if word in words and value]
     command: Any = getattr(getattr(error, "ctx", None), "command", None)
-    known = [word for each in getattr(command, "params", ()) for word in each.opts]
+    known = [word for parameter in getattr(command, "params", ()) for word in parameter.opts]
     if "--set" in known and getattr(error, "option_name", "--set") not in known:
         from unjam.cli.catalog import suggest_setting  # imported late: it imports all scenarios
 

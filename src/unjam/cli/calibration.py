@@ -168,8 +168,8 @@ def calibrate_command(
     for name, columns in result.estimates().items():
         label, unit, digits = CALIBRATION_COLUMNS[name]
         cells = (
-            f"{one.mean:.{digits}f} [{one.low:.{digits}f}, {one.high:.{digits}f}]" if one.count else "–"
-            for one in columns.values()
+            f"{column.mean:.{digits}f} [{column.low:.{digits}f}, {column.high:.{digits}f}]" if column.count else "–"
+            for column in columns.values()
         )
         table.add_row(label, unit, *cells)
     console.print(table)

@@ -179,7 +179,7 @@ def _packaged_summary(name: str, is_brief: bool) -> str:
 def suggest_setting(option: str, command: str) -> str:
     """Return a hint at the scenario parameters with the name of an unknown option, such as `--delay`; or nothing."""
     name, prefix = option.lstrip("-").replace("-", "_"), "scenario_options." if command in ("train", "search") else ""
-    recipes = (scenario_recipe(example_scenario(each)) for each in SCENARIOS)
+    recipes = (scenario_recipe(example_scenario(name)) for name in SCENARIOS)
     keys = dict.fromkeys(key for recipe in recipes for key in flatten_keys(recipe) if f".{key}".endswith(f".{name}"))
     return f"; parameters of scenarios: {', '.join(f'--set {prefix}{key}=' for key in keys)}" if keys else ""
 

@@ -144,9 +144,9 @@ def certify_command(
         print_json({"file": str(file), "page": str(target), "certificate": certificate})
         return
     console.print(verdict)
-    for each in certificate["string_stability"]:
-        gain = f"gain {max(each['gains']):.3f} at {each['peak_frequency']:.3g} Hz"
-        console.print(f"  at {each['speed']:g} m/s: {'falls behind its leader' if falls_behind(each) else gain}")
+    for point in certificate["string_stability"]:
+        gain = f"gain {max(point['gains']):.3f} at {point['peak_frequency']:.3g} Hz"
+        console.print(f"  at {point['speed']:g} m/s: {'falls behind its leader' if falls_behind(point) else gain}")
     console.print(describe_worst_cases(certificate, controller.driver))
     if is_packaged:
         row = measure_test_episode(controller)

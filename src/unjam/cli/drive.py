@@ -102,7 +102,7 @@ def drive_command(
             output.print_notes([f"plain SUMO has the traffic of the first episode without CAVs: {command}"])
         if result.report is not None:
             err_console.print(f"report: {result.report}")
-        is_drawable = all(len(each.outline) or len(each.poses) for each in result.plot_episodes.values())
+        is_drawable = all(len(episode.outline) or len(episode.poses) for episode in result.plot_episodes.values())
         output.suggest_after_drive(scenario, driver, changes, reward, backend, is_drawable, road.controller)
     raise_failures(result)
 
@@ -242,7 +242,8 @@ def assess_command(
     for line in (document["headline"], document["acc_finding"]):
         output.print_wrapped(line)
     output.print_options(OPTION_HEADINGS, option_rows(parse_assessment(document)))
-    for result in (*assessment.controller_results, *(each for each in assessment.acc_results if each.needs_comment)):
+    notable_acc_results = [result for result in assessment.acc_results if result.needs_comment]
+    for result in (*assessment.controller_results, *notable_acc_results):
         output.print_wrapped(f"- {result.summary}")
     output.print_notes(document["notes"])
     err_console.print(f"report: {assessment.page}", soft_wrap=True)

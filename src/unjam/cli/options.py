@@ -96,7 +96,7 @@ def with_trust_option(command: Callable[..., None]) -> Callable[..., None]:
 
 def _with_parameters(command: Callable[..., None], parameters: Iterable[inspect.Parameter]) -> Callable[..., None]:
     """Set the signature from which typer makes the options of a command."""
-    keywords = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
+    keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
     command.__signature__ = inspect.Signature(keywords)  # pyright: ignore[reportFunctionMemberAccess]
     return command
 

@@ -130,9 +130,9 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
 
     separator = " " if fits(range(len(headings)), " ") else "\n"
     blocks = [list[int]()]
-    for each in columns.values():
-        block = sorted([*blocks[-1], *each])
-        blocks[-1:] = [block] if not blocks[-1] or fits(block, separator) else [blocks[-1], each]
+    for values_of_column in columns.values():
+        block = sorted([*blocks[-1], *values_of_column])
+        blocks[-1:] = [block] if not blocks[-1] or fits(block, separator) else [blocks[-1], values_of_column]
     for block in blocks:
         console.print(build_table(block, separator))
     for number, label in enumerate(long_labels, 1):
@@ -277,7 +277,7 @@ def arguments_without(*options: str) -> list[str]:
     for word in words:
         if word in options:
             next(words, "")
-        elif not any(word.startswith(f"{each}=" if each.startswith("--") else each) for each in options):
+        elif not any(word.startswith(f"{option}=" if option.startswith("--") else option) for option in options):
             rest.append(word)
     return rest
 

@@ -123,10 +123,10 @@ def describe_string_stability(certificate: dict[str, Any], driver: FilteredDrive
     results, vehicle = certificate["string_stability"], driver.actuator.describe()
     if not results:
         return f"string stability was not tested, {vehicle}"
-    if any(each["amplified_band"] for each in results):
-        gain = max(gain for each in results for gain in each["gains"] if gain is not None and not isnan(gain))
+    if any(result["amplified_band"] for result in results):
+        gain = max(gain for result in results for gain in result["gains"] if gain is not None and not isnan(gain))
         return f"not string stable, {vehicle}: amplifies oscillations up to {gain:.3g} times"
-    if behind := [f"{each['speed']:g}" for each in results if falls_behind(each)]:
+    if behind := [f"{result['speed']:g}" for result in results if falls_behind(result)]:
         return f"string stability is unknown, {vehicle}: at {', '.join(behind)} m/s it falls behind its leader"
     return f"string stable, {vehicle}"
 
@@ -185,10 +185,10 @@ def _worst_cases(simulate: FollowingSimulator, states: FollowingState, driver: F
     return WorstCases(
         leader_stops=rows,
         steps=2 * stop.size + attack_steps,
-        contacts=int(sum((each.gap.min(0) < 0.0).sum() for each in records)),
-        min_gap=float(min(each.gap.min() for each in records)),
+        contacts=int(sum((record.gap.min(0) < 0.0).sum() for record in records)),
+        min_gap=float(min(record.gap.min() for record in records)),
         min_time_gap=float((gentle_stop.gap[is_moving] / gentle_stop.speed[is_moving]).min(initial=np.inf)),
-        max_braking=max(float(-np.diff(each.speed, axis=0).min()) / step for each in records),
+        max_braking=max(float(-np.diff(record.speed, axis=0).min()) / step for record in records),
         attack=tuple(np.round(attack, 2).tolist()),
     )
 

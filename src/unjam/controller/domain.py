@@ -40,8 +40,8 @@ def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[
             continue
         if mismatch := road_mismatch(controller.manifest, road):
             notes.append(f"{name} {mismatch}")
-        states = [each.states for each in episodes[name].trajectories] if name in episodes else []
-        share = max((outside_domain_share(controller, each) for each in states), default=0.0)
+        states = [trajectory.states for trajectory in episodes[name].trajectories] if name in episodes else []
+        share = max((outside_domain_share(controller, state) for state in states), default=0.0)
         if share > OUTSIDE_DOMAIN_THRESHOLD:
             steps = f"{100 * share:.0f} % of the control steps of its first episode"
             notes.append(f"{name} was outside of its certified domain in {steps}")

@@ -214,7 +214,7 @@ def unpack_parts(file: Path) -> dict[str, bytes]:
             parts[entry.filename] = archive.read(entry)
         # Neither hashes nor a signature cover other bytes, which may be a second file of another kind.
         headers = LOCAL_HEADER_BYTES + INDEX_ENTRY_BYTES  # in front of a part and in the index, each with its name
-        packed = (headers + 2 * len(each.filename.encode()) + each.compress_size for each in archive.infolist())
+        packed = (headers + 2 * len(entry.filename.encode()) + entry.compress_size for entry in archive.infolist())
         if size != ARCHIVE_END_BYTES + sum(packed):
             raise InputError(f"controller {file.name}: has bytes outside its parts; allowed: none, as unjam writes it")
     for name in (MANIFEST_PART, WEIGHTS_PART):

@@ -48,7 +48,9 @@ class Manifest:
     tuning: JsonObject = field(default_factory=dict)
 
 
-PROVENANCE_ENTRIES = tuple(each.name for each in signature(Manifest).parameters.values() if each.default != each.empty)
+PROVENANCE_ENTRIES = tuple(
+    parameter.name for parameter in signature(Manifest).parameters.values() if parameter.default != parameter.empty
+)
 """optional entries, which only the maker can know: origin and measured results of a controller"""
 
 
@@ -99,7 +101,7 @@ def first_difference(
         one, other = (float(str(expected)), float(str(actual))) if is_number else (nan, nan)
         return None if abs(other - one) <= tolerance * max(1.0, abs(other)) else (name, expected, actual)
     differences = (first_difference(one, other, tolerance, allows_missing, key) for key, one, other in pairs)
-    return next((each for each in differences if each is not None), None)
+    return next((difference for difference in differences if difference is not None), None)
 
 
 def driver_interface(driver: Driver, action_limit: float | None = None) -> JsonObject:

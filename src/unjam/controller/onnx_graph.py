@@ -95,9 +95,9 @@ def onnx_graph(driver: Driver, action_limit: float) -> bytes:
 def describe_graph(part: bytes, driver: Driver, action_limit: float, time_step: float) -> bytes:
     """Return a graph with units, and a description of `unjam.adapters.onnx_driver` for a control step [s] in TOML."""
     interface, needs = driver_interface(driver, action_limit), driver.requirements()
-    action, memory = interface["action"], {each["name"]: each["initial"] for each in interface["memory"]}
+    action, memory = interface["action"], {entry["name"]: entry["initial"] for entry in interface["memory"]}
     is_needed = {"loop_length": needs.needs_loop, "route_position": needs.needs_coordinate}
-    names = [each["name"] for each in interface["observation"]]
+    names = [entry["name"] for entry in interface["observation"]]
     description = {
         "inputs": [{"quantity": name} | ({} if is_needed.get(name, True) else {"optional": True}) for name in names],
         "output": {"tensor": action["name"], "limits": [float(action["low"]), float(action["high"])]},
@@ -110,7 +110,7 @@ def describe_graph(part: bytes, driver: Driver, action_limit: float, time_step: 
     model = parse_model(part)
     model.doc_string = f"{driver.describe()}: a control step of {time_step:g} s; {EXPORT_NOTE}"
     model.metadata_props.add(key=DESCRIPTION_KEY, value=tomli_w.dumps(description))
-    units = {each["name"]: each["unit"] for each in (*interface["observation"], action)}
+    units = {entry["name"]: entry["unit"] for entry in (*interface["observation"], action)}
     for value in (*model.graph.input, *model.graph.output):
         state = "state, given back in the next control step; initial values are in the metadata"
         value.doc_string = f"[{units[value.name]}]" if value.name in units else state

@@ -52,7 +52,7 @@ def measure_string_stability(
         amplified = frequencies[gains > 1.0 + GAIN_TOLERANCE]
         human_gains = human_gain(frequencies, speed, humans)
         stable = [n for n in range(MAX_FOLLOWERS + 1) if (gains * human_gains**n).max() <= 1.0 + GAIN_TOLERANCE]
-        tested, own, human = (tuple(each.tolist()) for each in (frequencies, gains, human_gains))
+        tested, own, human = (tuple(values.tolist()) for values in (frequencies, gains, human_gains))
         band = (float(amplified[0]), float(amplified[-1])) if len(amplified) else ()
         peak_frequency = float(frequencies[int(np.argmax(gains))])
         found.append(StringStability(speed, tested, own, human, peak_frequency, band, max(stable, default=0)))

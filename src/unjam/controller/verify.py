@@ -59,7 +59,7 @@ def verify_controller_file(path: Path | str, signer: Path | str | None = None) -
 
 def require_complete(checks: list[PartCheck]) -> None:
     """Raise `MissingPartError` if a part of a controller could not be checked."""
-    if missing := [f"{each.part}: not checked: {each.detail}" for each in checks if each.status == "not checked"]:
+    if missing := [f"{check.part}: not checked: {check.detail}" for check in checks if check.status == "not checked"]:
         raise MissingPartError(f"controller: {'; '.join(missing)}")
 
 
@@ -103,7 +103,7 @@ def _check_driver(controller: Controller) -> Iterator[PartCheck]:
     defaults = "; missing parameters have the defaults of this version" if first_difference(stated, actual) else ""
     detail = f"{driver.describe()}: built from its recipe, of which nothing was ignored{defaults}"
     yield PartCheck("driver", "checked", detail)
-    if files := sorted({each["path"] for each in user_code_recipes(stated)}):
+    if files := sorted({part["path"] for part in user_code_recipes(stated)}):
         detail = "trusted here, with the SHA-256 that the manifest names; its imports and its actions are not checked"
         yield PartCheck("code", "checked", f"{', '.join(short_text(path) for path in files)}: {detail}")
     else:
@@ -159,7 +159,7 @@ def _check_graph(controller: Controller) -> PartCheck:
         answers = replay_states(driver, random_states, _action_limit(controller))
         counts = 1, 2, 3 + secrets.randbelow(MAX_GRAPH_ROWS - 2)  # no maker can know them
         results = (run_graph(part, driver, random_states, rows) for rows in counts)
-        error = max(_max_error("its graph", each, answers, GRAPH_TOLERANCE, "random state {}") for each in results)
+        error = max(_max_error("its graph", result, answers, GRAPH_TOLERANCE, "random state {}") for result in results)
     except MissingPartError as missing:
         return PartCheck("graph", "not checked", str(missing))
     detail = f"within {sample_error:.1e} m/s2 of the sample and {error:.1e} of the driver"
@@ -193,9 +193,9 @@ def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) ->
         values = [*(getattr(now, name) for name in fields), *memory]
         acceleration, *memory = run_session(session, None, dict(zip(inputs, values, strict=True)))
         answers.append(acceleration)
-    if any(each.shape != (rows,) or not (np.abs(each - each[0]) <= BATCH_TOLERANCE).all() for each in answers):
+    if any(answer.shape != (rows,) or not (np.abs(answer - answer[0]) <= BATCH_TOLERANCE).all() for answer in answers):
         raise InputError(f"graph: {rows} CAVs with the same observation get different answers")
-    return np.array([each[0] for each in answers])
+    return np.array([answer[0] for answer in answers])
 
 
 def _random_states(part: bytes, states: LocalState) -> LocalState:

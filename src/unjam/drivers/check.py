@@ -108,6 +108,6 @@ def random_state(generator: np.random.Generator, rows: int, optional_fields: boo
 
 
 def _is_same_tree(tree: Any, other: Any) -> bool:
-    found, before = ({path: values for path, values in leaves(each) if values is not None} for each in (tree, other))
+    found, before = ({path: values for path, values in leaves(state) if values is not None} for state in (tree, other))
     is_same = (np.array_equal(np.asarray(found[path]), before[path], equal_nan=True) for path in found)
     return found.keys() == before.keys() and all(is_same)

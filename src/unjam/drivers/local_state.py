@@ -55,7 +55,9 @@ class LocalState(NamedTuple):
 
     def map(self, function: Callable[..., Any], *others: "LocalState") -> "LocalState":
         """Return `function` applied to each field, together with the same field of the other states."""
-        return LocalState(*(None if each[0] is None else function(*each) for each in zip(self, *others, strict=True)))
+        return LocalState(
+            *(None if values[0] is None else function(*values) for values in zip(self, *others, strict=True))
+        )
 
     def select(self, index: Any) -> "LocalState":
         """Return the state of some rows or steps; `index` is any array index."""

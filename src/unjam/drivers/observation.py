@@ -86,7 +86,10 @@ def _section_speed_feature(field: str, location: str) -> Feature:
     distances = (f"{ROAD_SECTION_LENGTH * number:g} m" for number in range(SECTIONS_AHEAD))
     return Feature(
         lambda inputs: (getattr(inputs.state, field) - inputs.state.speed[..., None]) / SPEED_SCALE,
-        tuple(ScaledInput(f"mean speed {location} {each} ahead - own speed", SPEED_SCALE, "m/s") for each in distances),
+        tuple(
+            ScaledInput(f"mean speed {location} {distance} ahead - own speed", SPEED_SCALE, "m/s")
+            for distance in distances
+        ),
         Requirements(frozenset({field}), needs_arrays=True),
     )
 
@@ -222,7 +225,9 @@ FEATURES: dict[str, Feature] = {
     ),
     "merge_proximity": Feature(
         lambda inputs: merge_proximity(inputs.state),
-        tuple(ScaledInput(f"proximity to {each:g} m before the merge", 1.0, "") for each in PROXIMITY_DISTANCES),
+        tuple(
+            ScaledInput(f"proximity to {distance:g} m before the merge", 1.0, "") for distance in PROXIMITY_DISTANCES
+        ),
         Requirements(frozenset({"distance_to_merge"}), needs_arrays=True),
     ),
     "lane_speeds": _section_speed_feature("lane_speeds", "in own lane"),
@@ -231,8 +236,11 @@ FEATURES: dict[str, Feature] = {
     "adjacent_lanes": Feature(
         lambda inputs: _adjacent_lane_features(inputs.state),
         (
-            *(ScaledInput(f"speed {each} - own speed", RELATIVE_SPEED_SCALE, "m/s") for each in ADJACENT_POSITIONS),
-            *(ScaledInput(f"gap {each}", GAP_SCALE, "m") for each in ADJACENT_POSITIONS),
+            *(
+                ScaledInput(f"speed {position} - own speed", RELATIVE_SPEED_SCALE, "m/s")
+                for position in ADJACENT_POSITIONS
+            ),
+            *(ScaledInput(f"gap {position}", GAP_SCALE, "m") for position in ADJACENT_POSITIONS),
         ),
         Requirements(frozenset({"adjacent_gaps", "adjacent_speeds"}), needs_arrays=True),
     ),
@@ -331,7 +339,7 @@ def observation_inputs(names: Sequence[NetworkInput], expert: Driver) -> tuple[S
 def observation_size(names: Sequence[NetworkInput], expert: Driver) -> int:
     """Return the number of a network's inputs with this expert."""
     columns = memory_size(expert)  # of the features without a description
-    size = sum(columns if each.inputs is None else len(each.inputs) for each in map(feature, names))
+    size = sum(columns if known.inputs is None else len(known.inputs) for known in map(feature, names))
     if not size:
         raise InputError("policy.inputs: expert_memory alone is not allowed: the expert has no memory features")
     return size

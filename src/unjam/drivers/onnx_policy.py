@@ -41,17 +41,17 @@ class OnnxPolicy:
     def initial_memory(self, n: int) -> Memory:
         """Return the initial recurrent state of `n` CAVs, in the types of the graph."""
         rows: Memory = {}
-        for each in self.memory:
-            tensor = self.tensors[each.input]
-            initial = np.array(each.initial, tensor.type)
-            rows[each.input] = np.broadcast_to(initial, (n, *(tensor.shape or ())[1:])).copy()
+        for entry in self.memory:
+            tensor = self.tensors[entry.input]
+            initial = np.array(entry.initial, tensor.type)
+            rows[entry.input] = np.broadcast_to(initial, (n, *(tensor.shape or ())[1:])).copy()
         return rows
 
     def __call__(self, observation: NDArray[np.float64], memory: Memory) -> tuple[Any, Memory]:
         """Return the numbers of the graph and the new recurrent state; raise `InputError` if it cannot be run."""
         values = {name: self._as_input(name, observation[:, columns]) for name, columns in self.columns.items()}
         values |= memory
-        outputs = [self.output, *(each.output for each in self.memory)]
+        outputs = [self.output, *(entry.output for entry in self.memory)]
         session = _cached_session(self.graph)
         if self.is_batched:
             found = run_session(session, outputs, values)
@@ -98,21 +98,21 @@ def _read_policy(content: bytes, description: PolicyDescription, expert: Driver)
     model = parse_model(content)
     remove_texts(model)
     check_model(model, model.ByteSize(), OPSETS, IR_VERSIONS)
-    inputs = {each.name: _read_tensor(each) for each in model.graph.input}
-    outputs = {each.name: _read_tensor(each) for each in model.graph.output}
-    remembered = {each.input for each in description.memory}
+    inputs = {tensor.name: _read_tensor(tensor) for tensor in model.graph.input}
+    outputs = {tensor.name: _read_tensor(tensor) for tensor in model.graph.output}
+    remembered = {entry.input for entry in description.memory}
     if unknown := remembered - inputs.keys():
         raise unknown_name("memory.input", min(unknown), inputs)
     columns = _assign_columns(description, expert, [name for name in inputs if name not in remembered])
     for name, positions in columns.items():
         _check_columns(name, inputs[name].shape, len(positions))
-    others = {each.output for each in description.memory}
-    names = [each for each in outputs if each not in others]
+    others = {entry.output for entry in description.memory}
+    names = [name for name in outputs if name not in others]
     output = description.output.tensor
     if output not in names and (output or len(names) != 1):
         raise unknown_name("output.tensor", output, names)
-    for each in description.memory:
-        _check_memory(each, inputs, outputs)
+    for entry in description.memory:
+        _check_memory(entry, inputs, outputs)
     is_batched = not any((inputs[name].shape or (0,))[0] for name in inputs)
     content = model.SerializeToString()
     return OnnxPolicy(content, columns, output or names[0], description.memory, inputs, is_batched)
@@ -124,20 +124,22 @@ def _read_tensor(value: Any) -> Tensor:
     tensor = value.type.tensor_type
     if tensor.elem_type not in TYPES:
         raise InputError(f"graph: {value.name!r} has the type {tensor.elem_type}; allowed: 1 (float32) or 11 (float64)")
-    shape = tuple(each.dim_value for each in tensor.shape.dim) if tensor.HasField("shape") else None
+    shape = tuple(dimension.dim_value for dimension in tensor.shape.dim) if tensor.HasField("shape") else None
     return Tensor(TYPES[tensor.elem_type], shape)
 
 
 def _assign_columns(description: PolicyDescription, expert: Driver, names: list[str]) -> dict[str, tuple[int, ...]]:
     columns: dict[str, list[int]] = {name: [] for name in names}
     start = 0
-    for each in description.inputs:
-        tensor, default = (each.tensor, each.quantity) if isinstance(each, PolicyInput) else ("", "")
+    for policy_input in description.inputs:
+        tensor, default = (
+            (policy_input.tensor, policy_input.quantity) if isinstance(policy_input, PolicyInput) else ("", "")
+        )
         if not tensor:
             tensor = default if default in columns else names[0] if len(names) == 1 else ""
         if tensor not in columns:
-            raise unknown_name(f"inputs: tensor of {each!r}", tensor, names)
-        size = observation_size((each,), expert)
+            raise unknown_name(f"inputs: tensor of {policy_input!r}", tensor, names)
+        size = observation_size((policy_input,), expert)
         columns[tensor] += range(start, start + size)
         start += size
     for name in names:

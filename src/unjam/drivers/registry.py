@@ -67,13 +67,13 @@ def driver_from_name(text: str, time_step: float) -> Driver:
 
 def driver_recipe(driver: Driver) -> tuple[Recipe, Arrays]:
     """Return the recipe of a driver and its networks' weights; `InputError` if no other process could build it."""
-    for each in _all_drivers(driver):
-        if not _is_portable(each):
+    for component in _all_drivers(driver):
+        if not _is_portable(component):
             reason = "is not allowed here: it drives in its own process only"
-            raise InputError(f"driver: {each.describe()!r} {reason}; allowed: {each.portable_form}")
-        for name, part in (named_parts(each) or {}).items():
+            raise InputError(f"driver: {component.describe()!r} {reason}; allowed: {component.portable_form}")
+        for name, part in (named_parts(component) or {}).items():
             if not isinstance(part, Driver):
-                check_part(f"driver {each.describe()}: {name}", part)
+                check_part(f"driver {component.describe()}: {name}", part)
     return pack(driver, classes={Driver: DRIVER_CLASSES})
 
 
@@ -100,9 +100,9 @@ def driver_from_recipe(recipe: Recipe, weights: Arrays) -> Driver:
         driver = unpack(Driver, recipe, weights, {Driver: DRIVER_CLASSES})
     except ValueError as error:
         raise InputError(f"driver recipe: {error}") from None
-    for each in (each for each in _all_drivers(driver) if isinstance(each, ResidualDriver)):
-        if each.network.input_size != (size := observation_size(each.features, each.expert)):
-            raise InputError(f"network: {each.network.input_size} inputs are not allowed; allowed: {size}")
+    for part in (part for part in _all_drivers(driver) if isinstance(part, ResidualDriver)):
+        if part.network.input_size != (size := observation_size(part.features, part.expert)):
+            raise InputError(f"network: {part.network.input_size} inputs are not allowed; allowed: {size}")
     return driver
 
 

@@ -46,7 +46,7 @@ class ExpertWrapper(DriverWrapper):
 
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
         """Return those of the expert and of the features."""
-        return merge_requirements(super().requirements(road), *(feature(each).requirements for each in self.features))
+        return merge_requirements(super().requirements(road), *(feature(name).requirements for name in self.features))
 
     @property
     def network_inputs(self) -> tuple[ScaledInput, ...]:

@@ -155,7 +155,7 @@ class RoadSections:
         first = (positions // ROAD_SECTION_LENGTH).astype(np.intp).clip(0, self._shape[-1] - 1)
         columns = first[:, None] + np.arange(SECTIONS_AHEAD)
         road = np.broadcast_to(roads, lanes.shape)[:, None]
-        return [means[road, each, columns] for each in (lanes[:, None], -1)]
+        return [means[road, lane, columns] for lane in (lanes[:, None], -1)]
 
 
 class SpeedMeasurement:

@@ -277,7 +277,7 @@ class SafetyFilter(Subclassable):
         if len(rows) == 0:
             return acceleration
         limited = np.array(acceleration)
-        pending = tuple(each[rows] for each in actuator_state.pending)
+        pending = tuple(command[rows] for command in actuator_state.pending)
         own = actuator, ActuatorState(actuator_state.acceleration[rows], pending)
         near = FollowingState(*(values[rows] for values in state))
         limited[rows] = np.minimum(limited[rows], self.max_acceleration(near, step, own))
@@ -340,7 +340,7 @@ class CAVActuation:
     def detach(self) -> None:
         """Let no gradients of torch flow through the states so far."""
         for name, (acceleration, pending) in self._states.items():
-            self._states[name] = ActuatorState(acceleration.detach(), tuple(each.detach() for each in pending))
+            self._states[name] = ActuatorState(acceleration.detach(), tuple(command.detach() for command in pending))
 
     def apply(self, name: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
         """Return the filtered command for a desired acceleration, and the acceleration in this simulation step."""

@@ -38,7 +38,9 @@ class SensorReadings:
     def __init__(self, sensors: Sensors, leader_braking: float, step: float, seed: np.random.SeedSequence) -> None:
         """Take the settings of all CAVs: maximum braking of leaders [m/s2], and time between readings [s]."""
         self._sensors, self._leader_speed_drop, self._step = sensors, leader_braking * step, step
-        self._filter_generator, self._driver_generator = (np.random.default_rng(each) for each in seed.spawn(2))
+        self._filter_generator, self._driver_generator = (
+            np.random.default_rng(child_seed) for child_seed in seed.spawn(2)
+        )
         self._bounds: dict[str, tuple[Array, Array]] = {}
         self._last_readings: dict[str, Floats] = {}
 

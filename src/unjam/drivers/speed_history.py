@@ -56,7 +56,9 @@ class BufferedWindow:
 
     def replace_rows(self, rows: Any, source: "BufferedWindow", source_rows: Any) -> "BufferedWindow":
         """Return a window, in a new buffer, in which some rows are those of another window of as many steps."""
-        own, other = (each.buffer.speeds[each.start : each.start + each.steps] for each in (self, source))
+        own, other = (
+            history.buffer.speeds[history.start : history.start + history.steps] for history in (self, source)
+        )
         return BufferedWindow.from_speeds(replace_columns(own, rows, other, source_rows))
 
     def detach(self) -> "BufferedWindow":

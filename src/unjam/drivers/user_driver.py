@@ -103,7 +103,7 @@ def _as_numpy_function(function: Callable[..., Any]) -> Callable[..., Any]:
             return tensor.to(like) if tensor.is_floating_point() else tensor.to(like.device)
 
         is_record = hasattr(rows, "_fields")
-        own = type(rows)(*(None if each is None else as_own(each) for each in rows)) if is_record else as_own(rows)
+        own = type(rows)(*(None if row is None else as_own(row) for row in rows)) if is_record else as_own(rows)
         if is_tensor:
             return map_leaves(lambda tensor: tensor.to(first), module(own))
         with torch.no_grad():

@@ -25,12 +25,12 @@ class ExternalDriver(Driver):
 
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
         """Return those of the expert and of the features."""
-        of_features = (feature(each).requirements for each in self.features)
+        of_features = (feature(name).requirements for name in self.features)
         return merge_requirements(self.expert.requirements(road), *of_features)
 
     def replace_rows(self, rows: Any, source: "ExternalDriver", source_rows: Any) -> None:
         """Let some CAVs go on with the last observation of CAVs of another driver of this kind."""
-        own, other = (each._expert_acceleration for each in (self, source))
+        own, other = (driver._expert_acceleration for driver in (self, source))
         self._expert_acceleration = replace_entries(own, rows, other, source_rows)
         self._next_memory = replace_memory_rows(self._next_memory, rows, source._next_memory, source_rows)
 

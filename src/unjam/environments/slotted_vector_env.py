@@ -76,7 +76,7 @@ class SlottedEpisodes(Episodes):
         stays = np.flatnonzero(~np.isin(self.world.cav_roads, rows))
         self._slots, self._memory = self._slots[stays], carry_over_memory(self._memory, stays, {}, 0)
         is_shown = ~np.isin(self._departed[0], rows)
-        self._departed = tuple(each[is_shown] for each in self._departed)
+        self._departed = tuple(values[is_shown] for values in self._departed)
         self.world.replace_roads(rows, source.world, source_rows)
         self.observe()
 

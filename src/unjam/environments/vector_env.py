@@ -251,7 +251,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
             return list(range(int(seed), int(seed) + self.num_envs))
         try:
             given = [None] * self.num_envs if seed is None else seed
-            seeds = [None if each is None else as_seed(index(each))[0] for each in given]
+            seeds = [None if seed is None else as_seed(index(seed))[0] for seed in given]
         except TypeError:
             raise invalid_value("seed", seed, "an integer, or one for each environment") from None
         if len(seeds) != self.num_envs:
@@ -394,7 +394,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         """Return the metrics of episodes that have ended behind recorded vehicles, zeros for others."""
         world, values = self._running_episodes.world, np.zeros((len(RECORDED_ROAD_METRICS), self.num_envs))
         for row in rows:
-            motions = [each[row] for each in [*self._motions][-1 - int(world.control_step_counts[row]) :]]
+            motions = [motion[row] for motion in [*self._motions][-1 - int(world.control_step_counts[row]) :]]
             episode = world.episode_of(row, as_numpy(namespace(motions[0]).stack(motions)))
             values[:, row] = [METRICS[name].function(episode) for name in RECORDED_ROAD_METRICS]
         return dict(zip(RECORDED_ROAD_METRICS, map(self._kind.to_array, values), strict=True))

@@ -146,7 +146,7 @@ def calibrate_idm(
     simulated = simulate_followers(individual_idm(individual, weight, settings.limits), segments)
     shares = segments.sample_counts / segments.sample_counts.sum()
     gap_error, speed_error = (float(np.sqrt((mse * shares).sum())) for mse in (simulated.gap_mse, simulated.speed_mse))
-    collisions, seconds = int(simulated.has_collided.sum()), sum(each.seconds for each in trajectories)
+    collisions, seconds = int(simulated.has_collided.sum()), sum(trajectory.seconds for trajectory in trajectories)
     names = CALIBRATED_PARAMETERS
     at_bounds = [name for name in names if is_at_bound(getattr(parameters, name), getattr(settings, name))]
     return CalibratedIDM(parameters, gap_error, speed_error, collisions, seconds, tuple(at_bounds))
@@ -233,12 +233,12 @@ def _calibrate_one_parameter(
     values = _minimize_on_grid(errors, np.linspace(bounds[0], bounds[1], CALIBRATION_GRID_SIZE), len(groups))
     simulated = simulate_followers(model(values), segments)
     mean_squares = simulated.gap_mse, simulated.speed_mse
-    errors_by_group = (_group_errors(each, segments, group, "sample").tolist() for each in mean_squares)
+    errors_by_group = (_group_errors(mean_square, segments, group, "sample").tolist() for mean_square in mean_squares)
     collisions, calibrated = np.bincount(group, simulated.has_collided, len(groups)).astype(int).tolist(), []
     rows = zip(values.tolist(), groups, *errors_by_group, collisions, strict=True)
     for value, trajectories, gap_error, speed_error, crashes in rows:
         parameters, at_bounds = replace(typical, **{name: value}), (name,) if is_at_bound(value, bounds) else ()
-        seconds = sum(each.seconds for each in trajectories)
+        seconds = sum(trajectory.seconds for trajectory in trajectories)
         calibrated.append(CalibratedIDM(parameters, gap_error, speed_error, crashes, seconds, at_bounds))
     return calibrated
 

@@ -74,7 +74,7 @@ class FittedDrivers:
     def report_lines(self) -> list[str]:
         """Return the lines of a report: errors of the simulated gaps, warnings, and the use of the residual."""
         fit, details = self.population.metadata["fit"], self.population.details
-        errors, seconds = np.array([[each["gap_error"], each["seconds"]] for each in details]).T
+        errors, seconds = np.array([[detail["gap_error"], detail["seconds"]] for detail in details]).T
         individual_error = np.sqrt(np.average(np.square(errors), weights=seconds))
         comparison = f"one IDM for all {fit['common']['gap_error']:.2f} m, individual IDMs {individual_error:.2f} m"
         lines = [f"root mean squared error of the simulated gap: {comparison}"]
@@ -83,7 +83,7 @@ class FittedDrivers:
             count = f"{len(at_bounds)} of {len(CALIBRATED_PARAMETERS)} parameters are at a bound of their range"
             reason = "this is not plausible for human drivers; are speeds in m/s and gaps in m?"
             lines.append(f"warning: {count} ({', '.join(at_bounds)}): {reason}")
-        collisions = sum(each["collisions"] > 0 for each in details)
+        collisions = sum(detail["collisions"] > 0 for detail in details)
         if collisions:
             lines.append(f"in the simulation, {format_count(collisions, 'driver')} had a collision with the leader")
         if "residual_gap_errors" in fit:
@@ -113,18 +113,24 @@ def fit_drivers_from_files(
     for file, stem in zip(files, _name_prefixes(files), strict=True):
         read = read_trajectories(file, format, ReadOptions(drop_bad_rows=drop_bad_rows, driver_columns=driver_columns))
         notes += [f"{file.name}: {line}" for line in read.summary_lines()]
-        trajectories += [replace(each, name=stem + each.name, driver=stem + each.driver) for each in read.trajectories]
+        trajectories += [
+            replace(trajectory, name=stem + trajectory.name, driver=stem + trajectory.driver)
+            for trajectory in read.trajectories
+        ]
     for name, value in (filters or {}).items():
         if name not in FILTER_FIELDS:
             raise unknown_name("select", name, FILTER_FIELDS)
-        known = shorten_list(sorted({str(getattr(each, name)) for each in trajectories} - {""})) or "none"
-        trajectories = [each for each in trajectories if getattr(each, name) == value]
+        known = shorten_list(sorted({str(getattr(trajectory, name)) for trajectory in trajectories} - {""})) or "none"
+        trajectories = [trajectory for trajectory in trajectories if getattr(trajectory, name) == value]
         if not trajectories:
             raise InputError(f"select: no trajectory has the {name} {value!r}; available: {known}")
-    time_step = max(each.time_step for each in trajectories)
-    if any(each.time_step != time_step for each in trajectories):
+    time_step = max(trajectory.time_step for trajectory in trajectories)
+    if any(trajectory.time_step != time_step for trajectory in trajectories):
         notes.append(f"trajectories with a shorter time step are interpolated to {time_step:g} s")
-        trajectories = [each if each.time_step == time_step else each.resample(time_step) for each in trajectories]
+        trajectories = [
+            trajectory if trajectory.time_step == time_step else trajectory.resample(time_step)
+            for trajectory in trajectories
+        ]
     population = fit_drivers(trajectories, settings, on_progress)
     origin = manifest()
     # Populations are published: they do not name folders of this machine.
@@ -158,7 +164,7 @@ def fit_drivers(
     for name in settings.individual:
         if name not in CALIBRATED_PARAMETERS:
             raise unknown_name("individual", name, CALIBRATED_PARAMETERS)
-    names = list(dict.fromkeys(each.driver for each in trajectories))
+    names = list(dict.fromkeys(trajectory.driver for trajectory in trajectories))
     if settings.residual and len(names) < MIN_RESIDUAL_DRIVERS:
         raise invalid_value("drivers", len(names), f">= {MIN_RESIDUAL_DRIVERS} for a residual")
     fixed = replace(settings.calibration, initial_headway_weight=(0.0, 0.0))  # drivers have their own headways
@@ -171,7 +177,7 @@ def fit_drivers(
     residual, facts = _fit_residual(trajectories, calibrated, settings) if settings.residual else (None, {})
     return Population(
         typical=typical,
-        drivers=tuple(each.parameters for each in calibrated.values()),
+        drivers=tuple(fit.parameters for fit in calibrated.values()),
         limits=fixed.limits,
         residual=residual,
         details=tuple({"name": name, **_calibration_details(each)} for name, each in calibrated.items()),
@@ -186,14 +192,17 @@ def _calibrate_in_rounds(
     on_progress: DriverProgress,
 ) -> tuple[IDMParameters, dict[str, CalibratedIDM]]:
     """Return the common IDM and that of each driver, calibrated in turn: one IDM for all reacts too weakly."""
-    groups = [[each for each in trajectories if each.driver == name] for name in names]
+    groups = [[trajectory for trajectory in trajectories if trajectory.driver == name] for name in names]
     has_own_headways = "time_headway" in settings.individual
     weights = (0.0, 1.0 if has_own_headways else 0.0)
     typical = calibrate_idm(trajectories, replace(settings.calibration, initial_headway_weight=weights)).parameters
     calibrated: dict[str, CalibratedIDM] = {}
     for number in range(settings.rounds):
         if number:
-            factors = [calibrated[each.driver].parameters.time_headway / typical.time_headway for each in trajectories]
+            factors = [
+                calibrated[trajectory.driver].parameters.time_headway / typical.time_headway
+                for trajectory in trajectories
+            ]
             typical = calibrate_idm(trajectories, settings.calibration, factors).parameters
         arguments = typical, settings.individual, settings.calibration
         own = calibrate_groups(groups, *arguments, lambda done: on_progress(done, len(names)))
@@ -213,7 +222,7 @@ def _fit_residual(
     shares = 1.0 - RESIDUAL_VALIDATION_SHARE, RESIDUAL_VALIDATION_SHARE, 0.0
     split = split_by_driver(trajectories, shares, settings.seed)
     parts = [select_splits(split, name) for name in ("train", "validation")]
-    drivers = [[calibrated[each.driver].parameters for each in part] for part in parts]
+    drivers = [[calibrated[trajectory.driver].parameters for trajectory in part] for part in parts]
     training, validation = map(CalibratedTrajectories, parts, drivers)
     limits = settings.calibration.limits
     network, errors = fit_multi_step(training, validation, limits, settings.multi_step, settings.seed)

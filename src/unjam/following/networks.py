@@ -243,7 +243,7 @@ def _gap_loss(
 
     follow = leader_replay.add_residual(base, recorded_network, limits)(speeds[0], gaps[0])
     states = list(leader_replay.follow_leader(follow, (speeds[0], gaps[0]), (leader_speeds, paths), segments.time_step))
-    speed, gap = (torch.stack(each) for each in zip(*states, strict=True))
+    speed, gap = (torch.stack(values) for values in zip(*states, strict=True))
     squares = (gap - gaps[1:]).square() + (settings.speed_weight * (speed - speeds[1:])).square()
     gap_part = ((squares * is_present).sum(0) / is_present.sum(0) + MEAN_SQUARE_OFFSET).sqrt().mean()
     return gap_part + settings.residual_weight * torch.stack(residuals).square()[is_present].mean()

@@ -121,7 +121,7 @@ def effect_of(rows: EpisodeRows, baseline: EpisodeRows, confidence: float = CONF
     """
     seeds = {str(row["seed"]) for row in rows}
     baseline = [row for row in baseline if str(row["seed"]) in seeds]
-    ran, baseline_ran = ([row for row in each if row["status"] != "failed"] for each in (rows, baseline))
+    ran, baseline_ran = ([row for row in table if row["status"] != "failed"] for table in (rows, baseline))
     fuel_metric = POWER_FUEL_METRIC if is_measured(ran, LAG_METRIC) else FUEL_METRIC
     metrics = TIME_METRIC, FLOW_METRIC, fuel_metric, HARD_BRAKING_METRIC
     differences = (paired_difference(rows, baseline, name, confidence) for name in metrics)
@@ -146,7 +146,7 @@ def _delay_reduction(rows: EpisodeRows, baseline: EpisodeRows, confidence: float
         (metric_value(human, TIME_METRIC) - metric_value(row, TIME_METRIC), metric_value(human, "delay"))
         for row, human in pair_rows(rows, baseline)
     ]
-    saved, delays = np.array([each for each in pairs if np.isfinite(each).all()]).reshape(-1, 2).T
+    saved, delays = np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2).T
     if not len(delays) or delays.mean() <= 0:
         return Estimate(nan, nan, nan, 0)
     return estimate(linearized_ratio(saved, delays).tolist(), confidence)

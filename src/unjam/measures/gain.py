@@ -69,7 +69,7 @@ def normalized_gain(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequenc
     """
     result = estimate(normalized_differences(rows, baseline, reference).tolist())
     limit = 0.0 if is_gain_capped(rows, baseline, reference) else MAX_GAIN
-    mean, low, high = (float(np.clip(each, MIN_GAIN, limit)) for each in (result.mean, result.low, result.high))
+    mean, low, high = (float(np.clip(value, MIN_GAIN, limit)) for value in (result.mean, result.low, result.high))
     return Estimate(mean, low, high, result.count)
 
 

@@ -93,7 +93,7 @@ def metric_table(
     if compared:
         description = f"Share of seeds with a larger return than {baseline}; a tie counts half. Wilson's interval."
         differences = (paired_differences([rows], reference, "return") for rows in compared.values())
-        improvements = (estimate_cell(probability_of_improvement(each), 2) for each in differences)
+        improvements = (estimate_cell(probability_of_improvement(difference), 2) for difference in differences)
         cells = [*(TableCell("") for _ in rows_by_driver), *improvements]
         table.append(TableRow("probability of improvement", "in return", description, cells))
     for name in names:

@@ -425,7 +425,7 @@ def measure(episode: Episode) -> dict[str, Any]:
         "sumo_seed": sumo_seed(episode.seed),
         **{name: getattr(episode, name) for name in ("status", "reason", "error", "teleports", "contacts")},
         "steps": episode.control_steps,
-        "warnings": [asdict(each) for each in episode.warnings],
+        "warnings": [asdict(warning) for warning in episode.warnings],
         **({"slow_entrances": [*map(asdict, episode.slow_entrances)]} if episode.slow_entrances else {}),
         "vehicles": len(episode.vehicle_ids),
         **episode.trips.values_at_end,

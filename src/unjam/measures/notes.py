@@ -26,7 +26,7 @@ def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:
     lost, others = warning_notes(rows_by_driver)
     traffic = early_end_notes, _backlog_notes, _unfinished_trip_notes, _entrance_notes, _flow_notes
     notes = (note(rows_by_driver) for note in (*traffic, teleport_notes, _repeated_drive_notes))
-    return [*lost, *(each for group in notes for each in group), *others]
+    return [*lost, *(note for group in notes for note in group), *others]
 
 
 def count_early_ends(rows: EpisodeRows) -> dict[str, int]:
@@ -115,7 +115,7 @@ def _unfinished_trip_notes(rows_by_driver: RowsByDriver) -> list[str]:
 def _entrance_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note for each entrance at which vehicles wait without a jam, with its values in one episode."""
     rows = (row for rows in rows_by_driver.values() for row in rows)
-    slow = {each["edge"]: each for row in rows for each in row.get("slow_entrances", ())}
+    slow = {entrance["edge"]: entrance for row in rows for entrance in row.get("slow_entrances", ())}
     return [
         f"{edge}: {each['vehicles']} vehicles wait {each['depart_delay']:.0f} s on average for their insertion without "
         f'a jam, and depart at {each["depart_speed"]:.0f} m/s; departSpeed="max" departLane="best" lets them enter '
@@ -130,7 +130,7 @@ def _flow_notes(rows_by_driver: RowsByDriver) -> list[str]:
     flows = dict[str, set[float]]()
     for row in (row for rows in all_rows for row in rows if row["status"] == "completed"):
         flows.setdefault(str(row["seed"]), set()).add(row.get(FLOW_METRIC, nan))
-    is_demand = bool(flows) and all(len(each) == 1 and not isnan(*each) for each in flows.values())
+    is_demand = bool(flows) and all(len(flow) == 1 and not isnan(*flow) for flow in flows.values())
     have_arrived = all(row.get("unfinished_trips", 1) == 0 for rows in all_rows for row in rows)
     if len(all_rows) < 2 or not is_demand or not have_arrived:
         return []
@@ -141,10 +141,10 @@ def warning_notes(rows_by_driver: RowsByDriver) -> tuple[list[str], list[str]]:
     """Return a note with one example for each kind of SUMO's warnings: on missing demand, and others."""
     rows = [row for rows in rows_by_driver.values() for row in rows if row["status"] != "failed"]
     counts, episodes, examples = Counter[str](), Counter[str](), dict[str, str]()
-    for each in (each for row in rows for each in row["warnings"]):
-        examples.setdefault(each["kind"], each["example"])
-        counts[each["kind"]] += each["count"]
-        episodes[each["kind"]] += 1
+    for warning in (warning for row in rows for warning in row["warnings"]):
+        examples.setdefault(warning["kind"], warning["example"])
+        counts[warning["kind"]] += warning["count"]
+        episodes[warning["kind"]] += 1
     lost, others = list[str](), list[str]()
     for kind, count in counts.most_common():
         share = f"{episodes[kind]} of {format_count(len(rows), 'episode')}"

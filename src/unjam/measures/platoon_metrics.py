@@ -104,7 +104,9 @@ def period_amplification(longest: float, shortest: float) -> Callable[[Episode],
         frequencies = np.fft.rfftfreq(len(last), episode.control_step)
         is_in_band = (frequencies > 1.0 / longest) & (frequencies <= 1.0 / shortest)
         recorded_spectrum, last_spectrum = (_spectrum(speeds)[is_in_band] for speeds in (recorded, last))
-        recorded_std, last_std = (float(np.sqrt(np.sum(each**2))) for each in (recorded_spectrum, last_spectrum))
+        recorded_std, last_std = (
+            float(np.sqrt(np.sum(spectrum**2))) for spectrum in (recorded_spectrum, last_spectrum)
+        )
         return last_std / recorded_std if recorded_std > MIN_WAVE_STD else nan
 
     limits = f"above {shortest:g} s" if longest == inf else f"of {shortest:g} to {longest:g} s"

@@ -32,7 +32,9 @@ def rejection_reasons(effect: Effect) -> list[str]:
     is_known = time.low > 0 or time.high < 0 or effect.is_too_small
     keeps_flow = effect.flow.high < 0 or effect.flow.low >= -MAX_FLOW_LOSS * effect.baseline_flow
     teleported = f"SUMO teleports or removes {100 * effect.baseline_teleport_share:.1f} % of the vehicles"
-    teleports, contacts = (format_count(each, "more vehicle") for each in (effect.teleports, round(effect.collisions)))
+    teleports, contacts = (
+        format_count(number, "more vehicle") for number in (effect.teleports, round(effect.collisions))
+    )
     braking = f"{format_difference(effect.hard_braking)} times in a million vehicle-steps (a positive mean counts)"
     may = "" if effect.hard_braking.low > 0 else " may"
     # Too few seeds give NaN, with which every comparison is false: then a check fails.
@@ -190,7 +192,7 @@ class ControllerResult:
 
 def recommended_result(results: Sequence[ControllerResult]) -> ControllerResult | None:
     """Return the result with the shortest travel time among those without a reason against them; None without any."""
-    return _quickest([each for each in results if not each.reasons])
+    return _quickest([result for result in results if not result.reasons])
 
 
 def _quickest(results: Sequence[ControllerResult]) -> ControllerResult | None:
@@ -225,7 +227,7 @@ def road_verdict(results: Sequence[ControllerResult], baseline: EpisodeRows = ()
     if (delay_share := delay / (travel_time - delay)) <= NEGLIGIBLE_DELAY_SHARE:
         within = max(1, ceil(100 * delay_share))
         reason = f"there is nothing to gain, because human-only traffic is within {within} % of free flow"
-    elif undecided := [each for each in results if each.verdict == UNDECIDED]:
+    elif undecided := [result for result in results if result.verdict == UNDECIDED]:
         best, fastest = _quickest(undecided) or undecided[0], ", the fastest so far" if len(undecided) > 1 else ""
         sentence = f"Not yet known whether to recommend {best.label}{fastest}: {best.open_question}."
         return RoadVerdict(UNDECIDED, sentence)
@@ -238,18 +240,18 @@ def road_verdict(results: Sequence[ControllerResult], baseline: EpisodeRows = ()
 
 def acc_finding(results: Sequence[AccResult]) -> str:
     """Return the finding on ACC vehicles alone as a sentence."""
-    return f"{ACC_BASELINE} {_acc_effect([each for each in results if each.has_enough_seeds])}."
+    return f"{ACC_BASELINE} {_acc_effect([result for result in results if result.has_enough_seeds])}."
 
 
 def _acc_effect(results: Sequence[AccResult]) -> str:
     """Return the predicate of a sentence about ACC vehicles alone: their largest gain, else their largest loss."""
     key = attrgetter("effect.relative_travel_time")
-    gains = [each for each in results if each.effect.travel_time.high < 0 and not each.effect.is_too_small]
-    losses = [each for each in results if each.effect.is_longer]
+    gains = [result for result in results if result.effect.travel_time.high < 0 and not result.effect.is_too_small]
+    losses = [result for result in results if result.effect.is_longer]
     if gains or losses:
         verb, most = ("shorten", min(gains, key=key)) if gains else ("lengthen", max(losses, key=key))
         time, change = format_seconds(most.effect.travel_time), 100 * most.effect.relative_travel_time
         return f"{verb} travel time: {time} ({change:+.1f} %) at {format_percent(most.penetration_rate)}"
-    if results and all(each.effect.is_too_small for each in results):
+    if results and all(result.effect.is_too_small for result in results):
         return f"change travel time by {TOO_SMALL}"
     return "are not shown to shorten travel time" if results else f"have fewer than {MIN_VERDICT_SEEDS} test seeds"

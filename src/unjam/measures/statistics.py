@@ -194,7 +194,7 @@ def regress(predictors: Any, values: Any) -> list[Estimate]:
     coefficients, _, rank, _ = np.linalg.lstsq(design, result, rcond=None)
     degrees = len(result) - rank
     if rank < design.shape[1] or degrees < 1:
-        return [Estimate(float(each), nan, nan, len(result)) for each in coefficients[1:]]
+        return [Estimate(float(coefficient), nan, nan, len(result)) for coefficient in coefficients[1:]]
     variance = float(np.sum((result - design @ coefficients) ** 2)) / degrees
     halves = _student_t(float(degrees)) * np.sqrt(variance * np.diag(np.linalg.inv(design.T @ design)))
     pairs = zip(coefficients[1:].tolist(), halves[1:].tolist(), strict=True)

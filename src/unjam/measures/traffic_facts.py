@@ -151,7 +151,9 @@ def wave_speed(positions: Floats, speeds: Floats, step: float) -> float:
     correlation = np.zeros(len(lags))
     for upstream, downstream in zip(series[:-apart], series[apart:], strict=True):
         if max(upstream.std(), downstream.std()) and np.isfinite(upstream + downstream).all():
-            upstream, downstream = ((each - each.mean()) / max(each.std(), 1e-9) for each in (upstream, downstream))
+            upstream, downstream = (
+                (series - series.mean()) / max(series.std(), 1e-9) for series in (upstream, downstream)
+            )
             correlation += [np.mean(downstream[:-lag] * upstream[lag:]) for lag in lags]
     return -WAVE_DISTANCE / (lags[correlation.argmax()] * step) if correlation.max() > 0 else nan
 

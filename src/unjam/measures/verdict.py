@@ -105,8 +105,8 @@ class Verdict:
     @property
     def lines(self) -> list[str]:
         """The verdict as text: a line, and an indented line for each difference."""
-        width = max((len(each.label) for each in self.differences), default=0)
-        numbers = (f"  {each.label:{width}}  {each.text}" for each in self.differences)
+        width = max((len(difference.label) for difference in self.differences), default=0)
+        numbers = (f"  {difference.label:{width}}  {difference.text}" for difference in self.differences)
         return [f"{self.driver}: {'; '.join(filter(None, [self.feasibility_text, self.comparison]))}", *numbers]
 
 
@@ -122,7 +122,7 @@ def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible:
     name_of_others = "human drivers" if reference == HUMAN_LABEL else reference
     checked = (*names, FUEL_METRIC) if names[0] == POWER_FUEL_METRIC else names
     differences = {name: paired_difference(rows, others, name) for name in checked}
-    if not any(each.count for each in differences.values()):
+    if not any(difference.count for difference in differences.values()):
         return Verdict(label, "", f"no episode can be compared with {name_of_others}", None)
     changes = {name: is_better(name, difference) for name, difference in differences.items()}
     texts = list[DifferenceText]()
@@ -150,7 +150,7 @@ def _comparison(
 ) -> str:
     """Return whether the first metric is shown to be better or worse, and the price of what is better."""
     first = next(iter(differences))
-    label, units = METRICS[first].label.partition(",")[0], max(each.count for each in differences.values())
+    label, units = METRICS[first].label.partition(",")[0], max(difference.count for difference in differences.values())
     counted = format_units(rows, units, "paired seed")
     if changes[first] is None:
         too_few = f", which {'is' if units == 1 else 'are'} too few"

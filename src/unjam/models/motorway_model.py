@@ -100,7 +100,7 @@ def _batch_vehicles(
     numbers = {entry.name: number for number, entry in enumerate(road.entries)}
     entries = np.array([numbers[name] for name in episode.vehicle_ids])
     types = [road.vehicle_types[road.entries[number].vehicle_type] for number in entries.tolist()]
-    *parameters, speed_factor, is_eidm = np.array([traffic.driver_columns(each) for each in types])[vehicle].T
+    *parameters, speed_factor, is_eidm = np.array([traffic.driver_columns(kind) for kind in types])[vehicle].T
     geometry = road.geometry
     lane = (geometry.lane_count - episode.lane_indices[at]).astype(np.intp)
     position, speed = episode.positions[at] + geometry.origin, episode.speeds[at]
@@ -152,8 +152,8 @@ def fit_motorway_model(
     model: RoadModel, samples: Sequence[MotorwaySamples], settings: ModelSettings, seed: Seed, group_size: int = 1
 ) -> ModelFit:
     """Fit `model` as `fit_human_model`; `group_size` consecutive episodes with equal vehicles are held out together."""
-    rows = HumanRows(*(np.concatenate(parts) for parts in zip(*(each.human_rows for each in samples), strict=True)))
+    rows = HumanRows(*(np.concatenate(parts) for parts in zip(*(sample.human_rows for sample in samples), strict=True)))
     rows = rows._replace(episode=rows.episode // group_size)
-    sigma = float(np.sqrt(np.mean([each.noise_variance for each in samples])))
+    sigma = float(np.sqrt(np.mean([sample.noise_variance for sample in samples])))
     min_reduction = 0.0 if model.base == "none" else MIN_ERROR_REDUCTION
     return fit_human_model(model, rows, sigma, settings, seed, False, min_reduction)

@@ -178,14 +178,14 @@ def human_rows(samples: Sequence[RoadSamples], base: str, scenario: Scenario) ->
     """Return the steps of human drivers that no right of way constrains, a row each."""
     base_model, parts = base_human_model(base, scenario), []
     max_noise = MAX_NOISE_STDS * scenario.noise_per_step * scenario.simulation_step
-    for each in samples:
-        gap = gap_on_loop(each.positions, np.roll(each.positions, -1, 1), each.length, VEHICLE_LENGTH)
-        inputs = each.speeds, np.roll(each.speeds, -1, 1), gap
-        base_speed, episode = base_model(*inputs), np.full(gap.shape, each.episode)
-        is_used = np.broadcast_to(each.is_human > 0.0, gap.shape)
-        if each.crossing_memory is not None:
-            is_used = is_used & _has_right_of_way(each, scenario, base_speed + max_noise)
-        columns = (*inputs, base_speed, each.intended_speeds, each.next_speeds, episode)
+    for sample in samples:
+        gap = gap_on_loop(sample.positions, np.roll(sample.positions, -1, 1), sample.length, VEHICLE_LENGTH)
+        inputs = sample.speeds, np.roll(sample.speeds, -1, 1), gap
+        base_speed, episode = base_model(*inputs), np.full(gap.shape, sample.episode)
+        is_used = np.broadcast_to(sample.is_human > 0.0, gap.shape)
+        if sample.crossing_memory is not None:
+            is_used = is_used & _has_right_of_way(sample, scenario, base_speed + max_noise)
+        columns = (*inputs, base_speed, sample.intended_speeds, sample.next_speeds, episode)
         parts.append(np.stack([values[is_used] for values in columns]))
     return HumanRows(*np.concatenate(parts, 1))
 

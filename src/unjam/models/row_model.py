@@ -163,7 +163,7 @@ class OneStepErrors(NamedTuple):
 
     def rmse_by_target(self) -> dict[str, OneStepRMSE]:
         """Return the root mean squared errors, by name of `TARGET_NAMES`."""
-        parts = (np.moveaxis(each, -1, 0) for each in (self.base, self.model, self.change))
+        parts = (np.moveaxis(values, -1, 0) for values in (self.base, self.model, self.change))
         return {
             name: OneStepRMSE(root_mean_square(base), root_mean_square(model), float(change.std()))
             for name, base, model, change in zip(TARGET_NAMES, *parts, strict=True)

@@ -79,7 +79,7 @@ class WholeRoadModel(WorldModel[road_model.RoadModel, SamplesT]):
     def holdout_samples(self) -> SamplesT:
         """The newest holdout episode, or the newest one if there is none."""
         holdout, group_size = self.settings.holdout, len(self.exploration_signs)
-        held_out = [each for each in self.samples if is_holdout_episode(each.episode // group_size, holdout)]
+        held_out = [sample for sample in self.samples if is_holdout_episode(sample.episode // group_size, holdout)]
         return (held_out or self.samples)[-1]
 
 
@@ -120,14 +120,14 @@ class ClosedRoadModel(WholeRoadModel[road_model.RoadSamples]):
     ) -> list[Episode]:
         """Return the episodes that follow recorded states; `memory` has all rows of the first CAV, then the next."""
         road = cast(LoopScenario, self.scenario)
-        by_episode = {each.episode: each for each in self.samples}
+        by_episode = {sample.episode: sample for sample in self.samples}
         samples = [by_episode[self.data.recordings[index].episode] for index, _ in start_indices]
         pairs = [(each, at // each.interval) for each, (_, at) in zip(samples, start_indices, strict=True)]
         memories = [(each.crossing_memory, row) for each, row in pairs]
         noise = float(self.ensemble.noise) / road.simulation_step / replace(road, noise=1.0).noise_per_step
         common = replace(road, horizon=control_steps, noise=noise if self.settings.add_noise else 0.0, population="")
         world = RingBatch(
-            [road_model.with_size(common, each.size) for each in samples],
+            [road_model.with_size(common, sample.size) for sample in samples],
             [(*seed, number) for number in range(len(samples))],  # of sensors alone: everything else is given
             draw=np.random.default_rng(list(seed)).standard_normal,
             human_model=human_model,
@@ -161,7 +161,7 @@ class ClosedRoadModel(WholeRoadModel[road_model.RoadSamples]):
     def _expert_memory(self, start_indices: StartIndices) -> Memory:
         """Return the expert's memory: all rows of the first CAV, then of the second."""
         starts = self._starts_by_cav(start_indices)
-        memories = [reconstruct_memory(self.task.expert, self.data.recordings, each) for each in starts]
+        memories = [reconstruct_memory(self.task.expert, self.data.recordings, start) for start in starts]
         return map_leaves(lambda *values: np.concatenate(values), *memories)
 
     def _starts_by_cav(self, start_indices: StartIndices) -> list[StartIndices]:
@@ -253,7 +253,7 @@ class MotorwayModel(WholeRoadModel[MotorwaySamples]):
     ) -> list[Episode]:
         """Return recorded episodes with the same vehicles, and seeds of human drivers' errors and of exploration."""
         replay = ReplayOptions(seeds, control_steps, self.settings.add_noise, correction)
-        road, vehicle_seeds = cast(Motorway, self.scenario), [each.seed for each in samples]
+        road, vehicle_seeds = cast(Motorway, self.scenario), [sample.seed for sample in samples]
         world = MotorwayBatch(road, vehicle_seeds, explore=exploration_scales, replay=replay)
         world.measured_fields = driver.requirements().measured_fields
         return finish_drive(DriveLoop(world, driver, 0.0 if exploration_scales is None else 1.0))
@@ -268,7 +268,9 @@ def _wave_facts(control_step: float, loop_length: float, lane_names: Sequence[st
 
 
 def _episode_facts(episode: Episode, interval: int) -> Facts:
-    speeds, positions, lanes = (each[::interval] for each in (episode.speeds, episode.positions, episode.lane_indices))
+    speeds, positions, lanes = (
+        values[::interval] for values in (episode.speeds, episode.positions, episode.lane_indices)
+    )
     return _road_facts(speeds, positions, lanes, episode.cav_columns)
 
 

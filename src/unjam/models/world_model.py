@@ -100,11 +100,11 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
     def add(self, episodes: Sequence[Episode]) -> None:
         """Add environment episodes to D_a; the first ones calibrate the IDM of the base if the settings ask for it."""
         self.first_new_episode = first = self.data.episode_count
-        self.new_steps = sum(len(each.reward) for episode in episodes for each in episode.trajectories)
+        self.new_steps = sum(len(trajectory.reward) for episode in episodes for trajectory in episode.trajectories)
         if self.samples_type:
             self.samples += [self.sample_episode(episode, first + index) for index, episode in enumerate(episodes)]
         self.data.add(episodes, self.scenario)
-        self.samples = [each for each in self.samples if each.episode >= self.data.recordings[0].episode]
+        self.samples = [sample for sample in self.samples if sample.episode >= self.data.recordings[0].episode]
         if self.settings.calibrate_base and first == 0:
             states = (recording.states for recording in self.data.recordings)
             self.scenario = replace(self.scenario, humans=calibrate_human_drivers(states, self.scenario))

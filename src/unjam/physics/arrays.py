@@ -101,8 +101,8 @@ def replace_padded_rows(values: Any, rows: Any, source: Any, source_rows: Any, p
     """Return an array (..., n, m) with rows of `source` (..., k, l) in place of some; the shorter gets `padding`."""
     width = max(values.shape[-1], source.shape[-1])
     found, other = (
-        np.pad(each, [(0, 0)] * (each.ndim - 1) + [(0, width - each.shape[-1])], constant_values=padding)
-        for each in (values, source)
+        np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, width - array.shape[-1])], constant_values=padding)
+        for array in (values, source)
     )
     found[..., rows, :] = other[..., source_rows, :]
     return found

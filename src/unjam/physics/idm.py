@@ -58,7 +58,7 @@ BISECTION_STEPS = 60  # bisections for an equilibrium speed that is exact to the
 
 def stack_idm_parameters(drivers: Sequence[IDMParameters]) -> IDMArrays:
     """Return the parameters of `drivers` as arrays of shape (drivers,)."""
-    return IDMArrays(**{name: np.array([getattr(one, name) for one in drivers]) for name in IDM_PARAMETER_NAMES})
+    return IDMArrays(**{name: np.array([getattr(driver, name) for driver in drivers]) for name in IDM_PARAMETER_NAMES})
 
 
 def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters | IDMArrays = PAPER_IDM) -> Array:

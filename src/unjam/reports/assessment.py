@@ -60,7 +60,7 @@ def keep_earlier_answer(folder: Path, rates: Sequence[float], drivers: dict[str,
         return None
     with open_folder(folder) as opened:
         stems = (f"{Path(ASSESSMENT_FILE).stem}-{number}" for number in count(1))
-        stem = next(each for each in stems if not opened.mode(f"{each}.json") and not opened.mode(f"{each}.html"))
+        stem = next(name for name in stems if not opened.mode(f"{name}.json") and not opened.mode(f"{name}.html"))
         # The document is last: as long as it is there, the next call knows that there is an answer.
         renamed = {
             name: f"{stem}{Path(name).suffix}" for name in filter(opened.mode, (ASSESSMENT_PAGE, ASSESSMENT_FILE))
@@ -87,7 +87,9 @@ def render_assessment(folder: Path) -> str:
         raise InputError(f"report: {str(folder)!r} has no {ASSESSMENT_FILE}")
     assessment, results = parse_assessment(json.loads(path.read_text())), read_results(folder)
     names = {"human": HUMAN_BASELINE_LABEL}
-    panels = [replace(each, driver=names.get(each.driver, each.driver)) for each in results.plot_episodes.values()]
+    panels = [
+        replace(episode, driver=names.get(episode.driver, episode.driver)) for episode in results.plot_episodes.values()
+    ]
     plotted = ((label, results.rows.get(label)) for label in results.plot_episodes)  # of the first episode of each
     times = {label: f"{rows[0][TIME_METRIC]:.1f} s" if rows else "not measured" for label, rows in plotted}
     return render_template(
@@ -98,7 +100,7 @@ def render_assessment(folder: Path) -> str:
         option_rows=option_rows(assessment),
         columns=[HUMAN_BASELINE_LABEL, *map(_option_label, _evaluated_options(assessment))],
         result_rows=_result_rows(assessment),
-        candidate_rows=[_tuning_row(each) for each in assessment["candidates"]],
+        candidate_rows=[_tuning_row(candidate) for candidate in assessment["candidates"]],
         effect_figure=figures.data_uri(effect_figure(assessment)),
         space_time=figures.data_uri(space_time.space_time_figure(panels)) if panels else "",
         panels=[f"{names.get(label, label)}, {time}" for label, time in times.items()],
@@ -117,12 +119,14 @@ def _option_label(option: dict[str, Any]) -> str:
 
 def _rates_without_controller(assessment: dict[str, Any]) -> list[tuple[float, dict[str, Any]]]:
     """Return the penetration rates without an evaluated controller, with the fastest candidate of each."""
-    evaluated = [each["penetration_rate"] for each in assessment["controller_results"]]
+    evaluated = [result["penetration_rate"] for result in assessment["controller_results"]]
     return [
         (rate, min(candidates, key=lambda each: each["effect"]["travel_time"].mean))
         for rate in assessment["penetration_rates"]
         if rate not in evaluated
-        and (candidates := [each for each in assessment["candidates"] if each["penetration_rate"] == rate])
+        and (
+            candidates := [candidate for candidate in assessment["candidates"] if candidate["penetration_rate"] == rate]
+        )
     ]
 
 
@@ -135,8 +139,8 @@ def parse_assessment(document: dict[str, Any]) -> dict[str, Any]:
         return Estimate(**replace_null(value)) if isinstance(value, dict) else nan if value is None else value
 
     groups = {key: [*map(parse, document[key])] for key in ("controller_results", "acc_results", "candidates")}
-    for each in groups["acc_results"]:
-        each["driver"] = ACC_LABEL
+    for result in groups["acc_results"]:
+        result["driver"] = ACC_LABEL
     return {**document, **groups, "baseline": parse(document["baseline"])}
 
 
@@ -144,12 +148,12 @@ def option_rows(assessment: dict[str, Any]) -> list[list[str]]:
     """Return the cells of the main table, as in `OPTION_HEADINGS`: the human baseline, then a row for each option."""
     time, flow = (assessment["baseline"][metric].mean for metric in (TIME_METRIC, FLOW_METRIC))
     rows = [["none", HUMAN_BASELINE_LABEL, f"{time:.1f} s", "–", f"{flow:,.0f} veh/h", "–", "–", "–"]]
-    for each in _evaluated_options(assessment):
-        effect, to_acc = each["effect"], [each.get(name, MISSING) for name in ACC_DIFFERENCES]
+    for option in _evaluated_options(assessment):
+        effect, to_acc = option["effect"], [option.get(name, MISSING) for name in ACC_DIFFERENCES]
         times = [format_difference(change, 1) for change in (effect["travel_time"], to_acc[0])]
         flows = [format_difference(change) for change in (effect["flow"], to_acc[1])]
-        verdicts = feasibility_text(effect), each.get("verdict", "–")
-        rows.append([format_percent(each["penetration_rate"]), each["driver"], *times, *flows, *verdicts])
+        verdicts = feasibility_text(effect), option.get("verdict", "–")
+        rows.append([format_percent(option["penetration_rate"]), option["driver"], *times, *flows, *verdicts])
     return rows
 
 
@@ -165,10 +169,13 @@ def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
     options = _evaluated_options(assessment)
     effects = [option["effect"] for option in options]
     baseline = assessment["baseline"]
-    verdicts = [each.get("verdict", "–") for each in options]
-    relative = [f"{100 * each['travel_time'].mean / each['baseline_travel_time']:+.1f}" for each in effects]
-    acc = [format_difference(each["difference_to_acc"], 1) if "difference_to_acc" in each else "–" for each in options]
-    contacts = [f"{each['collisions']:+.0f}" for each in effects]
+    verdicts = [option.get("verdict", "–") for option in options]
+    relative = [f"{100 * effect['travel_time'].mean / effect['baseline_travel_time']:+.1f}" for effect in effects]
+    acc = [
+        format_difference(option["difference_to_acc"], 1) if "difference_to_acc" in option else "–"
+        for option in options
+    ]
+    contacts = [f"{effect['collisions']:+.0f}" for effect in effects]
     time, *others = (
         (*heading, estimate_cell(baseline[metric], digits).mean, [format_difference(e[field], digits) for e in effects])
         for field, metric, *heading, digits in EFFECT_METRICS
@@ -176,13 +183,13 @@ def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
     baseline_contacts = f"{baseline['collisions'].mean * baseline['collisions'].count:.0f}"
     rows = (
         ("verdict", "", "", verdicts),
-        ("feasibility", "", "", [feasibility_text(each) for each in effects]),
+        ("feasibility", "", "", [feasibility_text(effect) for effect in effects]),
         time,
         ("travel time, relative to the human baseline", "%", "", relative),
         ("travel time, compared with ACC vehicles", "s", "", acc),
         *others,
         ("vehicles in collisions, all episodes", "", baseline_contacts, contacts),
-        ("test seeds", "", str(assessment["seeds"]["test"]), [str(each["travel_time"].count) for each in effects]),
+        ("test seeds", "", str(assessment["seeds"]["test"]), [str(effect["travel_time"].count) for effect in effects]),
     )
     return [{"label": label, "unit": unit, "cells": [first, *cells]} for label, unit, first, cells in rows]
 
@@ -207,7 +214,7 @@ def effect_figure(assessment: dict[str, Any]) -> Figure:
 
     Tuning seeds are pale, test seeds opaque; lines are confidence intervals.
     """
-    drivers = list(dict.fromkeys([*(each["driver"] for each in assessment["acc_results"]), *assessment["drivers"]]))
+    drivers = list(dict.fromkeys([*(result["driver"] for result in assessment["acc_results"]), *assessment["drivers"]]))
     rates = assessment["penetration_rates"]
     figure = figures.new_figure(4.0)
     panels = figure.subplots(1, 2)

@@ -36,7 +36,7 @@ def write_certificate_page(
         cards=cards,
         verdict=verdict,
         notes=_certificate_notes(certificate),
-        string_stability=[(each, _max_gain(each)) for each in strings],
+        string_stability=[(string, _max_gain(string)) for string in strings],
         attack_figure=data_uri(_attack_figure(worst["attack"])),
         string_figure=data_uri(_string_figure(strings)),
         domain=[(label, certificate["domain"][key], unit) for label, key, unit in DOMAIN_QUANTITIES],
@@ -62,14 +62,16 @@ def _certificate_notes(certificate: dict[str, Any]) -> list[str]:
     notes = []
     if not certificate["comfort"]["meets_iso_15622"]:
         notes.append("In its sample it brakes or accelerates harder than ISO 15622 allows for ACC.")
-    for each in certificate["string_stability"]:
-        if np.isnan(np.array(each["gains"], np.float64)).any():
-            notes.append(f"At {each['speed']:g} m/s it falls behind its leader: its string stability is unknown.")
-        if each["amplified_band"]:
-            low, high = each["amplified_band"]
+    for point in certificate["string_stability"]:
+        if np.isnan(np.array(point["gains"], np.float64)).any():
+            notes.append(f"At {point['speed']:g} m/s it falls behind its leader: its string stability is unknown.")
+        if point["amplified_band"]:
+            low, high = point["amplified_band"]
             band = f"of {low:.3g} Hz" if low == high else f"between {low:.3g} and {high:.3g} Hz"
-            gain = f"by up to {_max_gain(each):.3f} times"
-            notes.append(f"At {each['speed']:g} m/s it amplifies oscillations {band}, {gain}: it is not string stable.")
+            gain = f"by up to {_max_gain(point):.3f} times"
+            notes.append(
+                f"At {point['speed']:g} m/s it amplifies oscillations {band}, {gain}: it is not string stable."
+            )
     return notes
 
 

@@ -90,10 +90,13 @@ def render_report(results: Sequence[Results]) -> str:
     counts = [len(column.rows) for column in columns]
     rows, baseline = {column.name: column.rows for column in columns}, summary.common_baseline(results)
     first = "" if baseline else summary.first_alternative(results)
-    is_alternative = {each.name: each.name.endswith(f": {HUMAN_LABEL}") and each.name != first for each in columns}
+    is_alternative = {
+        column.name: column.name.endswith(f": {HUMAN_LABEL}") and column.name != first for column in columns
+    }
     if first in rows:  # drivers of CAVs are compared with human drivers of their own folder
         columns = [
-            summary.compare_alternative(each, rows[first]) if is_alternative[each.name] else each for each in columns
+            summary.compare_alternative(column, rows[first]) if is_alternative[column.name] else column
+            for column in columns
         ]
     headings, table = metric_table(rows, baseline)
     roads = (", ".join(format_drawn_values(episode.drawn_values)) for episode in panels)
@@ -190,9 +193,9 @@ def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
     max_frames = min(MAX_REPLAY_FRAMES, max(1, MAX_REPLAY_VALUES // max(1, vehicles)))
     step = max(REPLAY_STEP, longest / max_frames, *(episode.control_step for episode in panels))
     frames = 1 + int(longest / step + 1e-9)
-    longest_platoon = max((-each.lane_lines[:, 0].min() for each in panels if each.has_recorded_leader), default=0.0)
+    longest_platoon = max((-panel.lane_lines[:, 0].min() for panel in panels if panel.has_recorded_leader), default=0.0)
     scale = space_time.speed_scale(panels)
-    tracks = ((printable(each.driver), _replay_track(each, step, frames, longest_platoon)) for each in panels)
+    tracks = ((printable(panel.driver), _replay_track(panel, step, frames, longest_platoon)) for panel in panels)
     return {
         "step": step,
         "frames": frames,

@@ -252,10 +252,10 @@ def original_command(results: Results) -> str:
         return shlex.join(command)
     try:
         manifest = json.loads(_read_text(results.folder / "manifest.json"))
-        first, *others = (each["command"] for each in (manifest, *manifest["lineage"]))
+        first, *others = (record["command"] for record in (manifest, *manifest["lineage"]))
     except INVALID_DATA_ERRORS:
         return shlex.join(command)
-    budgets = [["--steps", after] for each in others for word, after in pairwise(each) if word == "--steps"]
+    budgets = [["--steps", after] for other in others for word, after in pairwise(other) if word == "--steps"]
     return shlex.join([*first, *(budgets or [[]])[-1]])
 
 

@@ -108,7 +108,7 @@ def trajectory_figure(episodes: Sequence[PlotEpisode], shown: Sequence[PlotEpiso
 
 
 def _branch_row(episodes: Sequence[PlotEpisode], branch: str, is_main: bool) -> PanelRow:
-    present = np.concatenate([_branch_positions(each, branch, is_main).ravel() for each in episodes])
+    present = np.concatenate([_branch_positions(episode, branch, is_main).ravel() for episode in episodes])
     present = present[~np.isnan(present)]
     extent = (float(present.min()), float(present.max())) if present.size else (0.0, 1.0)
     if all(episode.is_closed for episode in episodes):
@@ -203,7 +203,11 @@ def _mark_merges(axes: Axes, episode: PlotEpisode, extent: tuple[float, float]) 
 
 def has_lane_maps(episodes: Sequence[PlotEpisode]) -> bool:
     """Return whether episodes are drawn lane by lane: whether all are on the same road with lanes."""
-    return bool(episodes) and len({tuple(each.lane_names) for each in episodes}) == 1 and bool(episodes[0].lane_names)
+    return (
+        bool(episodes)
+        and len({tuple(episode.lane_names) for episode in episodes}) == 1
+        and bool(episodes[0].lane_names)
+    )
 
 
 def space_time_figure(episodes: Sequence[PlotEpisode], shown: Sequence[PlotEpisode] = ()) -> Figure:
@@ -233,7 +237,7 @@ def lane_map_figure(episodes: Sequence[PlotEpisode], shown: Sequence[PlotEpisode
 def _busiest_lanes(episodes: Sequence[PlotEpisode]) -> list[int]:
     """Return the lanes to draw, from left to right: of those with vehicles on the road shown, the busiest."""
     counts = {
-        lane: sum(int(np.sum((each.lane_indices == lane) & ~np.isnan(each.positions))) for each in episodes)
+        lane: sum(int(np.sum((episode.lane_indices == lane) & ~np.isnan(episode.positions))) for episode in episodes)
         for lane in range(len(episodes[0].lane_names))
     }
     busy = sorted((lane for lane in counts if counts[lane]), key=lambda lane: -counts[lane])
@@ -241,7 +245,7 @@ def _busiest_lanes(episodes: Sequence[PlotEpisode]) -> list[int]:
 
 
 def _lane_range(episodes: Sequence[PlotEpisode], lane: int) -> tuple[float, float]:
-    present = np.concatenate([each.positions[each.lane_indices == lane] for each in episodes])
+    present = np.concatenate([episode.positions[episode.lane_indices == lane] for episode in episodes])
     present = present[~np.isnan(present)]
     return (float(present.min()), float(present.max()) + 1.0) if len(present) else (0.0, 1.0)
 

@@ -86,7 +86,7 @@ def first_alternative(results: Sequence[Results]) -> str:
     are_networks = all(result.metadata["scenario"].endswith(".sumocfg") for result in results)
     common = common_seeds(results)
     keys = [_episode_keys(result.rows[HUMAN_LABEL]) for result in results] if has_humans else []
-    episodes = {str([key for key in each if key[0] in common]) for each in keys}
+    episodes = {str([key for key in driver_keys if key[0] in common]) for driver_keys in keys}
     is_comparison = len(results) > 1 and are_networks and bool(common) and len(episodes) > 1
     return f"{folder_names(results)[0]}: {HUMAN_LABEL}" if is_comparison else ""
 
@@ -141,12 +141,12 @@ def mismatch_warning(results: Sequence[Results]) -> str:
     if len(parents) == 1 and (parents.pop() / "config.toml").is_file():
         return ""
     episodes = [next(iter(result.plot_episodes.values()), None) for result in results]
-    known = [each for each in episodes if each is not None and not each.has_recorded_leader]
+    known = [episode for episode in episodes if episode is not None and not episode.has_recorded_leader]
     kinds = {
         "roads": [result.metadata["scenario"] for result in results],
-        "geometries": [each.outline.round().tobytes() + each.lane_lines.round().tobytes() for each in known],
+        "geometries": [episode.outline.round().tobytes() + episode.lane_lines.round().tobytes() for episode in known],
         "seeds": [str([row["seed"] for row in next(iter(result.rows.values()), [])]) for result in results],
-        "durations": [str(each.times[-1]) for each in known if each.status == "completed"],
+        "durations": [str(episode.times[-1]) for episode in known if episode.status == "completed"],
     }
     different = [kind for kind, values in kinds.items() if len(set(values)) > 1]
     if (first := first_alternative(results)) and "durations" not in different:
@@ -170,7 +170,7 @@ def command_differences(results: Sequence[Results]) -> list[tuple[str, str]]:
     if not all(commands):
         return []
     shared = set.intersection(*map(set, commands))
-    texts = ["; ".join(each for each in command if each not in shared) for command in commands]
+    texts = ["; ".join(word for word in command if word not in shared) for command in commands]
     return [*zip(folder_names(results), texts, strict=True)] if any(texts) else []
 
 
@@ -180,7 +180,7 @@ def _command_options(result: Results) -> list[str]:
     for word in (word for word in shlex.split(original_command(result))[1:] if word not in IRRELEVANT_FLAGS):
         is_value = options and options[-1].startswith("-") and " " not in options[-1] and not word.startswith("-")
         options = [*options[:-1], f"{options[-1]} {word}"] if is_value else [*options, word]
-    return [each for each in options if not each.startswith(IRRELEVANT_OPTIONS)]
+    return [option for option in options if not option.startswith(IRRELEVANT_OPTIONS)]
 
 
 def name_baselines(results: Sequence[Results]) -> str:

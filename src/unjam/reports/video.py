@@ -74,7 +74,7 @@ def _draw_legend(pen: ImageDraw.ImageDraw, max_speed: float, pixels: int) -> Non
     left = bottom - width
     top = bottom - LEGEND_HEIGHT * OVERSAMPLING
     for number, color in enumerate(colors):
-        start, end = (left + width * each / len(colors) for each in (number, number + 1))
+        start, end = (left + width * position / len(colors) for position in (number, number + 1))
         pen.rectangle((start, top, end, bottom), fill=color)
     for x, anchor, text in ((left, "ld", "0"), (left + width, "rd", f"{max_speed:.0f} m/s")):
         pen.text((x, top - 4 * OVERSAMPLING), text, fill=TEXT_COLOR, font=font, anchor=anchor)

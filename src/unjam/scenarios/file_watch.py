@@ -14,7 +14,7 @@ from unjam.scenarios.scenario import Scenario
 def watch_files(scenarios: Iterable[Scenario], *names: Any) -> FileWatch:
     """Return a watch of the files of scenarios, of their rewards, and of the code and TOML files that `names` name."""
     scenarios = tuple(scenarios)
-    texts = {name for name in (*names, *(each.reward for each in scenarios)) if isinstance(name, str)}
+    texts = {name for name in (*names, *(scenario.reward for scenario in scenarios)) if isinstance(name, str)}
     return FileWatch(partial(_list_files, scenarios, texts))  # environments are pickled with it
 
 

@@ -174,7 +174,8 @@ class Motorway(Scenario):
     @property
     def max_vehicles(self) -> float:
         """Twice as many as the largest demand has: headways are random."""
-        return self.max_duration / 3600.0 * 2.0 * sum(max(each.inflow, each.off_peak_inflow) for each in self._sources)
+        peak_inflow = sum(max(source.inflow, source.off_peak_inflow) for source in self._sources)
+        return self.max_duration / 3600.0 * 2.0 * peak_inflow
 
     @property
     def _sources(self) -> tuple["Motorway | Ramp", ...]:
@@ -188,7 +189,7 @@ class Motorway(Scenario):
             name, human = f"vehicle_{number}", f"human_type_{generator.integers(HUMAN_TYPE_COUNT)}"
             draws[name] = generator.random()
             entries.append(Entry(name, route, 0.0, speed, time, lane, select_type(human)))
-        cars = {each.name: draws[each.name] for each in entries if types[each.vehicle_type].vehicle_class is None}
+        cars = {entry.name: draws[entry.name] for entry in entries if types[entry.vehicle_type].vehicle_class is None}
         geometry = self.geometry
         return MotorwayRoad(
             geometry=geometry,
@@ -326,7 +327,8 @@ class Motorway(Scenario):
         lanes = "one lane" if self.lanes == 1 else f"{self.lanes} lanes"
         ramps = {0: "without ramps", 1: "with a ramp"}.get(len(self.ramps), f"with {len(self.ramps)} ramps")
         peak, off_peak = (
-            " + ".join(f"{getattr(each, name):g}" for each in self._sources) for name in ("inflow", "off_peak_inflow")
+            " + ".join(f"{getattr(source, name):g}" for source in self._sources)
+            for name in ("inflow", "off_peak_inflow")
         )
         peak = f"{peak} veh/h from {self.peak[0]:g} to {self.peak[1]:g} s"
         vehicles = f"{peak}, else {off_peak} ({100 * self.penetration_rate:g} % CAV)"

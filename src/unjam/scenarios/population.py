@@ -188,7 +188,7 @@ def _read_cached(path: Path, modified_ns: int, size: int) -> Population:
             drivers=drivers,
             limits=(low, high),
             residual=_read_residual(path, content["residual"]),
-            details=tuple({key: one[key] for key in one if key not in IDM_PARAMETER_NAMES} for one in entries),
+            details=tuple({key: entry[key] for key in entry if key not in IDM_PARAMETER_NAMES} for entry in entries),
             metadata={key: value for key, value in content.items() if key not in POPULATION_KEYS},
         )
     except INVALID_DATA_ERRORS as error:

@@ -120,12 +120,12 @@ class Recorded(Scenario):
 
     @cached_property
     def _longest_recording(self) -> float:
-        return max(each.seconds for each in self._leaders) if self.recordings else ARTIFICIAL_SECONDS
+        return max(leader.seconds for leader in self._leaders) if self.recordings else ARTIFICIAL_SECONDS
 
     @property
     def max_leader_speed(self) -> float:
         """Largest speed of all recordings [m/s]; 0 without any."""
-        return float(max(each.speed.max() for each in self._leaders)) if self.recordings else 0.0
+        return float(max(leader.speed.max() for leader in self._leaders)) if self.recordings else 0.0
 
     @cached_property
     def _leaders(self) -> list[LeaderRecording]:

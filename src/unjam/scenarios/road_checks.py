@@ -57,7 +57,7 @@ def _check_network(road: BuiltRoad) -> None:
     for name, edge in edges.items():
         for end in ("from_node", "to_node"):
             _check_name(f"edges.{name}.{end}", getattr(edge, end), nodes)
-        ends = [(nodes[each].x, nodes[each].y) for each in (edge.from_node, edge.to_node)]
+        ends = [(nodes[node].x, nodes[node].y) for node in (edge.from_node, edge.to_node)]
         _check_length(f"edges.{name}.length", edge.length, _line_length(np.array(edge.shape or ends)), "its line")
     for name, route in routes.items():
         for edge_name in route.edges:

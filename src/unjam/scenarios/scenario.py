@@ -209,10 +209,10 @@ class Scenario(Subclassable):
 
     @model_validator(mode="after")
     def _check_parts(self) -> Self:
-        for each in fields(self):
-            value = getattr(self, each.name)
+        for parameter in fields(self):
+            value = getattr(self, parameter.name)
             for part in value if isinstance(value, tuple) else (value,):
-                check_part(f"scenario {type(self).__name__}.{each.name}", part)
+                check_part(f"scenario {type(self).__name__}.{parameter.name}", part)
         return self
 
     @model_validator(mode="after")

@@ -262,7 +262,7 @@ class UserNetwork(Scenario):
 
 def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
     """Return the scenario of a .sumocfg file with `changes`; raise `InputError` about it before SUMO starts."""
-    for name in (each for each in OPERATOR_SETTINGS if each in changes):
+    for name in (setting for setting in OPERATOR_SETTINGS if setting in changes):
         reason = "it is not allowed on your own network, only on motorways such as on-ramp"
         raise InputError(f"{name}: {reason}; {ALTERNATIVES}")
     files = read_sumo_files(Path.cwd() / file)  # not its target: SUMO finds other files next to a link

@@ -110,7 +110,7 @@ class BrakingLog:
 
     def _count_block(self) -> None:
         if self._block:
-            speed_changes, kinds = (np.concatenate(each) for each in zip(*self._block, strict=True))
+            speed_changes, kinds = (np.concatenate(parts) for parts in zip(*self._block, strict=True))
             order = np.argsort(kinds, kind="stable")  # by one pass for each byte of small integers
             present, starts = np.unique(kinds[order], return_index=True)
             for kind, changes in zip(present.tolist(), np.split(speed_changes[order], starts[1:]), strict=False):

@@ -141,7 +141,7 @@ def unread_reason(scenario: Scenario, kind: type[Scenario], names: Collection[st
         allowed = "classes with other values of settings alone, or backend=sumo"
         return f"{type(scenario).__name__}.{member} is not allowed: the backend does not read it; allowed: {allowed}"
     defaults = kind()
-    for name in [each.name for each in fields(kind) if each.name not in names]:
+    for name in [field.name for field in fields(kind) if field.name not in names]:
         value, default = getattr(scenario, name), getattr(defaults, name)
         if value != default:
             return f"{name}: {value!r} is not allowed: the backend does not read it; allowed: {default!r}"

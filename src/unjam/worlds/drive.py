@@ -116,5 +116,5 @@ def finish_drive(drive_loop: DriveLoop) -> Any:
     last = drive_loop.observe()
     if last is None:
         return world.record(DriverLog())
-    memories = [each[EXPERT_KEY] for each in drive_loop.initial_memories]
+    memories = [initial_memory[EXPERT_KEY] for initial_memory in drive_loop.initial_memories]
     return world.record(DriverLog(decisions, last, memories, driver.action_repeat))

@@ -202,7 +202,7 @@ def add_reward_terms(episode: Episode, reward: Reward) -> Episode:
     has_crashed = episode.status == "collision"
     terms = episode_reward_terms(reward, episode.speeds, episode.trajectories, has_crashed, episode.backlog)
     trajectories = tuple(
-        replace(each, reward_terms={name: values[each.step_slice] for name, values in terms.items()})
-        for each in episode.trajectories
+        replace(trajectory, reward_terms={name: values[trajectory.step_slice] for name, values in terms.items()})
+        for trajectory in episode.trajectories
     )
     return replace(episode, reward_terms=terms, trajectories=trajectories)

@@ -132,7 +132,7 @@ class TripLog:
             if len(entries) > 1:
                 start, rows = entries[0][0], np.array([row for _, row in entries])
                 state = LocalState(*(_trip_values(values, entries) for values in states))
-                values = (_trip_values(each, entries[:-1]) for each in commands)
+                values = (_trip_values(command, entries[:-1]) for command in commands)
                 terminated = has_crashed and entries[-1][0] == len(self.applied_accelerations)
                 trip = name, number, start, rows, state
                 trajectories.append(make_trajectory(*trip, *values, terminated=terminated, driver_log=driver_log))
@@ -183,7 +183,7 @@ class OpenRoadLog:
 
         Only vehicles of one branch and group share columns.
         """
-        vehicles, cavs = self.traffic.vehicle_ids, dict.fromkeys(each.vehicle for each in trajectories)
+        vehicles, cavs = self.traffic.vehicle_ids, dict.fromkeys(trajectory.vehicle for trajectory in trajectories)
         columns = self.traffic.columns([*zip((name in cavs for name in vehicles), branches, groups, strict=True)])
         branch_of_column = dict(zip(columns.tolist(), branches, strict=True))
         is_shared = len(branch_of_column) < len(vehicles)
@@ -202,13 +202,13 @@ class OpenRoadLog:
 
     def make_audit(self, trajectories: Sequence[Trajectory]) -> audit.Audit:
         """Return the braking in every simulation step, and the CAVs' car following in every control step."""
-        moments = max((len(each.states.speed) for each in trajectories), default=0)
+        moments = max((len(trajectory.states.speed) for trajectory in trajectories), default=0)
         speed, leader, gap = np.full((3, moments, len(trajectories)), np.nan)
         for column, each in enumerate(trajectories):
             rows = slice(len(each.states.speed))
             speed[rows, column] = each.states.speed
             leader[rows, column], gap[rows, column] = each.states.leader_speed, each.states.leader_gap
-        added = np.concatenate([np.zeros(0), *(each.shield_braking for each in trajectories)])
+        added = np.concatenate([np.zeros(0), *(trajectory.shield_braking for trajectory in trajectories)])
         is_overridden, step = added > audit.OVERRIDE_TOLERANCE, self._scenario.control_step
         following = audit.following_statistics(speed, leader, gap, step, is_overridden, np.zeros_like(added))
         human, cav = map(self._braking.statistics, (audit.HUMAN_DRIVER, audit.CAV_DRIVER))

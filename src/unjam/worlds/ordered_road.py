@@ -153,7 +153,7 @@ class OrderedRoadLog:
             entry = number if rows is None else int(rows[number])
             entry_rows = None if rows is None else np.full(control_steps + 1, entry)
             state = states.map(lambda values: np.ascontiguousarray(values[number]))  # noqa: B023
-            commands = (np.ascontiguousarray(each[:, number]) for each in (applied, filter_braking, shield_braking))
+            commands = (np.ascontiguousarray(values[:, number]) for values in (applied, filter_braking, shield_braking))
             trip = name, entry, 0, entry_rows, state
             trajectories.append(make_trajectory(*trip, *commands, terminated=self.has_crashed, driver_log=driver_log))
         return Episode(

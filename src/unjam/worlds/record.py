@@ -141,13 +141,13 @@ class Trips:
     def values_at_end(self) -> dict[str, float]:
         """Number of vehicles that have not arrived, and share of delay in their travel time; empty without trips."""
         unfinished = ~self.has_arrived
-        delay, spent = (float(each[unfinished].sum()) for each in (self.delay, self.travel_time))
+        delay, spent = (float(values[unfinished].sum()) for values in (self.delay, self.travel_time))
         values = {"unfinished_trips": int(unfinished.sum()), "delay_share_at_end": delay / spent if spent else 0.0}
         return values if self.vehicle_ids else {}
 
     def vehicles_of(self, *groups: str) -> set[str]:
         """Return the ids of the vehicles of some `VEHICLE_GROUPS`."""
-        classes = {each for group in groups for each in VEHICLE_GROUPS[group]}
+        classes = {vehicle_class for group in groups for vehicle_class in VEHICLE_GROUPS[group]}
         pairs = zip(self.vehicle_ids, self.vehicle_classes, strict=True)
         return {name for name, vehicle_class in pairs if vehicle_class in classes}
 

@@ -282,7 +282,7 @@ def _random_outcome(rows: slice, vehicles: int = 6, cavs: int = 2) -> Outcome:
     speeds, accelerations = generator.uniform(0, 20, (PROBE_ROWS, vehicles)), generator.normal(size=(PROBE_ROWS, cavs))
     time_gaps, crashed = generator.uniform(0.5, 3, (PROBE_ROWS, cavs)), np.arange(PROBE_ROWS) == 1
     numbers = speeds, accelerations, time_gaps, crashed, 10 * speeds[:, 0], speeds[:, :cavs]
-    return Outcome(*(each[rows] for each in numbers))
+    return Outcome(*(number[rows] for number in numbers))
 
 
 def episode_reward_terms(
@@ -298,7 +298,7 @@ def episode_reward_terms(
     for part in parts:
         outcome = _step_outcomes(speeds, trajectories, has_crashed and part.stop == steps, backlog, part)
         terms.append(validate_reward_terms(reward, outcome, part.start))
-    return {name: np.concatenate([each[name] for each in terms]) for name in terms[0]}
+    return {name: np.concatenate([term[name] for term in terms]) for name in terms[0]}
 
 
 def _step_outcomes(
@@ -306,7 +306,7 @@ def _step_outcomes(
 ) -> Outcome:
     first, end = step_range.start, step_range.stop
     size = end - first
-    cavs = [each for each in trajectories if each.step_slice.start < end and first < each.step_slice.stop]
+    cavs = [cav for cav in trajectories if cav.step_slice.start < end and first < cav.step_slice.stop]
     accelerations, time_gaps, cav_speeds = (np.full((size, len(cavs)), np.nan) for _ in range(3))
     for column, cav in enumerate(cavs):
         start, stop = max(cav.start_step, first), min(cav.step_slice.stop, end)

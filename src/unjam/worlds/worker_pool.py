@@ -111,7 +111,8 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
         Raise `SumoInputError` if SUMO refuses the files of the very first task, and so would refuse those of others.
         """
         check_owner(self._owner, "worker pool: it")
-        for task in {(each.reward, each.scenario.reward, each.backend): each for each in tasks}.values():
+        task_by_code = {(task.reward, task.scenario.reward, task.backend): task for task in tasks}
+        for task in task_by_code.values():
             self._code_hashes = task.code_hashes() | self._code_hashes  # code stays what it was at first
         is_first, self._is_first = self._is_first, False
 

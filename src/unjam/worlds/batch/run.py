@@ -173,7 +173,9 @@ def run_batches(
     batches: list[dict[int, EpisodeTask]] = []
     for index, task in enumerate(tasks):
         size = support.required_batch_kind(task.scenario).max_roads
-        suitable = (each for each in batches if len(each) < size and _can_share_batch(task, next(iter(each.values()))))
+        suitable = (
+            batch for batch in batches if len(batch) < size and _can_share_batch(task, next(iter(batch.values())))
+        )
         batch = next(suitable, None)
         if batch is None:
             batches.append(batch := {})

@@ -58,7 +58,7 @@ def statistically_unsupported_reason(scenario: Scenario) -> str:
     if kind := batch_kind(scenario):
         return kind.reason(scenario)
     base = next((base for base in BATCH_KINDS if isinstance(scenario, base)), None)
-    return unread_reason(scenario, base or Ring, [each.name for each in fields(scenario)])
+    return unread_reason(scenario, base or Ring, [field.name for field in fields(scenario)])
 
 
 def _ring_reason(scenario: Ring | Recorded) -> str:
@@ -141,7 +141,7 @@ def required_batch_kind(scenario: Scenario) -> BatchKind:
 def differ_only_in_size(first: Scenario, second: Scenario) -> bool:
     """Return whether scenarios differ at most in the size of their roads, so that they can share a batch."""
     size = getattr(first, "size_parameter", "")
-    shared = (each.name for each in fields(first) if each.name != size)
+    shared = (field.name for field in fields(first) if field.name != size)
     return type(first) is type(second) and all(getattr(first, name) == getattr(second, name) for name in shared)
 
 

@@ -166,11 +166,11 @@ class FigureEightMovement:
         leader_speed = xp.where(is_visible, leader.speed, models.speed_limit)
         follow_speed = models.follow_speed(speed, leader_speed, xp.where(is_visible, leader.gap, human_idm.FREE_GAP))
         motion = speed, leader, free_speed, follow_speed, look_ahead
-        major_last, minor_last = (_last_vehicle(speed, each) for each in distances_past)
+        major_last, minor_last = (_last_vehicle(speed, distance) for distance in distances_past)
         safe = xp.minimum(free_speed, follow_speed)
         for distance_past, foe in zip(distances_past, (minor_last, major_last), strict=True):
             safe = self._speed_on_crossing(speed, safe, distance_past, foe)
-        to_major, to_minor = (self._sumo_loop_length - each for each in distances_past)
+        to_major, to_minor = (self._sumo_loop_length - distance for distance in distances_past)
         major = self._approach(*motion, major_side, MAJOR_STOP_DISTANCE, to_major, major_last, minor_last)
         minor = self._approach(*motion, minor_side, MINOR_STOP_DISTANCE, to_minor, minor_last, major_last)
         safe = xp.where(major.is_approaching, major.go_speed, safe)
@@ -334,7 +334,7 @@ class FigureEightMovement:
 
     def restore_memory(self, memories: Sequence[CrossingMemory]) -> None:
         """Continue from the memories of the roads, shape (vehicles,) each."""
-        self.memory = CrossingMemory(*(self._to_array(np.stack(each, 1)) for each in zip(*memories, strict=True)))
+        self.memory = CrossingMemory(*(self._to_array(np.stack(values, 1)) for values in zip(*memories, strict=True)))
 
 
 def crossing_memories(scenario: Scenario, road: ClosedRoad, speeds: Floats, positions: Floats) -> CrossingMemory:
@@ -344,7 +344,7 @@ def crossing_memories(scenario: Scenario, road: ClosedRoad, speeds: Floats, posi
     for speed, next_speed, position in zip(speeds, speeds[1:], positions, strict=False):
         movement.update_memory(speed[:, None], next_speed[:, None], movement.distances_past(position[:, None]))
         memories.append(movement.memory)
-    return CrossingMemory(*(np.concatenate(each, 1).T for each in zip(*memories, strict=True)))
+    return CrossingMemory(*(np.concatenate(values, 1).T for values in zip(*memories, strict=True)))
 
 
 def may_follow_commands(
@@ -356,11 +356,11 @@ def may_follow_commands(
     commanded_speeds: Floats,
 ) -> NDArray[np.bool_]:
     """Return whether the right of way allows speeds; `motion`: speeds and positions; all (steps, vehicles)."""
-    speed, position, commanded = (each.T for each in (*motion, commanded_speeds))
+    speed, position, commanded = (values.T for values in (*motion, commanded_speeds))
     roads = [road] * len(commanded_speeds)
     movement = FigureEightMovement(scenario, roads, cav_indices, np.asarray, lambda *_: commanded)
     movement.hand_over()
-    movement.restore_memory([CrossingMemory(*each) for each in zip(*memories, strict=True)])
+    movement.restore_memory([CrossingMemory(*values) for values in zip(*memories, strict=True)])
     gap = gap_on_loop(position, np.roll(position, -1, 0), road.loop_length, VEHICLE_LENGTH)
     leader = human_idm.Leader(np.roll(speed, -1, 0), gap)
     moved = movement.move(speed, position, leader, 0.0, commanded[cav_indices])

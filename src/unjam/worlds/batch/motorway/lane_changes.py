@@ -369,7 +369,7 @@ def _has_change_conflict(vehicles: MotorwayVehicles, changes_lane: Array, geomet
         return conflict
     rows = np.flatnonzero(np.isin(vehicles.road, vehicles.road[merges]))
     vehicles, merges = vehicles.select(rows), merges[rows]
-    ahead, behind = (each[1] for each in find_neighbors(vehicles.road, np.where(merges, 1, vehicles.lane), 2))
+    ahead, behind = (neighbor[1] for neighbor in find_neighbors(vehicles.road, np.where(merges, 1, vehicles.lane), 2))
     position, min_distance = vehicles.position, 2.0 * (geometry.vehicle_length + vehicles.minimum_gap)
     is_tight_ahead = (ahead >= 0) & merges[ahead] & (position[ahead] - position < min_distance)
     is_tight_behind = (behind >= 0) & merges[behind] & (position - position[behind] < min_distance)

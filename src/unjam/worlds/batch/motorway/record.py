@@ -77,7 +77,7 @@ class MotorwayLog:
         recovers = audit.is_recovering(self._is_recovering[own], duration, previous, pair) & (leader >= 0)
         self._is_recovering[own], self._following_pairs[:, *own] = recovers, pair
         columns = own[0], *pair, recovers
-        self._steady_following.append(np.stack([each[is_steady].astype(np.float64) for each in columns]))
+        self._steady_following.append(np.stack([column[is_steady].astype(np.float64) for column in columns]))
         counted = is_running[road]
         driver = (road * len(_DRIVER_KINDS) + kind)[counted].astype(np.uint16)
         self._braking.add(vehicles.acceleration[counted], driver)
@@ -111,7 +111,7 @@ class MotorwayLog:
 
     def _trips(self, driver_log: DriverLog) -> list[list[record.Trajectory]]:
         """Return the trips of the CAVs on each road that last at least one control step, in order of entry."""
-        counts = [len(each) for each in self._cav_numbers]
+        counts = [len(cav_number) for cav_number in self._cav_numbers]
         step_index = np.repeat(np.arange(len(counts)), counts)
         row = np.concatenate([np.arange(count) for count in counts])
         numbers = np.concatenate(self._cav_numbers)
@@ -152,11 +152,11 @@ class MotorwayLog:
         vehicle = np.argsort(order)[inverse]  # by first appearance
         first, last = steps[first_rows[order]], np.zeros(len(order), np.intp)
         np.maximum.at(last, vehicle, steps)
-        cav_ids = dict.fromkeys(each.vehicle for each in trips)
+        cav_ids = dict.fromkeys(trip.vehicle for trip in trips)
         entries = [road.entries[number] for number in numbers[order].tolist()]
-        groups = [(each.name in cav_ids, each.route) for each in entries]
+        groups = [(entry.name in cav_ids, entry.route) for entry in entries]
         columns = record.assign_columns(first, last, groups, max(1, moments // record.SHARED_COLUMN_FRAMES))
-        branches = dict(zip(columns.tolist(), [each.route for each in entries], strict=True))
+        branches = dict(zip(columns.tolist(), [entry.route for entry in entries], strict=True))
 
         def as_table(values: Floats) -> Floats:
             table = np.full((moments, len(branches)), np.nan)
@@ -166,7 +166,7 @@ class MotorwayLog:
         return record.Episode(
             **record.common_fields(self._scenario, road, seed, bool(has_crashed)),
             collisions=2 * int(has_crashed),
-            vehicle_ids=tuple(each.name for each in entries),
+            vehicle_ids=tuple(entry.name for entry in entries),
             cav_ids=tuple(cav_ids),
             vehicle_columns=tuple(columns.tolist()),
             branches=tuple(branches[column] for column in sorted(branches)),
@@ -187,7 +187,7 @@ class MotorwayLog:
     def _audit(self, road_index: int, trips: list[record.Trajectory], steady_following: Floats) -> audit.Audit:
         first = road_index * len(_DRIVER_KINDS)
         humans, cavs, cut_ins = (self._braking.statistics(first + kind) for kind in _DRIVER_KINDS)
-        jerks = [np.abs(np.diff(each.states.speed, 2)).max(initial=0.0) for each in trips]
+        jerks = [np.abs(np.diff(trip.states.speed, 2)).max(initial=0.0) for trip in trips]
         speed, leader_speed, gap, in_recovery = steady_following[:, None]
         step, control_step = self._scenario.simulation_step, self._scenario.control_step
         following = audit.following_statistics(speed, leader_speed, gap, step, in_recovery=in_recovery)

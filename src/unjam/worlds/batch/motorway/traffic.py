@@ -198,7 +198,9 @@ class BatchMotorways:
         row = neighbors_on_lane(self.neighbors.leaders, vehicles.lane)
         sections, has_leader = geometry.sections(vehicles.lane, position), row >= 0
         is_on_ramp, is_on_lane = (vehicles.lane == 0) & sections.is_before, (vehicles.lane == 0) & ~sections.is_before
-        limit, ramp_limit = (each * vehicles.speed_factor for each in (geometry.speed_limit, sections.ramp_speed_limit))
+        limit, ramp_limit = (
+            lane_limit * vehicles.speed_factor for lane_limit in (geometry.speed_limit, sections.ramp_speed_limit)
+        )
         allowed = geometry.speed_limits(vehicles.lane, sections) * vehicles.speed_factor
         allowed = np.minimum(allowed, vehicles.speed_cap)
         adapted = vehicles.desired_speed + clamp_min(limit - ramp_limit, 0.0) * step / LIMIT_ADAPTATION_TIME
@@ -216,7 +218,7 @@ class BatchMotorways:
         max_speed = np.where(vehicles.is_eidm, vehicles.speed_cap, allowed)
         safe = np.minimum(np.minimum(speed + vehicles.max_acceleration * step, max_speed), follow)
         may_be_free = as_rows(safe > speed - LEADER_BRAKING_THRESHOLD * step)
-        own, ahead, limits = (each[may_be_free] for each in (speed, free_gap, next_allowed))
+        own, ahead, limits = (values[may_be_free] for values in (speed, free_gap, next_allowed))
         free = drivers.select(may_be_free).desired_speed(own, ahead, limits, step)
         # Of the leader and the allowed speed, drivers obey the one that requires more braking without coolness.
         is_free = np.zeros(len(speed), bool)

@@ -108,8 +108,10 @@ class MotorwayDrivers(NamedTuple):
     def select(self, index: Array) -> "MotorwayDrivers":
         """Return some of the drivers."""
         index = as_rows(index)
-        parameters = IDMArrays(*(each if type(each) is float else each[index] for each in self.parameters))
-        return MotorwayDrivers(parameters, DriverErrors(*(each[index] for each in self.errors)), self.is_eidm[index])
+        parameters = IDMArrays(
+            *(parameter if type(parameter) is float else parameter[index] for parameter in self.parameters)
+        )
+        return MotorwayDrivers(parameters, DriverErrors(*(error[index] for error in self.errors)), self.is_eidm[index])
 
     def follow_speed(self, speed: Array, gap: Array, leader_speed: Array, step: float) -> Array:
         """Return the desired speeds after a step at bumper-to-bumper gaps behind leaders."""

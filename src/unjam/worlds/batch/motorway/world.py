@@ -250,9 +250,9 @@ class MotorwayBatch:
     def _exact_state(self) -> LocalState:
         traffic, vehicles = self._traffic, self._traffic.vehicles
         rows, geometry = self._cav_rows(), traffic.geometry
-        roads, _, lane, position, speed = (each[rows] for each in vehicles[:5])
+        roads, _, lane, position, speed = (vehicle[rows] for vehicle in vehicles[:5])
         motion = vehicles.position, vehicles.speed, np.broadcast_to(geometry.vehicle_length, vehicles.speed.shape)
-        own, left, right = (observe_lane(traffic.neighbors, rows, lane + each, *motion) for each in (0, 1, -1))
+        own, left, right = (observe_lane(traffic.neighbors, rows, lane + offset, *motion) for offset in (0, 1, -1))
         limit = geometry.speed_limits(lane, geometry.sections(lane, position))
         lane_speeds, road_speeds = self._road_sections.speeds_ahead(self._messages.latest, lane, position, roads)
         if self.roads[0].roadside.source == "none":
@@ -307,7 +307,9 @@ class MotorwayBatch:
         roads, generators = self.cav_roads, self._exploration_generators
         if episode_noise_size:
             if self._episode_noise is None:
-                self._episode_noise = np.stack([each.standard_normal(episode_noise_size) for each in generators])
+                self._episode_noise = np.stack(
+                    [generator.standard_normal(episode_noise_size) for generator in generators]
+                )
             return self._exploration_scales[roads, None] * self._episode_noise[roads]
         noise = np.empty(len(roads))
         for road in np.unique(roads).tolist():

@@ -36,7 +36,7 @@ def make_ring_episodes(
     driver_log = replace(driver_log, decisions=decisions, last_observation=None if last is None else as_numpy(last))
     ring_count, values = start_positions.shape[1], dict[str, Floats]()
     for name, steps in series.items():
-        stacked = [as_numpy(each).reshape(-1, ring_count) for each in steps]
+        stacked = [as_numpy(step).reshape(-1, ring_count) for step in steps]
         values[name] = np.stack(stacked) if steps else np.zeros((0, 0, ring_count))
     episodes = []
     for ring, (scenario, road, seed, count, has_crashed) in enumerate(rings):

@@ -107,7 +107,7 @@ class RingBatch:
             )
             self._find_contacts = figure_eight_contacts
         crossings = zip(*(road.crossings for road in roads), strict=True)
-        self._crossing_starts = [to_array(np.tile([start for start, _ in each], cavs)) for each in crossings]
+        self._crossing_starts = [to_array(np.tile([start for start, _ in crossing], cavs)) for crossing in crossings]
         self._ends = to_array(np.full(len(roads), float(scenario.horizon)))
         """number of control steps in the episode of each road, shape (W,)"""
         self._noise_scale = to_array(np.full((vehicles, 1), scenario.noise_per_step * step))
@@ -194,7 +194,7 @@ class RingBatch:
         speed, position, gap = (values.T.copy() for values in (self._speed, self._position, self._gap))
         states = []
         for ring, crashed in enumerate(self.crashed_roads.tolist()):
-            memory = self._figure_eight and CrossingMemory(*(each[:, ring] for each in self._figure_eight.memory))
+            memory = self._figure_eight and CrossingMemory(*(values[:, ring] for values in self._figure_eight.memory))
             own_history = None if history is None else history.select(ring)
             motion = speed[ring], position[ring], gap[ring]
             states.append(WarmUpState(*motion, crashed, noise[ring], own_history, memory))
@@ -202,7 +202,7 @@ class RingBatch:
 
     def _restore(self, states: Sequence[WarmUpState]) -> LocalState | None:
         *motion, noise, histories, memories = zip(*states, strict=True)
-        arrays = (self._to_array(np.stack(each, -1)) for each in motion)
+        arrays = (self._to_array(np.stack(values, -1)) for values in motion)
         self._speed, self._position, self._gap, self.crashed_roads = arrays
         cast(SeededNoise, self._noise).restore(noise)
         if self._figure_eight:
@@ -228,7 +228,9 @@ class RingBatch:
 
     def detach_state(self) -> None:
         """Let no gradients of torch flow through the state so far."""
-        self._speed, self._position, self._gap = (each.detach() for each in (self._speed, self._position, self._gap))
+        self._speed, self._position, self._gap = (
+            values.detach() for values in (self._speed, self._position, self._gap)
+        )
         self._actuation.detach()
 
     @property
