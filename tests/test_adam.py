@@ -21,6 +21,6 @@ def test_adam_equals_torchs_to_the_bit_and_resumes_from_its_state(fused: bool) -
             network(torch.arange(12.0).reshape(3, 4)).square().mean().backward()
             optimizer.step()
         assert torch.is_grad_enabled()
-        return [each.detach().numpy().tobytes() for each in network.parameters()]
+        return [parameter.detach().numpy().tobytes() for parameter in network.parameters()]
 
     assert trained(Adam) == trained(torch.optim.Adam)

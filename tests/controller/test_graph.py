@@ -223,8 +223,8 @@ WRONG: dict[str, tuple[Change, str]] = {
 def test_an_attribute_has_one_value_of_its_type(fields: list[dict[str, Any]]) -> None:
     def change(model: Any) -> None:
         node = model.graph.node.add(op_type="Constant", output=["made"])
-        for each in fields:
-            node.attribute.add(**each)
+        for field in fields:
+            node.attribute.add(**field)
 
     with pytest.raises(InputError, match=r"graph: (attribute|type) of Constant"):
         check_graph(graph(change), Constant())

@@ -58,7 +58,7 @@ def known(path: Path) -> tuple[Any, dict[str, PartCheck]]:
     How a training explored is left out: a controller drives without exploration.
     """
     controller = read_controller(path)
-    checks = {each.part: each for each in check_parts(controller) if each.status != "stated"}
+    checks = {check_part.part: check_part for check_part in check_parts(controller) if check_part.status != "stated"}
     del checks["signature"]
     recipe = driver_recipe(controller.driver)[0]
     return replace_values(recipe, exploration_std=0.0, episode_noise=False), checks

@@ -172,7 +172,7 @@ def test_without_onnxscript_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatc
 def test_a_described_graph_needs_of_a_road_what_its_driver_needs(name: str) -> None:
     driver = driver_from_name(name, 0.1)
     content = describe_graph(linear(1, [1.0]).SerializeToString(), driver, 1.0, 0.1)
-    (text,) = (each.value for each in parse_model(content).metadata_props)
+    (text,) = (metadata_prop.value for metadata_prop in parse_model(content).metadata_props)
     described = build_dataclass(PolicyDescription, parse_toml(text), "")
     found = merge_requirements(*(feature(each).requirements for each in described.inputs))
     expected = driver.requirements()

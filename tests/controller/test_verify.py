@@ -203,7 +203,7 @@ def test_a_graph_that_cannot_be_run_here_is_not_checked_and_never_passes(
     driver = Constant()
     path = written(tmp_path, content_of(driver, limit=20.0, parts={GRAPH_PART: graph()}))
     monkeypatch.setitem(sys.modules, package, None)
-    (found,) = [each for each in check_parts(read_controller(path)) if each.part == "graph"]
+    (found,) = [check_part for check_part in check_parts(read_controller(path)) if check_part.part == "graph"]
     assert found.status == "not checked"
     with pytest.raises(MissingPartError, match=f"^controller: graph: not checked: {package} is not installed"):
         verify_controller_file(path)
@@ -249,7 +249,7 @@ JSON = st.recursive(
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Every place in a JSON document."""
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return [*([path] if path else []), *(found for key, part in inner for found in places(part, (*path, key)))]
+    return [*([path] if path else []), *(place for key, part in inner for place in places(part, (*path, key)))]
 
 
 @settings(max_examples=60)

@@ -16,7 +16,7 @@ from unjam.drivers.wrappers import RoadTypeSwitch
 from unjam.scenarios import make_scenario
 from unjam.worlds.episode import run_episode
 
-ROAD_TYPES = tuple(each.name for each in fields(RoadTypeSwitch))
+ROAD_TYPES = tuple(field.name for field in fields(RoadTypeSwitch))
 EACH = RoadTypeSwitch(*(Constant(acceleration=0.1 * number) for number in range(len(ROAD_TYPES))))
 
 

@@ -236,7 +236,7 @@ def test_a_policy_keeps_the_features_that_it_was_made_with(tmp_path: Path, monke
     recipe, arrays = driver_recipe(driver)
     Path("elsewhere").mkdir()
     monkeypatch.chdir("elsewhere")
-    assert [each["path"] for each in user_code_recipes(recipe)] == [str(tmp_path / "mine.py")]
+    assert [user_code_recipe["path"] for user_code_recipe in user_code_recipes(recipe)] == [str(tmp_path / "mine.py")]
     assert driver_recipe(driver_from_recipe(recipe, arrays))[0] == recipe
     Path("mine.py").write_text(CODE.format(2))
     (tmp_path / "mine.py").write_text(CODE.format(3))

@@ -83,7 +83,7 @@ def test_on_an_own_network_cavs_are_called_in_order_of_entry(tmp_path: Path) -> 
     environment.close()
     assert list(seen) == ["cav_0", "cav_1", "cav_2"]
     driven = [float(10.0 * speeds[5][0]) for speeds in seen.values()]
-    assert driven == pytest.approx([each.states.speed[6] for each in expected.trajectories], abs=1e-5)
+    assert driven == pytest.approx([trajectory.states.speed[6] for trajectory in expected.trajectories], abs=1e-5)
     assert len(expected.cav_ids) == 3
 
 

@@ -93,10 +93,10 @@ def gymnasium_steps(**arguments: Any) -> list[float]:
 def pettingzoo_steps(**arguments: Any) -> list[float]:
     environment = unjam.parallel_env("ring", **SHORT, **arguments)
     observations, _ = environment.reset(seed=3)
-    found = [number for each in observations.values() for number in each]
+    found = [number for observation in observations.values() for number in observation]
     for _ in range(10):
         observations, rewards, *_ = environment.step(dict.fromkeys(environment.agents, 0.2))
-        found += [*(number for each in observations.values() for number in each), *rewards.values()]
+        found += [*(number for observation in observations.values() for number in observation), *rewards.values()]
     environment.close()
     return found
 

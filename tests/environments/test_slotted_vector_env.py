@@ -135,7 +135,7 @@ def test_with_zero_actions_episodes_are_those_of_the_batch_alone(name: str) -> N
         info = environment.step(np.zeros((3, 2, 1)))[-1]
         for row in np.flatnonzero(info.get("_episode_metrics", ())).tolist():
             metrics = info["episode_metrics"]
-            found.append((row, {each: metrics[each][row] for each in metrics if not each.startswith("_")}))
+            found.append((row, {metric: metrics[metric][row] for metric in metrics if not metric.startswith("_")}))
     seeds = {0: [(5,), (5, 1)], 1: [(6,), (6, 1)], 2: [(OTHER_SEED,), (OTHER_SEED, 1)]}
     scenario = make_scenario("on-ramp", changes)
     driver = make_expert(CASES[name]["expert"], scenario.control_step)
@@ -143,7 +143,7 @@ def test_with_zero_actions_episodes_are_those_of_the_batch_alone(name: str) -> N
         alone = run_batches([EpisodeTask(scenario, driver, seed) for seed in own], allow_statistical=True)
         for metrics, episode in zip([each for number, each in found if number == row], alone, strict=True):
             assert metrics.pop("steps") == episode.control_steps == ROAD["horizon"]
-            assert metrics == pytest.approx({each: METRICS[each].function(episode) for each in metrics}, abs=1e-9)
+            assert metrics == pytest.approx({metric: METRICS[metric].function(episode) for metric in metrics}, abs=1e-9)
             assert metrics.keys() == {"return", "mean_speed", "travel_time", "insertion_backlog_veh"}
 
 
@@ -169,7 +169,9 @@ def test_all_columns_have_single_precision_if_they_are_not_exact() -> None:
     for _ in range(100):
         fast.step(np.zeros((2, 4)))
     vehicles = fast._running_episodes.world._traffic.vehicles
-    assert {each.dtype for each in vehicles if each.dtype.kind == "f"} == {np.dtype(np.float32)}, "half of the time"
+    assert {vehicle.dtype for vehicle in vehicles if vehicle.dtype.kind == "f"} == {np.dtype(np.float32)}, (
+        "half of the time"
+    )
 
 
 def test_episodes_in_single_precision_are_others_of_the_same_distribution() -> None:
@@ -230,7 +232,7 @@ def test_vehicles_under_way_at_a_collision_count_for_the_planned_time() -> None:
     outcomes = [
         Outcome(speeds[[step]], empty, empty, np.array([step == 3]), backlog[[step]], empty) for step in (1, 2, 3)
     ]
-    sums = {name: sum(open_road_sums(each)[name] for each in outcomes) for name in open_road_sums(outcomes[0])}
+    sums = {name: sum(open_road_sums(outcome)[name] for outcome in outcomes) for name in open_road_sums(outcomes[0])}
     found = open_road_metrics(sums, outcomes[-1], np.array([3]), np.array([10 - 3]), 0.5)
     assert found["travel_time"] == pytest.approx(mean_travel_time(episode))
 

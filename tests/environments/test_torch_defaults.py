@@ -56,7 +56,7 @@ def export(folder: Path) -> Any:
     torch.nn.init.zeros_(network.bias)
     write_onnx_policy(network, folder / "policy.onnx", [PolicyInput("speed")])
     graphs = (folder / "policy.onnx").read_bytes(), onnx_graph(make_driver("pi", 0.1), 1.0)
-    return [torch.as_tensor(np.frombuffer(each, np.uint8).copy(), device="cpu") for each in graphs]
+    return [torch.as_tensor(np.frombuffer(graph, np.uint8).copy(), device="cpu") for graph in graphs]
 
 
 CASES: dict[str, Callable[[Path], Any]] = {

@@ -130,7 +130,7 @@ def hostile(count: int, folder: Path, generator: np.random.Generator) -> Outcome
             assert result in (DRIVEN, REFUSED)
             assert {each.name: each.read_bytes() for each in working_folder.iterdir()} == before
             for process in map(psutil.Process, [os.getpid(), *processes(workers)]):
-                assert not any(one.status == "LISTEN" for one in process.net_connections())
+                assert not any(net_connection.status == "LISTEN" for net_connection in process.net_connections())
             outcome_text = "it drove" if result == DRIVEN else "it was refused in one line"
             outcome.happened[f"{outcome_text}, nothing was written, and nothing listened"] += 1
     return outcome

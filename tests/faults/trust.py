@@ -86,7 +86,7 @@ def sandboxes(count: int, folder: Path, generator: np.random.Generator) -> Outco
                 except EpisodeError as error:
                     one_line(error)
                 process = psutil.Process(sumo._process.pid)
-                assert not any(one.status == "LISTEN" for one in process.net_connections())
+                assert not any(net_connection.status == "LISTEN" for net_connection in process.net_connections())
                 words = "SUMO with options to write or to listen: it did not"
             assert canary.read_text() == "as it was"
             assert sorted(path.name for path in folder.iterdir()) == before

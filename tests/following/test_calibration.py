@@ -92,5 +92,5 @@ def test_short_last_segment_of_a_trajectory_has_little_weight(weighting: Literal
     whole = idm_driver(DRIVER, seconds=20.0)
     candidates = np.array([[30.0, 1.4, 1.4, 2.0, 2.5, 0.0]]).T
     segments = [make_segments([whole], seconds) for seconds in (20.0, 19.8)]
-    errors = [gap_objective(each, (-4.0, 2.0), weighting)(candidates)[0] for each in segments]
+    errors = [gap_objective(segment, (-4.0, 2.0), weighting)(candidates)[0] for segment in segments]
     assert errors[1] == pytest.approx(errors[0], rel=0.02)

@@ -44,7 +44,7 @@ def test_another_follower_starts_another_trajectory(data: EnvironmentData) -> No
     gap = np.array(recording.states.follower_gap, np.float64)
     gap[400:] += 30.0
     trajectories = trajectories_behind_cavs([with_follower_gap(recording, gap)], RING.control_step)
-    assert [len(each.speed) for each in trajectories] == [400, 501]
+    assert [len(trajectory.speed) for trajectory in trajectories] == [400, 501]
 
 
 def test_hard_braking_within_a_control_step_is_not_taken_for_another_follower() -> None:
@@ -54,7 +54,9 @@ def test_hard_braking_within_a_control_step_is_not_taken_for_another_follower() 
     gap = 20.0 + np.concatenate([[0.0], np.cumsum(20.0 - follower_speeds[1:]) * 0.2])
     leader_speed, missing = np.full(26, 20.0), np.full(26, np.nan)
     states = LocalState(leader_speed, leader_speed, leader_speed, follower_speeds[::5], gap[::5], missing, missing)
-    assert [len(each.speed) for each in trajectories_behind_cavs([states], 1.0, 5)] == [26]
+    assert [
+        len(trajectories_behind_cav.speed) for trajectories_behind_cav in trajectories_behind_cavs([states], 1.0, 5)
+    ] == [26]
     assert trajectories_behind_cavs([states], 1.0) == []
 
 

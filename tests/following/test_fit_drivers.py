@@ -29,10 +29,10 @@ def trajectories() -> list[FollowingTrajectory]:
 def test_each_driver_has_its_headway_and_the_common_parameters(trajectories: list[FollowingTrajectory]) -> None:
     progress: list[tuple[int, int]] = []
     population = fit_drivers(trajectories, FitDriversSettings(calibration=QUICK), lambda *done: progress.append(done))
-    headways = [one.time_headway for one in population.drivers]
+    headways = [driver.time_headway for driver in population.drivers]
     assert headways == sorted(headways)
-    assert all(one.max_acceleration == population.typical.max_acceleration for one in population.drivers)
-    assert [detail["name"] for detail in population.details] == [each.driver for each in trajectories]
+    assert all(driver.max_acceleration == population.typical.max_acceleration for driver in population.drivers)
+    assert [detail["name"] for detail in population.details] == [trajectory.driver for trajectory in trajectories]
     assert all(detail["gap_error"] < population.metadata["fit"]["common"]["gap_error"] for detail in population.details)
     assert population.residual is None
     assert progress[-1] == (5, 5)
@@ -127,7 +127,7 @@ def test_filters_select_trajectories(data: Path) -> None:
 def test_drivers_of_several_files_have_different_names(data: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.parquet"
     write_table(other, [{}])
-    names = [one["name"] for one in fit_drivers_from_files([data, other], CHANGES).population.details]
+    names = [detail["name"] for detail in fit_drivers_from_files([data, other], CHANGES).population.details]
     assert names == ["data-0", "data-1", "data-2", "other-0"]
 
 
@@ -178,7 +178,7 @@ def test_drivers_of_files_with_the_same_name_have_different_names(data: Path, tm
     for day in days:
         day.parent.mkdir()
         day.write_bytes(data.read_bytes())
-    names = [each["name"] for each in fit_drivers_from_files(days, CHANGES).population.details]
+    names = [detail["name"] for detail in fit_drivers_from_files(days, CHANGES).population.details]
     assert len(set(names)) == len(names) == 2 * len(fit_drivers_from_files([data], CHANGES).population.details)
     assert {name.partition("-")[0] for name in names} == {"1", "2"}
     with pytest.raises(InputError, match=r"data: .* is not allowed; allowed: each file once"):

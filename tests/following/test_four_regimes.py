@@ -22,7 +22,10 @@ def test_same_seed_gives_the_same_data() -> None:
 
 def test_each_regime_starts_with_its_acceleration() -> None:
     trajectories = make_four_regimes(FourRegimesSettings(samples=60_000, acceleration_noise=0.0))
-    starts = {kind: np.array([each.acceleration[0] for each in trajectories if each.kind == kind]) for kind in REGIMES}
+    starts = {
+        kind: np.array([trajectory.acceleration[0] for trajectory in trajectories if trajectory.kind == kind])
+        for kind in REGIMES
+    }
     assert (starts["acceleration"] > 0).all()
     assert ((starts["deceleration"] <= 0) & (starts["deceleration"] >= -2)).all()
     np.testing.assert_allclose(starts["cruising"], 0.0, atol=1e-9)

@@ -81,7 +81,7 @@ def drive_all() -> Iterator[tuple[str, Episode]]:
 def hash_of(episode: Episode) -> str:
     """Return the hash of all speeds and positions, rounded to `GRAIN`."""
     grains = [np.rint(np.nan_to_num(each, nan=-1e6) / GRAIN) for each in (episode.speeds, episode.positions)]
-    content = b"".join(each.astype("<i8").tobytes() for each in grains)
+    content = b"".join(grain.astype("<i8").tobytes() for grain in grains)
     return hashlib.sha256(repr(episode.vehicle_ids).encode() + content).hexdigest()
 
 

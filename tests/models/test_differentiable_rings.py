@@ -158,7 +158,7 @@ def test_gradients_are_finite_at_standstill_and_in_contact(reward: str, actuator
         total = total + rings.step(command if step < 25 else -command).sum()
     assert bool(rings.crashed_roads.any()) != is_filtered
     gradients = torch.autograd.grad(total + rings.speeds.sum() + rings.gaps[cav].sum(), (command, speeds))
-    assert all(bool(each.isfinite().all()) for each in gradients)
+    assert all(bool(gradient.isfinite().all()) for gradient in gradients)
     assert gradients[0].abs().max() > 0.0
 
 
@@ -200,7 +200,9 @@ def test_an_episode_is_that_of_a_batch_with_rewards(changes: dict[str, Any], is_
             rewards.append(rings.step(acceleration))
             speeds.append(rings.speeds)
     episodes = run_batch([EpisodeTask(road, driver, seed) for seed in seeds])
-    assert is_filtered == any((each.filter_braking > 0.0).any() for one in episodes for each in one.trajectories)
+    assert is_filtered == any(
+        (trajectory.filter_braking > 0.0).any() for one in episodes for trajectory in one.trajectories
+    )
     for ring, episode in enumerate(episodes):
         assert np.abs(episode.reward - torch.stack(rewards)[:, ring].numpy()).max() < 1e-9
         assert np.abs(episode.speeds - torch.stack(speeds)[..., ring].numpy()).max() < 1e-9

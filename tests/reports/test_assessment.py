@@ -71,8 +71,8 @@ def assessment_folder(folder: Path, results: list[ControllerResult]) -> Path:
         "acc_finding": acc_finding(WITH_ACC),
         "recommended": best and {"penetration_rate": best.penetration_rate, "driver": best.driver},
         "controller_results": [
-            {**asdict(each), "reasons": each.reasons, "verdict": each.verdict, "summary": each.summary}
-            for each in results
+            {**asdict(result), "reasons": result.reasons, "verdict": result.verdict, "summary": result.summary}
+            for result in results
         ],
         "acc_results": [{**asdict(each), "driver": "cruise", "summary": each.summary} for each in WITH_ACC],
         "candidates": candidates,

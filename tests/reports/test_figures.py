@@ -75,11 +75,11 @@ def panels_of(figure: Figure) -> list[Axes]:
 
 
 def lines_of(axes: Axes) -> list[LineCollection]:
-    return [each for each in axes.collections if isinstance(each, LineCollection)]
+    return [collection for collection in axes.collections if isinstance(collection, LineCollection)]
 
 
 def fields_of(axes: Axes) -> list[QuadMesh]:
-    return [each for each in axes.collections if isinstance(each, QuadMesh)]
+    return [collection for collection in axes.collections if isinstance(collection, QuadMesh)]
 
 
 def drawn_lines(axes: Axes) -> list[Line2D]:

@@ -52,11 +52,11 @@ def test_vehicles_are_only_in_the_map_of_their_lane(episode: PlotEpisode) -> Non
     panels = [axes for axes in figure.axes if axes.get_visible() and axes.get_label() != "<colorbar>"]
     assert tuple(axes.get_ylabel().split("\n")[0] for axes in panels) == episode.lane_names
     for lane, axes in enumerate(panels):
-        (mesh,) = [each for each in axes.collections if isinstance(each, QuadMesh)]
+        (mesh,) = [collection for collection in axes.collections if isinstance(collection, QuadMesh)]
         speeds = episode.speeds[(episode.lane_indices == lane) & ~np.isnan(episode.positions)]
         drawn = np.asarray(mesh.get_array()).astype(float)
         assert speeds.min() - 0.01 <= np.nanmin(drawn) <= np.nanmax(drawn) <= speeds.max() + 0.01
-        (cavs,) = [each for each in axes.collections if isinstance(each, LineCollection)]
+        (cavs,) = [collection for collection in axes.collections if isinstance(collection, LineCollection)]
         own = episode.lane_indices[:, episode.cav_columns] == lane
         assert len(cavs.get_segments()) == (own[1:] & own[:-1]).sum()
 
@@ -74,7 +74,9 @@ def test_roads_without_common_lanes_are_drawn_as_trajectories(episode: PlotEpiso
     assert not has_lane_maps([episode, merge])
     assert not has_lane_maps([])
     panels = [axes for axes in space_time_figure([merge]).axes if axes.get_label() != "<colorbar>"]
-    lines = [[each for each in axes.collections if isinstance(each, LineCollection)] for axes in panels]
+    lines = [
+        [collection for collection in axes.collections if isinstance(collection, LineCollection)] for axes in panels
+    ]
     assert [len(of_panel) for of_panel in lines] == [2, 2]  # human drivers and CAVs, on highway and ramp
 
 

@@ -45,7 +45,7 @@ def test_vehicles_in_one_column_are_never_present_together(is_present: np.ndarra
             is_present[moments[0] : moments[-1] + 1, vehicle] = True
     vehicles = [vehicle for vehicle in range(12) if is_present[:, vehicle].any()]
     moments = [np.flatnonzero(is_present[:, vehicle]) for vehicle in vehicles]
-    first, last = (np.array([each[end] for each in moments], int) for end in (0, -1))
+    first, last = (np.array([moment[end] for moment in moments], int) for end in (0, -1))
     groups = [vehicle in cavs for vehicle in vehicles]
     columns = assign_columns(first, last, groups, gap)
     assert sorted(set(columns.tolist())) == list(range(len(set(columns.tolist()))))

@@ -150,7 +150,7 @@ def test_drivers_are_compared_with_the_baseline_of_their_folder() -> None:
     assert common_baseline([requested]) == name_baselines([requested]) == "pi"
     assert name_baselines([result]) == "the human baseline"
     unknown = replace(result, metadata={**result.metadata, "baseline": "gone"})
-    assert [each.driver for each in column_verdicts([unknown])] == ["pi", "mine"]
+    assert [column_verdict.driver for column_verdict in column_verdicts([unknown])] == ["pi", "mine"]
 
 
 def test_drivers_that_are_compared_with_human_drivers_have_verdicts_and_no_finding() -> None:
@@ -367,7 +367,7 @@ def test_two_configurations_of_a_network_are_compared_on_the_same_seeds() -> Non
         "no humans": drive_results("d", "d.sumocfg", pi=[]),
         "a built-in road": drive_results("e", "ring", human=rows_of([5.0, 7.0])),
     }
-    assert [first_alternative([plain, each]) for each in others.values()] == [""] * 3
+    assert [first_alternative([plain, other]) for other in others.values()] == [""] * 3
     assert first_alternative([plain]) == ""
     same = drive_results("runs/limited", "b.sumocfg", human=rows_of([1.0, 2.0]))
     assert first_alternative([plain, same]) == "", "the same human traffic"

@@ -176,7 +176,7 @@ def test_a_picture_of_an_open_road_shows_lanes_and_present_vehicles(episode: Epi
     assert 0 < is_present.sum() < len(is_present)
     assert np.isfinite(scene.poses[is_present]).all()
     assert scene.is_cav[is_present].sum() == len(
-        {each.vehicle for each in episode.trajectories if at_end(each, episode)}
+        {trajectory.vehicle for trajectory in episode.trajectories if at_end(trajectory, episode)}
     )
     full, empty = draw(scene), draw(scene._replace(speeds=np.full(len(is_present), np.nan)))
     assert full.shape == (FRAME_SIZE, FRAME_SIZE, 3)

@@ -59,10 +59,10 @@ def test_drivers_change_lanes_within_the_ranges_and_some_never_cooperate(
     changing = LaneChanging(assertiveness=(low, low + width), cooperation=(0.5, 0.7), uncooperative_share=share)
     generator = np.random.default_rng(seed)
     drivers = [dict(changing.draw(generator)) for _ in range(200)]
-    assert all(low - 1e-4 <= each["lcAssertive"] <= low + width + 1e-4 for each in drivers)
-    uncooperative = [each for each in drivers if each["lcCooperative"] == 0.0]
+    assert all(low - 1e-4 <= driver["lcAssertive"] <= low + width + 1e-4 for driver in drivers)
+    uncooperative = [driver for driver in drivers if driver["lcCooperative"] == 0.0]
     assert all(each["lcCooperativeSpeed"] == 0.0 for each in uncooperative)
-    assert all(0.5 <= each["lcCooperative"] <= 0.7 for each in drivers if each not in uncooperative)
+    assert all(0.5 <= driver["lcCooperative"] <= 0.7 for driver in drivers if driver not in uncooperative)
     assert len(uncooperative) / 200 == pytest.approx(share, abs=0.15)
 
 

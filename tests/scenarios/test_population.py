@@ -124,9 +124,9 @@ def test_on_a_motorway_only_car_following_is_calibrated(tmp_path: Path) -> None:
     assert isinstance(road, MotorwayRoad)
     kinds = road.vehicle_types
     follows = {(one.time_headway, one.max_acceleration, one.comfortable_deceleration) for one in DRIVERS}
-    assert {(one.time_headway, one.acceleration, one.deceleration) for one in kinds.values()} == follows
-    assert {one.model for one in kinds.values()} == {"IDM"}
-    assert all(0.8 <= one.speed_factor <= 1.2 for one in kinds.values())
+    assert {(kind.time_headway, kind.acceleration, kind.deceleration) for kind in kinds.values()} == follows
+    assert {kind.model for kind in kinds.values()} == {"IDM"}
+    assert all(0.8 <= kind.speed_factor <= 1.2 for kind in kinds.values())
 
 
 def test_without_a_population_roads_are_unchanged() -> None:

@@ -60,7 +60,7 @@ def test_classes_instances_and_functions_of_a_file_are_driven_in_a_worker(roads:
     assert scenarios[0] == scenarios[1] == scenarios[2]
     scenarios.append(make_scenario(f"{roads}:ShortRing", {"horizon": 5}))
     with WorkerPool(1) as workers:
-        episodes = workers.run([EpisodeTask(each, Human(), (1,)) for each in scenarios])
+        episodes = workers.run([EpisodeTask(scenario, Human(), (1,)) for scenario in scenarios])
     assert [episode.loop_length for episode in episodes] == [300.0, 300.0, 300.0, 120.0]
     assert statistically_unsupported_reason(scenarios[0])
 

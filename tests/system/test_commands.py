@@ -224,7 +224,9 @@ def test_assess_prints_text_and_json_and_writes_a_page(unjam: Run, tmp_path: Pat
     found = document(unjam(*ASSESS, "-n", 36, "--json", pictures=False))
     assert found["folder"] == "runs/assess-straight-001"
     assert found["headline"] == headline
-    assert [f"- {each['summary']}" for each in found["controller_results"]] == [" ".join(finding.split())]
+    assert [f"- {controller_result['summary']}" for controller_result in found["controller_results"]] == [
+        " ".join(finding.split())
+    ]
     names = {path.name for path in (tmp_path / "answer").iterdir()}
     assert names == {
         *("assessment.html", "assessment.json", "selection", "request.json", "episodes.jsonl"),
@@ -331,7 +333,7 @@ def test_train_resume_drive_and_export(unjam: Run, tmp_path: Path) -> None:
         **{"driver": "pi + residual, filtered", "control_steps": 80},
     }
     verified = document(unjam("verify", "ring.unjam", "--json"))
-    status = {each["part"]: each["status"] for each in verified["parts"]}
+    status = {part["part"]: part["status"] for part in verified["parts"]}
     assert verified["ok"] is True
     assert (status["sample"], status["graph"], status["origin"]) == ("checked", "absent", "stated")
     assert "checked sample: 80 control steps" in unjam("verify", "ring.unjam").stdout

@@ -52,8 +52,8 @@ def planted_module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     (folder / "later.py").write_text("ONE = 1.0\n")
     (folder / "small.toml").write_text(to_toml(small_config(**SMALL)))
     steps = range(60)
-    columns = {"pair": 1, "follower": 1, "time": [0.5 * each for each in steps], "gap": 10.0}
-    speeds = {"speed": [8.0 + 0.01 * each for each in steps], "leader_speed": [8.0] * len(steps)}
+    columns = {"pair": 1, "follower": 1, "time": [0.5 * step for step in steps], "gap": 10.0}
+    speeds = {"speed": [8.0 + 0.01 * step for step in steps], "leader_speed": [8.0] * len(steps)}
     pd.DataFrame({**columns, **speeds}).to_csv(folder / "data.csv", index=False)
     before = {**os.environ}
     os.environ["UNJAM_STATE"] = str(tmp_path_factory.mktemp("state"))

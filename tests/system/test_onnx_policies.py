@@ -53,7 +53,7 @@ def test_an_exported_policy_is_filtered_verified_and_certified(unjam: Run, tmp_p
         (tmp_path / name).unlink()
     verified = unjam("verify", "it.unjam", "--json")
     assert verified.returncode == 0, verified.stderr
-    parts = {each["part"]: each for each in json.loads(verified.stdout)["parts"]}
+    parts = {part["part"]: part for part in json.loads(verified.stdout)["parts"]}
     assert {parts[name]["status"] for name in ("driver", "weights", "sample", "certificate")} == {"checked"}
     assert parts["code"]["status"] == "absent"
     (row,) = driven(unjam, "-d", "it.unjam")

@@ -120,4 +120,4 @@ def test_extras_of_messages_are_those_of_the_package() -> None:
     }
     assert installed == EXTRAS
     assert project["optional-dependencies"]["all"] == [f"unjam[{','.join(sorted(set(EXTRAS.values())))}]"]
-    assert not [name for name in EXTRAS if any(each.startswith(name) for each in project["dependencies"])]
+    assert not [name for name in EXTRAS if any(dependency.startswith(name) for dependency in project["dependencies"])]

@@ -359,7 +359,7 @@ def test_a_ring_of_the_batch_is_that_of_sumo() -> None:
         with closing(RoadEnv("ring", length=230, horizon=20, backend=backend, render_mode="rgb_array")) as environment:
             environment.reset(seed=2)
             steps = [environment.step(np.array([0.2]))[:2] for _ in range(19)]
-            seen.append([*(np.append(*each) for each in steps), environment.render().mean()])
+            seen.append([*(np.append(*step) for step in steps), environment.render().mean()])
     np.testing.assert_allclose(seen[0][:-1], seen[1][:-1], atol=1e-6)
     assert seen[0][-1] == pytest.approx(seen[1][-1], abs=1e-3)
 

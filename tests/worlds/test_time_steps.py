@@ -40,7 +40,7 @@ from unjam.worlds.worker_pool import EpisodeTask
 
 OTHER_STEP = {"steps_per_control_step": 3, "length": (230, 230), "horizon": 10}
 ROAD = Ring(steps_per_control_step=3, length=(230, 230), horizon=10)
-TIMED = [name for name, kind in DRIVERS.items() if "time_step" in {each.name for each in fields(kind)}]  # pyright: ignore[reportArgumentType]
+TIMED = [name for name, kind in DRIVERS.items() if "time_step" in {field.name for field in fields(kind)}]  # pyright: ignore[reportArgumentType]
 REFUSED = r"is not allowed on ring: its time_step is 0\.1 s; allowed: 0\.3 s, the control step"
 
 

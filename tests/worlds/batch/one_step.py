@@ -23,7 +23,7 @@ def errors(eight: FigureEight, driver: Driver, seed: int, simulation: Simulation
     assert isinstance(road, ClosedRoad)
     steps, vehicles = len(episode.speeds) - 1, len(road.vehicle_ids)
     controlled = [road.vehicle_ids.index(name) for name in road.cav_ids] if episode.trajectories else []
-    applied = np.array([each.applied_acceleration for each in episode.trajectories])
+    applied = np.array([trajectory.applied_acceleration for trajectory in episode.trajectories])
     generator = np.random.default_rng(others[0])
     blocks = [generator.standard_normal((NOISE_BLOCK_STEPS, vehicles)) for _ in range(steps // NOISE_BLOCK_STEPS + 1)]
     step = eight.simulation_step

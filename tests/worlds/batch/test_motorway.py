@@ -324,17 +324,19 @@ def test_what_a_cav_perceived_is_what_was_there(driven: dict[str, list[Episode]]
     episode = driven["jam-ahead"][0]
     column = dict(zip(episode.vehicle_ids, episode.vehicle_columns, strict=True))
     assert len(episode.trajectories) > 5
-    for each in episode.trajectories:
-        moments = slice(each.start_step, each.start_step + len(each.states.speed))
-        np.testing.assert_allclose(each.states.speed, episode.speeds[moments, column[each.vehicle]])
-        np.testing.assert_allclose(each.states.route_position, episode.positions[moments, column[each.vehicle]])
-        gaps = episode.gaps[moments, column[each.vehicle]]
+    for trajectory in episode.trajectories:
+        moments = slice(trajectory.start_step, trajectory.start_step + len(trajectory.states.speed))
+        np.testing.assert_allclose(trajectory.states.speed, episode.speeds[moments, column[trajectory.vehicle]])
+        np.testing.assert_allclose(
+            trajectory.states.route_position, episode.positions[moments, column[trajectory.vehicle]]
+        )
+        gaps = episode.gaps[moments, column[trajectory.vehicle]]
         near = gaps < 100.0
-        np.testing.assert_allclose(each.states.leader_gap[near], gaps[near])
-        change = np.diff(each.states.speed) / episode.control_step
-        np.testing.assert_allclose(each.applied_acceleration, change, atol=1e-12)
-        assert not each.terminated
-        assert np.isfinite(each.reward).all()
+        np.testing.assert_allclose(trajectory.states.leader_gap[near], gaps[near])
+        change = np.diff(trajectory.states.speed) / episode.control_step
+        np.testing.assert_allclose(trajectory.applied_acceleration, change, atol=1e-12)
+        assert not trajectory.terminated
+        assert np.isfinite(trajectory.reward).all()
 
 
 @pytest.mark.slow
@@ -342,8 +344,8 @@ def test_cavs_that_hold_back_are_slower_upstream_than_those_that_never_do() -> N
     crowded = replace(SHORT, penetration_rate=0.5, horizon=200)
 
     def upstream(name: str) -> float:
-        states = [each.states for episode in batch_of(crowded, name, 3) for each in episode.trajectories]
-        return float(np.mean(np.concatenate([each.speed[each.distance_to_merge > 0.0] for each in states])))
+        states = [trajectory.states for episode in batch_of(crowded, name, 3) for trajectory in episode.trajectories]
+        return float(np.mean(np.concatenate([state.speed[state.distance_to_merge > 0.0] for state in states])))
 
     assert upstream("constant:acceleration=-1") < 0.8 * upstream("cruise")
 

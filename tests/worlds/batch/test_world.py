@@ -294,9 +294,9 @@ def test_quick_noise_is_of_the_same_size_and_cavs_have_none() -> None:
     world = RingBatch([replace(ring, warmup=60)] * 50, [(seed,) for seed in range(50)], singles("cpu"), draw=draw)
     episodes = finish_drive(start_batch_drive(world, Constant(0.2), singles("cpu")))
     noise = [
-        each.speeds[1:] - np.diff(each.positions, axis=0) / each.control_step
-        for each in episodes
-        if each.speeds.min() > 0.5
+        episode.speeds[1:] - np.diff(episode.positions, axis=0) / episode.control_step
+        for episode in episodes
+        if episode.speeds.min() > 0.5
     ]
     cav = episodes[0].vehicle_ids.index("cav_0")
     added = np.array(noise)
