@@ -369,4 +369,4 @@ class MultiLaneTraffic(OpenTraffic[OpenRoadT]):
         step, limits = self.scenario.simulation_step, self._acc_limits(names)
         caps = cruise.set_speed(current, targets, self.limits.highest, step, limits)
         for name, cap in zip(names, caps.tolist(), strict=True):
-            self._speed_caps.set(name, "set speed", inf if self._is_uncapped(name) else cap)
+            self._speed_caps.set_cap(name, "set speed", inf if self._is_uncapped(name) else cap)

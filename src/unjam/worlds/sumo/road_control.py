@@ -30,11 +30,11 @@ class SpeedCaps:
         self.own_max_speeds: dict[str, float] = {}
         """maximum speeds of the vehicles that have a cap, without it [m/s]"""
 
-    def capped(self, source: Hashable) -> list[str]:
+    def vehicles_with_cap(self, source: Hashable) -> list[str]:
         """Return the vehicles that have a cap from a source; some of them may have left the road."""
         return [name for name, caps in self._caps.items() if source in caps]
 
-    def set(self, name: str, source: Hashable, cap: float) -> None:
+    def set_cap(self, name: str, source: Hashable, cap: float) -> None:
         """Set the cap of a vehicle on the road from one source [m/s]; infinite: none."""
         caps = self._caps.get(name)
         if caps is None:
@@ -48,9 +48,9 @@ class SpeedCaps:
             return
         self._simulation.set_max_speed(name, min(self.own_max_speeds[name], *caps.values(), inf))
         if not caps:
-            self.forget(name)
+            self.remove(name)
 
-    def forget(self, name: str) -> None:
+    def remove(self, name: str) -> None:
         """Forget a vehicle that has no cap, or has left the road."""
         self._caps.pop(name, None)
         self.own_max_speeds.pop(name, None)
@@ -114,13 +114,13 @@ class RampControl:
         caps = np.maximum(self._limit, vehicles.speeds - LIMIT_DECELERATION * self._step)
         limited = {names[row]: float(caps[row]) for row in np.flatnonzero(is_limited).tolist()}
         present = set(names)
-        for name in self._speed_caps.capped(self):
+        for name in self._speed_caps.vehicles_with_cap(self):
             if name not in present:
-                self._speed_caps.forget(name)
+                self._speed_caps.remove(name)
             elif name not in limited:
-                self._speed_caps.set(name, self, inf)
+                self._speed_caps.set_cap(name, self, inf)
         for name, cap in limited.items():
-            self._speed_caps.set(name, self, cap)
+            self._speed_caps.set_cap(name, self, cap)
 
     def _meter_ramp(self, vehicles: ControlledVehicles) -> None:
         """Let vehicles stop at the meter, and release one after the other; faster if the queue is long."""
