@@ -67,8 +67,8 @@ class MotorwayTraffic(MultiLaneTraffic[MotorwayRoad]):
 
     def _command_humans(self) -> None:
         """Let the road operator control speed limits and meters."""
-        for control in self._ramp_controls:
-            control.act(ControlledVehicles(self._names, self._lane, self._position, self._speed, self._length))
+        for ramp_control in self._ramp_controls:
+            ramp_control.control(ControlledVehicles(self._names, self._lane, self._position, self._speed, self._length))
 
     def _names_and_speeds(self) -> tuple[Sequence[str], Floats]:
         return self._names, self._speed

@@ -84,7 +84,7 @@ class RampControl:
         self._known = set[str]()
         self._time, self._wait = 0.0, 0.0
 
-    def act(self, vehicles: ControlledVehicles) -> None:
+    def control(self, vehicles: ControlledVehicles) -> None:
         """Measure and control in this simulation step."""
         self._time += self._step
         end = self._ramp.merge_end + MEASURED_DOWNSTREAM
