@@ -123,7 +123,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         """distances that vehicles have driven since their entry [m]"""
         self.fuel = call_for_each("getFuelConsumption")
         """fuel rates of vehicles in the last step [mg/s], by their emission class"""
-        self.now: Callable[[], float] = call("simulation", "getTime")
+        self.time: Callable[[], float] = call("simulation", "getTime")
         self.max_speed: Callable[[str], float] = call("vehicle", "getMaxSpeed")
         """maximum speed of a vehicle, whatever the road allows [m/s]"""
         self.set_max_speed: Callable[[str, float], object] = call("vehicle", "setMaxSpeed")
@@ -388,7 +388,7 @@ class Simulation(AbstractContextManager["Simulation"]):
 
     def end_with_trips(self, vehicle_classes: dict[str, str], warmup_end: float, removes_jammed: bool) -> Trips:
         """End the episode, so that SUMO writes its last records, and return the trips as `read_trips` does."""
-        end = self.now()
+        end = self.time()
         self._library.end()
         return read_trips(self._trip_file, vehicle_classes, warmup_end, end, removes_jammed)
 

@@ -131,7 +131,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
     def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
         # SUMO does not expect the vehicles that calibrators will add.
         until, simulation = self.road.files.calibrated_until, self._simulation
-        self.is_finished = not simulation.expects_vehicles() and (not until or simulation.now() >= until)
+        self.is_finished = not simulation.expects_vehicles() and (not until or simulation.time() >= until)
         if self.options.record_details:
             self._route_counts.update(simulation.route_of(name) for name in entered_names)
 
