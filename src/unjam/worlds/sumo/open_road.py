@@ -50,7 +50,7 @@ class ActiveVehicles:
         self.off_road: dict[str, bool] = {}
         """the same for vehicles that SUMO is removing, which it lists as arrived or teleported only later"""
         self._removed_unlisted = set[str]()
-        self.collided = set[str]()
+        self.collided_vehicles = set[str]()
         self.arrivals = self.teleports = 0
         self.removed_count = 0
         """vehicles that SUMO removed for good, among the teleports: they never arrive"""
@@ -82,7 +82,7 @@ class ActiveVehicles:
 
     def add_collision(self, colliding: Sequence[str], simulation: Simulation) -> None:
         """Count a collision in the last step; vehicles that SUMO removes for it are teleports, not arrivals."""
-        self.collided.update(colliding)
+        self.collided_vehicles.update(colliding)
         removed = set(colliding) & {*simulation.arrived_vehicles(), *self.off_road}
         removed -= set(simulation.teleporting_vehicles())  # one that is teleported to its end has arrived
         unlisted = removed & self.off_road.keys()
@@ -191,7 +191,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         self._warm_up(lambda: self._simulate({}), on_progress)
         self.is_controlled = is_controlled
         self._vehicles.arrivals = self._vehicles.teleports = 0
-        self._vehicles.collided.clear()
+        self._vehicles.collided_vehicles.clear()
         self._log = self._make_log()
         self._log_moment()
 
@@ -306,7 +306,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
             "arrivals": vehicles.arrivals,
             "teleports": vehicles.teleports,
             "removed": self._waiting_removed_count,
-            "collisions": len(vehicles.collided),
+            "collisions": len(vehicles.collided_vehicles),
             "planned_duration": self.scenario.horizon * self.scenario.control_step,
             "lane_lines": network_geometry(self._network_file()).lane_lines if details else np.zeros((0, 2)),
         }
