@@ -162,7 +162,7 @@ class UserNetwork(Scenario):
             cav_types=self.cav_types,
             eligible_types=self.eligible_types(files),
             cav_seed=cav_seed,
-            cavs=self.cavs,
+            max_cav_count=self.cavs,
             roadside=self.roadside,
         )
 

@@ -74,7 +74,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
         return self._vehicles.removed_count
 
     def _may_add_cav(self) -> bool:
-        return self.road.cavs is None or self._selected_cav_count < self.road.cavs
+        return self.road.max_cav_count is None or self._selected_cav_count < self.road.max_cav_count
 
     def _is_cav(self, name: str) -> bool:
         self._vehicle_types[name] = self._simulation.type_of(name)
