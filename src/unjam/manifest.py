@@ -30,7 +30,7 @@ def manifest() -> dict[str, Any]:
     }
 
 
-def without_folders(command: list[str]) -> list[str]:
+def strip_folders(command: list[str]) -> list[str]:
     """Return a command for publication: paths of the machine become names of files."""
     return [Path(word).name if "/" in word else word for word in command]
 

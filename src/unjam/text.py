@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from unicodedata import category
 
-MAX_LISTED_NAMES = 20  # names that a message lists of a list from a file
+MAX_LISTED_NAMES = 20  # maximum number of names that a message lists
 INVISIBLE_LETTERS = {
     *"\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0",
     *map(chr, (*range(0x180B, 0x1810), *range(0xFE00, 0xFE10), *range(0xE0100, 0xE01F0))),
@@ -37,11 +37,12 @@ def format_duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
-def shorten_list(names: Iterable[str]) -> str:
-    """Return the names joined by commas, without those after the first `MAX_LISTED_NAMES`."""
-    known = list(names)
-    more = len(known) - MAX_LISTED_NAMES
-    return ", ".join(known[:MAX_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")
+def shorten_list(names: Iterable[str], max_names: int = MAX_LISTED_NAMES, max_letters: int | None = None) -> str:
+    """Return the first names joined by commas, each cut to `max_letters`, and the number of the remaining names."""
+    all_names = list(names)
+    more = len(all_names) - max_names
+    listed = ", ".join(name[:max_letters] for name in all_names[:max_names])
+    return listed + (f" and {more} more" if more > 0 else "")
 
 
 def split_label(label: str) -> list[str]:

@@ -83,10 +83,10 @@ def test_synonyms_of_an_option_are_treated_alike(options: dict[str, tuple[str, s
         ('<phemlight-path value="mine"/>', "phemlight-path: 'mine' is not allowed; allowed: ./PHEMlight/"),
         ('<laterl-resolution value="1"/>', "SUMO 1.28 has no such option; did you mean 'lateral-resolution'?"),
         ('<Begin value="1"/>', "Begin: SUMO 1.28 has no such option; did you mean 'begin'?"),
-        ('<begin value="1"/><b value="1"/>', "b: is set twice"),
-        ('<begin value="1" v="2"/>', "begin: is set twice"),
+        ('<begin value="1"/><b value="1"/>', "b: it is set twice"),
+        ('<begin value="1" v="2"/>', "begin: it is set twice"),
         ("<begin>1</begin>", "'1' is not allowed; allowed: <option value=\"...\"/>"),
-        ('<n value="other.net.xml"/>', "n: is set twice"),
+        ('<n value="other.net.xml"/>', "n: it is set twice"),
     ],
 )
 def test_unsupported_options_are_refused(inside: str, words: str, tmp_path: Path) -> None:

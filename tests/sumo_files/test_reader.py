@@ -101,12 +101,12 @@ INCLUDES = {
     "it is missing": ({"road.rou.xml": ["none.xml"]}, "none.xml': there is no such file"),
     "a name that no file has": ({"road.rou.xml": ["a" * 5000]}, "': there is no such file"),
     "a folder": ({"road.rou.xml": ["."]}, "': there is no such file"),
-    "itself": ({"road.rou.xml": ["road.rou.xml"]}, "road.rou.xml: includes itself"),
-    "each other": ({"road.rou.xml": ["b.xml"], "b.xml": ["./road.rou.xml"]}, "road.rou.xml: includes itself"),
+    "itself": ({"road.rou.xml": ["road.rou.xml"]}, "road.rou.xml: it includes itself"),
+    "each other": ({"road.rou.xml": ["b.xml"], "b.xml": ["./road.rou.xml"]}, "road.rou.xml: it includes itself"),
     "what is no XML": ({"road.rou.xml": ["b.xml"], "b.xml": None}, "b.xml: cannot be read: no element found"),
     "more and more": (
         {"road.rou.xml": ["1.xml"] * 9} | {f"{n}.xml": [f"{n + 1}.xml"] * 9 for n in range(1, 9)} | {"9.xml": []},
-        ".xml: includes more than 1000 files",
+        ".xml: it includes more than 1000 files",
     ),
 }
 
@@ -154,7 +154,7 @@ def test_a_file_that_is_none_of_sumo_is_refused_in_any_folder(is_included: bool,
     path = configuration(tmp_path / "mine", routes=ROUTES.replace("<routes>", f"<routes>{include}"))
     if not is_included:
         path.write_text(path.read_text().replace("road.rou.xml", "road.rou.xml,secret.xml"))
-    assert refusal_message(path).startswith("secret.xml: begins with <settings>; allowed: an element of SUMO")
+    assert refusal_message(path).startswith("secret.xml: it begins with <settings>; allowed: an element of SUMO")
 
 
 def test_copies_have_neither_elements_unknown_to_sumo_nor_text(tmp_path: Path) -> None:

@@ -180,9 +180,9 @@ def test_a_changed_file_is_read_again(tmp_path: Path) -> None:
 
 
 BROKEN = {
-    "no network": ("", ROUTES, "<configuration/>", "road.sumocfg: names no net-file"),
+    "no network": ("", ROUTES, "<configuration/>", "road.sumocfg: it names no net-file"),
     "no version": ("<net><edge/></net>", ROUTES, "", "road.net.xml: the network has no version"),
-    "another root": (ROUTES, ROUTES, "", "road.net.xml: is not a SUMO network: it begins with <routes>"),
+    "another root": (ROUTES, ROUTES, "", "road.net.xml: it is not a SUMO network: it begins with <routes>"),
     "empty network": ("", ROUTES, "", "road.net.xml: cannot be read"),
     "network that is no XML": ("plain words", ROUTES, "", "road.net.xml: cannot be read"),
     "routes that are no XML": (NETWORK, "<routes><vehicle", "", "road.rou.xml: cannot be read"),

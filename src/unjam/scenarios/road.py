@@ -247,7 +247,7 @@ class UserNetworkRoad(OpenRoad):
     """vehicle types to which the penetration rate applies"""
     cav_seed: int
     """seed of the choice of CAVs"""
-    cavs: int | None = None
+    max_cav_count: int | None = None
     """maximum number of CAVs: the first that enter"""
     drivers: tuple[IDMParameters, ...] = ()
     """calibrated human drivers, one for each car; empty: all drive as their types say"""

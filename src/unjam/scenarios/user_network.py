@@ -20,6 +20,7 @@ from unjam.scenarios.road import UserNetworkRoad
 from unjam.scenarios.scenario import CruiseControl, Scenario
 from unjam.sumo_files import SumoFiles, read_sumo_files
 from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
+from unjam.text import shorten_list
 
 DEFAULT_DURATION = 3600.0
 """duration of an episode if the configuration has no end [s]"""
@@ -45,8 +46,8 @@ DRIVERS_PER_EPISODE = 100
 """calibrated human drivers of an episode, drawn from the population"""
 ACC_SETTINGS: dict[str, Any] = {"actuation": "cruise", "safety.active": False}
 """CAVs have an ACC that follows and makes room for vehicles that change lanes; drivers only reduce its set speed"""
-MAX_LOGGED_NAMES, MAX_NOTED_NAMES = 8, 200
-"""largest number of options and elements that a line of the log names, and that a note names"""
+MAX_LOGGED_NAMES, MAX_NOTED_NAMES, MAX_NAME_LETTERS = 8, 200, 60
+"""largest number of options and elements that a line of the log names, and that a note names, and of letters of each"""
 DEVICE_SHARE = re.compile(r"(person-)?device\..*\.probability")
 DROPPED_DEVICE_SHARE = re.compile(rf"option {DEVICE_SHARE.pattern}")
 """options, and items left out, by which SUMO draws the vehicles that have a device, all from one random sequence"""
@@ -162,7 +163,7 @@ class UserNetwork(Scenario):
             cav_types=self.cav_types,
             eligible_types=self.eligible_types(files),
             cav_seed=cav_seed,
-            cavs=self.cavs,
+            max_cav_count=self.cavs,
             roadside=self.roadside,
         )
 
@@ -298,7 +299,8 @@ def _format_time(time: float) -> str:
 
 def notes_on_files(files: SumoFiles, max_names: int = MAX_NOTED_NAMES) -> list[str]:
     """Return the differences between an episode and what plain SUMO would make of the files, one line each."""
-    dropped, replaced = (_shorten_list(names, max_names) for names in (files.dropped_items, files.replaced_options))
+    lists = files.dropped_items, files.replaced_options
+    dropped, replaced = (shorten_list(names, max_names, MAX_NAME_LETTERS) for names in lists)
     notes = [f"{files.path.name}: left out because they only write or listen: {dropped}"] if dropped else []
     notes += [f"{files.path.name}: replaced by values of unjam: {replaced}"] if replaced else []
     shares = (DEVICE_SHARE, files.options), (DROPPED_DEVICE_SHARE, files.dropped_items)
@@ -310,11 +312,6 @@ def notes_on_files(files: SumoFiles, max_names: int = MAX_NOTED_NAMES) -> list[s
             "times of equal seeds differ by about 0.1 %"
         )
     return notes
-
-
-def _shorten_list(names: Sequence[str], max_names: int) -> str:
-    more = f" and {len(names) - max_names} more" if len(names) > max_names else ""
-    return ", ".join(name[:60] for name in names[:max_names]) + more
 
 
 @cache
@@ -345,4 +342,5 @@ def is_road_vehicle(files: SumoFiles, name: str) -> bool:
 
 
 def _format_types(files: SumoFiles, names: Collection[str]) -> str:
-    return _shorten_list([f"{name} ({vehicle_class(files, name)})" for name in sorted(names)], MAX_LOGGED_NAMES)
+    listed = (f"{name} ({vehicle_class(files, name)})" for name in sorted(names))
+    return shorten_list(listed, MAX_LOGGED_NAMES, MAX_NAME_LETTERS)

@@ -1,4 +1,4 @@
-"""Read users' SUMO files in a limited process before SUMO starts, which crashes on some, and could write or listen."""
+"""Read users' SUMO files in a resource-limited subprocess, as SUMO could crash on them, write files or listen."""
 
 import json
 import re
@@ -13,7 +13,7 @@ from unjam.sumo_files.reader import ALLOWED_VARIABLES, UNKNOWN_VARIABLE, FileSta
 from unjam.text import spelling_hint
 
 READER_PROGRAM = Path(__file__).with_name("reader_program.py")
-MAX_READER_MEMORY, MAX_READER_TIME = 4 * 2**30, 120  # maximum memory [bytes] and time [s] of the reader process
+MAX_READER_MEMORY, MAX_READER_TIME = 4 * 2**30, 120  # limits of the reader process: memory [bytes] and time [s]
 
 LaneShape = tuple[str, float, float, list[tuple[float, float]]]
 """id of the edge, length [m], speed limit [m/s], and points (x, y) of the center line [m]"""
@@ -42,28 +42,29 @@ configuration-file configuration c game game.mode breakpoints edgedata-files dat
 selection-file demo disable-textures window-size window-pos tracker-interval gui-testing gui-testing-debug
 suppress-warnings no-duration-log
 """
-PASSED_OPTIONS = set(_PASSED.split())  # options that only define how to simulate; they are passed to SUMO
-PASSED_OPTION_PREFIXES = tuple(_PASSED_PREFIXES.split())  # of further options that are passed
+PASSED_OPTIONS = set(_PASSED.split())  # options that unjam passes to SUMO: they only define how to simulate
+PASSED_OPTION_PREFIXES = tuple(_PASSED_PREFIXES.split())  # prefixes of further options that unjam passes to SUMO
 IGNORED_OPTIONS = {*_IGNORED.split(), *"vtgdHWXVQGSDTBmN?"}
-"""options that unjam sets itself, or that do not affect traffic; that they are left out is not reported"""
-REPLACED_OPTIONS = ("seed", "random", "max-depart-delay", "threads")  # they affect traffic, and unjam sets them
+"""options that unjam sets itself, or that do not affect traffic; unjam drops them without a report"""
+REPLACED_OPTIONS = ("seed", "random", "max-depart-delay", "threads")  # options that affect traffic; unjam sets them
 OUTPUT_OPTIONS = re.compile(
     r"output|^(write-|save-|netstate|ndump|dump-|summary$|tripinfo$|personinfo$|vehroutes|personroutes$)"
     r"|^(log|log-file|message-log|error-log|precision\.geo|person-fcd|remote-port|num-clients|l|C)$"
     r"|^(person-)?device\.(fcd|ssm|tripinfo|vehroute|btsender|btreceiver|example)\."
     r"|^device\.toc\.file$|^device\.fcd-replay\.(?!files)|^pedestrian\.jupedsim\.(wkt|py)"
 )
-"""names of options for output and connections of SUMO, which do not affect traffic"""
+"""pattern of options for SUMO's output and connections, which do not affect traffic"""
 REFUSED_OPTIONS = {
     "load-state": "no file, as episodes begin on an empty road; begin earlier, with --set warmup=600",
     **dict.fromkeys(
         ("astar.all-distances", "astar.landmark-distances", "device.fcd-replay.files"),
-        "no file, as unjam cannot check what is in it",
+        "no file, as unjam cannot check its content",
     ),
     "phemlight-path": "./PHEMlight/, SUMO's default",
 }
-"""options that affect traffic but cannot be passed to SUMO, with the allowed values"""
-HARMFUL_OPTION_PARTS = ("file", "output", "threads", ".wkt", ".py")  # among PASSED_OPTION_PREFIXES
+"""allowed values of options that affect traffic but cannot be passed to SUMO"""
+HARMFUL_OPTION_PARTS = ("file", "output", "threads", ".wkt", ".py")
+"""texts in the names of harmful options, although these begin with one of `PASSED_OPTION_PREFIXES`"""
 
 
 class SumoFiles(NamedTuple):
@@ -74,57 +75,57 @@ class SumoFiles(NamedTuple):
     additional_files: tuple[Path, ...]
     route_files: tuple[Path, ...]
     weight_files: tuple[Path, ...]  # files with travel times of edges, for vehicles that choose their route
-    sources: tuple[Path, ...]  # all files that were read, included ones too
-    begin: float  # of the simulation [s]
+    sources: tuple[Path, ...]  # all files that were read, with those that they include
+    begin: float  # begin of the simulation [s]
     end: float | None  # end of the simulation [s]; None: when the last vehicle has arrived
     first_departure: float | None  # earliest departure of a vehicle [s]; None: unknown
     calibrated_until: float  # latest time at which calibrators may add vehicles [s]; zero: there are none
-    step: float  # of the simulation [s]
-    options: dict[str, str]  # values of the options that are passed to SUMO, by name
-    dropped_items: tuple[str, ...]  # options and elements that only write files or open ports
-    replaced_options: tuple[str, ...]  # among `REPLACED_OPTIONS`
+    step: float  # time step of the simulation [s]
+    options: dict[str, str]  # values of the options that unjam passes to SUMO, by name
+    dropped_items: tuple[str, ...]  # dropped options and elements: they only write files or open ports
+    replaced_options: tuple[str, ...]  # options in the configuration that are `REPLACED_OPTIONS`
     copy_sources: dict[Path, tuple[Path, ...]]
-    """sources of the harmless copy of a file, by file; SUMO reads files without a copy directly"""
+    """sources of the harmless copy that SUMO reads instead of a file, by file; it reads other files directly"""
     types: dict[str, dict[str, str]]  # attributes of all vehicle types, by id
     type_parameters: dict[str, dict[str, str]]
-    """nested `<param>` elements of the types: values by key, by the type's id"""
-    used_types: frozenset[str]  # ids
-    removes_jammed_vehicles: bool  # instead of teleporting them
-    has_bicycle_lanes: bool  # for bicycles only
-    has_opposite_lanes: bool  # on which vehicles may overtake
-    has_spread_flows: bool  # with a number of vehicles, which SUMO spreads until the end of the simulation
+    """values of the `<param>` elements of each type, by key"""
+    used_types: frozenset[str]  # ids of the types that vehicles have
+    removes_jammed_vehicles: bool  # whether SUMO removes jammed vehicles instead of teleporting them
+    has_bicycle_lanes: bool  # whether lanes are for bicycles only
+    has_opposite_lanes: bool  # whether vehicles may overtake on lanes of the opposite direction
+    has_spread_flows: bool  # whether SUMO spreads the vehicles of a flow until the end of the simulation
 
 
 _read_files: dict[Path, tuple[dict[Path, FileStamp], SumoFiles]] = {}
-"""stamps of all files, and their content, by path of the configuration"""
-_answers: dict[str, dict[str, Any]] = {}  # of the reader process, by path of the configuration
+"""stamps and content of all files, by path of the configuration"""
+_answers: dict[str, dict[str, Any]] = {}  # answers of the reader process, by path of the configuration
 
 
 def read_sumo_files(path: Path) -> SumoFiles:
-    """Return the content of a .sumocfg file and of the files that it names; read again if one has changed.
+    """Return the content of a .sumocfg file and of the files that it names; changed files are read again.
 
     Raise `InputError` if a file is missing, broken or too large, the network has no version, or there are no vehicles.
     """
     if path in _read_files:
         stamps, files = _read_files[path]
-        if all(file.is_file() and file_stamp(file) == before for file, before in stamps.items()):
+        if all(file.is_file() and file_stamp(file) == stamp for file, stamp in stamps.items()):
             return files
-    return take_answer(str(path), _run_reader("configuration", path))
+    return store_answer(str(path), _run_reader("configuration", path))
 
 
-def answer_of(path: str) -> dict[str, Any] | None:
-    """Return the stored answer of the reader process for a configuration, or None; another process can take it."""
+def stored_answer(path: str) -> dict[str, Any] | None:
+    """Return the answer of the reader process for a configuration, to store in another process; None without one."""
     return _answers.get(path)
 
 
-def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
-    """Store and return the content of a .sumocfg file, from an answer of the reader process."""
+def store_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
+    """Store an answer of the reader process, and return the content of the .sumocfg file."""
     path, fields = Path(file), dict(answer)
     stamps = {Path(source): (time, size) for source, (time, size) in fields.pop("stamps").items()}
     fields |= {name: tuple(map(Path, fields[name])) for name in ("additional_files", "route_files", "weight_files")}
     fields["network"], fields["sources"] = Path(fields["network"]), tuple(stamps)
-    copies = fields["copy_sources"].items()
-    fields["copy_sources"] = {Path(copied): tuple(map(Path, sources)) for copied, sources in copies}
+    copy_sources = fields["copy_sources"].items()
+    fields["copy_sources"] = {Path(original): tuple(map(Path, sources)) for original, sources in copy_sources}
     fields["used_types"], options = frozenset(fields["used_types"]), fields["options"]
     kinds = {name: classify_option(path.name, name, value) for name, value in options.items()}
     fields["options"] = {name: value for name, value in options.items() if kinds[name] == "passed"}
@@ -140,7 +141,7 @@ def take_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
 
 
 def classify_option(file: str, name: str, value: str) -> Literal["passed", "ignored", "replaced", "dropped"]:
-    """Return how unjam treats an option; `InputError` if SUMO has none, or it affects traffic and cannot be passed."""
+    """Return how unjam treats an option; `InputError` if SUMO has no such option, or its value is not allowed."""
     if is_passed_option(name):
         return "passed"
     if name in IGNORED_OPTIONS:
@@ -159,14 +160,16 @@ def classify_option(file: str, name: str, value: str) -> Literal["passed", "igno
 
 def read_lanes(path: Path) -> list[LaneShape]:
     """Return all lanes of a network file; raise `InputError` if it is broken or too large."""
-    return [(edge, *numbers, [(x, y) for x, y in line]) for edge, *numbers, line in _run_reader("lanes", path)]
+    lanes = _run_reader("lanes", path)
+    return [(edge, length, limit, [(x, y) for x, y in line]) for edge, length, limit, line in lanes]
 
 
 def write_harmless_copy(path: Path, copy: Path, driver_count: int = 0, types: Path | None = None) -> None:
-    """Write a copy of a SUMO file without harmful elements, with new attributes of vehicle types from a JSON file.
+    """Write a copy of a SUMO file without harmful elements.
 
-    Lists of vehicle types also name those of CAVs, and of cars with one of `driver_count` calibrated drivers. Raise
-    `InputError` if the file is broken or too large, `DiskError` if the copy cannot be written.
+    Vehicle types get the attributes that the JSON file `types` has for their ids. Lists of vehicle types also name the
+    types of CAVs and of `driver_count` calibrated drivers. Raise `InputError` if the file is broken or too large,
+    `DiskError` if the copy cannot be written.
     """
     _run_reader("copy", path, copy, str(driver_count), *([str(types)] if types else []))
 
@@ -174,7 +177,7 @@ def write_harmless_copy(path: Path, copy: Path, driver_count: int = 0, types: Pa
 def _run_reader(
     command: Literal["configuration", "lanes", "copy"], path: Path, copy: Path | None = None, *options: str
 ) -> Any:
-    """Return the answer of the reader process; raise `InputError` if it reports an error, or is lost."""
+    """Return the answer of the reader process; raise `InputError` if the process reports an error or is lost."""
     limits = [str(MAX_READER_MEMORY), str(MAX_READER_TIME), str(copy.parent) if copy else ""]
     program = python_command("-I", "-S", sandbox.__file__, *limits, str(READER_PROGRAM), command)
     arguments = [*program, str(path), *([str(copy)] if copy else []), *options]
@@ -192,6 +195,6 @@ def _run_reader(
 
 
 def is_passed_option(name: str) -> bool:
-    """Return whether SUMO receives an option: it only defines how to simulate."""
-    is_harmful = any(word in name for word in HARMFUL_OPTION_PARTS)
+    """Return whether unjam passes an option to SUMO, as it only defines how to simulate."""
+    is_harmful = any(text in name for text in HARMFUL_OPTION_PARTS)
     return name in PASSED_OPTIONS or (name.startswith(PASSED_OPTION_PREFIXES) and not is_harmful)

@@ -1,4 +1,4 @@
-"""The program that reads users' SUMO files in a limited process: it prints one JSON document, and starts in 50 ms."""
+"""The program of the resource-limited subprocess that reads users' SUMO files; it prints one JSON document."""
 
 import json
 import os
@@ -13,21 +13,23 @@ from urllib.parse import unquote
 from xml.parsers import expat
 
 _PROGRAM_FOLDER = Path(__file__).parent
-if __name__ == "__main__":  # packages without their own code, which would import more than is needed
+if __name__ == "__main__":  # to start in 50 ms, do not run the code of these packages, which imports much more
     for name, folder in (("unjam", _PROGRAM_FOLDER.parent), ("unjam.sumo_files", _PROGRAM_FOLDER)):
         sys.modules[name] = ModuleType(name)
         sys.modules[name].__path__ = [str(folder)]
 
-from unjam.sumo_files import reader as xml  # noqa: E402
+from unjam.sumo_files import reader  # noqa: E402
 from unjam.sumo_files.reader import BrokenFileError, XmlAttributes, XmlReader  # noqa: E402
 
-DEFAULT_VEHICLE_TYPE = "DEFAULT_VEHTYPE"  # vehicle type that SUMO uses for vehicles without a type
-MODE_TYPES = {"car": DEFAULT_VEHICLE_TYPE, "bicycle": "DEFAULT_BIKETYPE"}  # of the trip of a person
+DEFAULT_VEHICLE_TYPE = "DEFAULT_VEHTYPE"  # type of vehicles for which the files define none
+MODE_TYPES = {"car": DEFAULT_VEHICLE_TYPE, "bicycle": "DEFAULT_BIKETYPE"}
+"""vehicle type of a person's trip, by mode"""
 OTHER_DEFAULT_TYPES = {"DEFAULT_BIKETYPE": "bicycle", "DEFAULT_TAXITYPE": "taxi", "DEFAULT_RAILTYPE": "rail"}
-"""vehicle classes of SUMO's other predefined types"""
-DEMAND_ELEMENTS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}  # create vehicles from then on
-TIME_UNITS = (1.0, 60.0, 3600.0, 86400.0)  # seconds, minutes, hours and days [s]: SUMO's times can be 1:30:00
-FILE_OPTIONS = ("net-file", "additional-files", "route-files", "weight-files")  # files that SUMO reads
+"""vehicle classes of SUMO's other predefined vehicle types"""
+DEMAND_ELEMENTS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}
+"""elements that create vehicles, with the attribute for the first departure"""
+TIME_UNITS = (1.0, 60.0, 3600.0, 86400.0)  # second, minute, hour and day [s], as SUMO's times can be 1:30:00
+FILE_OPTIONS = ("net-file", "additional-files", "route-files", "weight-files")  # options that name files
 SYNONYMS = {
     synonym: name
     for name, synonyms in {
@@ -41,44 +43,46 @@ SYNONYMS = {
     }.items()
     for synonym in synonyms.split()
 }
-"""name of an option by each of its synonyms in SUMO"""
+"""SUMO's main name of an option, by synonym"""
 _MODELS = """
 Krauss KraussOrig1 KraussPS KraussX IDM IDMM EIDM SmartSK Daniel1 PWagner2009 BKerner Wiedemann W99 ACC CACC CC Rail
 """
 READ_ELEMENTS = (
     *(*DEMAND_ELEMENTS, "lane", "neigh", "param", "person", "personFlow", "personTrip", "calibrator"),
     *("vType", "/vType", "vTypeDistribution", "/vTypeDistribution"),
-    *(f"{xml.FOLLOWING_MODEL_PREFIX}{name}" for name in _MODELS.split()),  # nested in types of older files
+    *(f"{reader.FOLLOWING_MODEL_PREFIX}{name}" for name in _MODELS.split()),  # within types, in older files
 )
-"""elements with content that `_Demand` needs, and the ends of some"""
-MAX_VEHICLE_TYPES = 100_000  # of which unjam makes others for CAVs
-TRUE_VALUES = ("true", "t", "yes", "on", "1", "x")  # texts that SUMO accepts as true
+"""elements that `_Demand` reads; `/` marks the end of an element"""
+MAX_VEHICLE_TYPES = 100_000  # maximum number, as unjam derives types of CAVs from them
+TRUE_VALUES = ("true", "t", "yes", "on", "1", "x")  # texts that SUMO reads as true
 
 
 def _read_configuration(path: Path) -> dict[str, Any]:
-    """Return the content of a .sumocfg file and of the files that it names as JSON, the fields of `SumoFiles`."""
-    xml.check_file_exists(path)
-    stamps = {path: xml.file_stamp(path)}
+    """Return the fields of `SumoFiles` for a .sumocfg file and the files that it names, as JSON values."""
+    reader.check_file_exists(path)
+    stamps = {path: reader.file_stamp(path)}
     options = _read_options(path)
     if options.get("mesosim", "").lower() in TRUE_VALUES:
-        raise BrokenFileError(f"{path.name}: mesosim: true is not allowed; allowed: false, as it obeys no commands")
+        raise BrokenFileError(
+            f"{path.name}: mesosim: true is not allowed; allowed: false, as its vehicles obey no commands"
+        )
     networks, additional, routes, weights = (
-        [_named_file(path, option, name.strip()) for name in options.pop(option, "").split(",") if name.strip()]
+        [_resolve_file_name(path, option, name.strip()) for name in options.pop(option, "").split(",") if name.strip()]
         for option in FILE_OPTIONS
     )
     if len(networks) != 1:
-        raise BrokenFileError(f"{path.name}: names {'more than one' if networks else 'no'} net-file")
+        raise BrokenFileError(f"{path.name}: it names {'more than one' if networks else 'no'} net-file")
     (network,), demand = networks, _Demand()
     files = [network, *additional, *routes, *weights]
     for file in files:
-        xml.check_file_exists(file)
+        reader.check_file_exists(file)
     readers = {file: XmlReader(demand.handlers()) for file in files}
-    for file, reader in readers.items():
-        reader.read(file)
-        stamps = {**reader.sources, **stamps}
-    if (root := readers[network].root) != xml.NETWORK_ELEMENT:
-        raise BrokenFileError(f"{network.name}: is not a SUMO network: it begins with <{root}>")
-    if not readers[network].version:  # without it SUMO would crash
+    for file, xml_reader in readers.items():
+        xml_reader.read(file)
+        stamps = {**xml_reader.sources, **stamps}
+    if (root := readers[network].root) != reader.NETWORK_ELEMENT:
+        raise BrokenFileError(f"{network.name}: it is not a SUMO network: it begins with <{root}>")
+    if not readers[network].version:  # SUMO would crash
         convert = f"convert it: netconvert -s {network.name} -o"
         raise BrokenFileError(f"{network.name}: the network has no version; {convert}")
     if not demand.used_names:
@@ -94,12 +98,16 @@ def _read_configuration(path: Path) -> dict[str, Any]:
         "route_files": list(map(str, routes)),
         "weight_files": list(map(str, weights)),
         "options": options,
-        "dropped_items": sorted({name for reader in readers.values() for name in reader.dropped_items}),
-        "copy_sources": {str(file): list(map(str, one.sources)) for file, one in readers.items() if one.needs_copy},
+        "dropped_items": sorted({item for xml_reader in readers.values() for item in xml_reader.dropped_items}),
+        "copy_sources": {
+            str(file): list(map(str, xml_reader.sources))
+            for file, xml_reader in readers.items()
+            if xml_reader.needs_copy
+        },
         "begin": begin,
         "end": end,
         "first_departure": demand.first_departure,
-        "calibrated_until": demand.last_end if demand.calibrates else 0.0,
+        "calibrated_until": demand.last_end if demand.has_calibrators else 0.0,
         "step": _read_seconds(path, options, "step-length", 1.0) or 1.0,
         "used_types": sorted(demand.used_types()),
         "removes_jammed_vehicles": options.get("time-to-teleport.remove", "").lower() in TRUE_VALUES,
@@ -113,14 +121,14 @@ def _read_configuration(path: Path) -> dict[str, Any]:
 
 
 def _read_options(path: Path) -> dict[str, str]:
-    """Return the options of a configuration that have a value, by SUMO's main names."""
+    """Return the options in a configuration that have a value, by SUMO's main names of the options."""
     options: dict[str, str] = {}
 
     def add_option(tag: str, attributes: XmlAttributes) -> None:
         for value in filter(None, map(attributes.get, ("value", "v"))):
             name = canonical_option(tag)
             if name in options:
-                raise BrokenFileError(f"{path.name}: {tag}: is set twice")
+                raise BrokenFileError(f"{path.name}: {tag}: it is set twice")
             options[name] = _substitute_variables(value)
 
     def refuse_text(text: str) -> None:
@@ -130,32 +138,35 @@ def _read_options(path: Path) -> dict[str, str]:
     parser = expat.ParserCreate()
     parser.buffer_text = True
     parser.StartElementHandler, parser.CharacterDataHandler = add_option, refuse_text
-    xml.parse_xml(path, parser, [path.read_bytes()])
+    reader.parse_xml(path, parser, [path.read_bytes()])
     return options
 
 
 def canonical_option(name: str) -> str:
-    """Return SUMO's main name of an option that has several."""
+    """Return SUMO's main name of an option, which may have synonyms."""
     for old, new in (("device.routing.", "device.rerouting."), (".knownveh", ".explicit")):
         name = name.replace(old, new)
     return SYNONYMS.get(name, name)
 
 
-def _named_file(path: Path, option: str, name: str) -> Path:
-    """Return a file that an option names; only names of existing files have all variables: no message shows these."""
-    file = path.parent / unquote(xml.UNKNOWN_VARIABLE.sub(lambda match: os.environ.get(match[0][2:-1], ""), name))
-    if (variable := xml.UNKNOWN_VARIABLE.search(name)) and not os.path.isfile(file):
-        allowed = f"{xml.ALLOWED_VARIABLES}, and others in names of existing files"
+def _resolve_file_name(path: Path, option: str, name: str) -> Path:
+    """Return the path of a file that an option names, with all variables replaced.
+
+    Only names of existing files may contain unknown variables: messages must not show the values.
+    """
+    file = path.parent / unquote(reader.UNKNOWN_VARIABLE.sub(lambda match: os.environ.get(match[0][2:-1], ""), name))
+    if (variable := reader.UNKNOWN_VARIABLE.search(name)) and not os.path.isfile(file):
+        allowed = f"{reader.ALLOWED_VARIABLES}, and others in names of existing files"
         raise BrokenFileError(f"{path.name}: {option}: {variable[0]!r} is not allowed; allowed: {allowed}")
     return file
 
 
 def _substitute_variables(text: str) -> str:
-    """Replace `~` and some variables as SUMO does; not all, as configurations of others could ask for secrets."""
-    home = re.sub("(^|,)~", r"\1${HOME}", text)
-    for name in xml.SUBSTITUTED_VARIABLES:
-        home = home.replace(f"${{{name}}}", os.environ.get(name, ""))
-    return home
+    """Replace `~` and the allowed variables as SUMO does; others may have secrets that a strange file asks for."""
+    text = re.sub("(^|,)~", r"\1${HOME}", text)
+    for name in reader.SUBSTITUTED_VARIABLES:
+        text = text.replace(f"${{{name}}}", os.environ.get(name, ""))
+    return text
 
 
 def _read_lanes(path: Path) -> list[tuple[str, float, float, list[tuple[float, float]]]]:
@@ -163,28 +174,28 @@ def _read_lanes(path: Path) -> list[tuple[str, float, float, list[tuple[float, f
     lanes: list[tuple[str, float, float, list[tuple[float, float]]]] = []
 
     def add_lane(attributes: XmlAttributes) -> None:
-        edge, length, speed, shape = (attributes.get(name, "") for name in ("id", "length", "speed", "shape"))
+        lane_id, length, limit, shape = (attributes.get(name, "") for name in ("id", "length", "speed", "shape"))
         line = [tuple(map(float, point.split(",")[:2])) for point in shape.split()]
-        lanes.append((edge.rpartition("_")[0], float(length), float(speed), [(x, y) for x, y in line]))
+        lanes.append((lane_id.rpartition("_")[0], float(length), float(limit), [(x, y) for x, y in line]))
 
     XmlReader({"lane": add_lane}).read(path)
     return lanes
 
 
 def _read_seconds(path: Path, options: dict[str, str], name: str, default: float | None) -> float | None:
-    """Return a time option [s]; SUMO writes -1 for no end."""
+    """Return the value of a time option [s], or a default; SUMO writes -1 for an absent end."""
     text = options.get(name)
     if text is None or (name == "end" and text.strip() in ("-1", "-1.00")):
         return default
-    value, positive = _parse_time(text), name == "step-length"
-    if value < 0 or not isfinite(value) or (positive and not value):
-        allowed = "seconds > 0" if positive else "seconds, hours:minutes:seconds"
+    value, must_be_positive = _parse_time(text), name == "step-length"
+    if value < 0 or not isfinite(value) or (must_be_positive and not value):
+        allowed = "seconds > 0" if must_be_positive else "seconds, hours:minutes:seconds"
         raise BrokenFileError(f"{path.name}: {name}: {text!r} is not allowed; allowed: {allowed}")
     return value
 
 
 def _parse_time(text: str) -> float:
-    """Return a time [s] from 90, 1:30:00 or 1:00:00:00; NaN: not a time."""
+    """Return a time [s] from a text such as 90, 1:30:00 or 1:00:00:00; NaN if the text is not a time."""
     parts = text.split(":")
     try:
         value = sum(float(part) * unit for part, unit in zip(reversed(parts), TIME_UNITS, strict=False))
@@ -194,23 +205,23 @@ def _parse_time(text: str) -> float:
 
 
 class _Demand:
-    """The vehicle types that files define, the vehicles that they create, and whether there are bicycle lanes."""
+    """Collector of the vehicle types, vehicles and special lanes in the files of a configuration."""
 
     def __init__(self) -> None:
         self.types: dict[str, XmlAttributes] = {}
         self.type_parameters: dict[str, XmlAttributes] = {}  # values of the parameters of each type, by key
-        self.used_names: set[str] = set()  # types and distributions that vehicles have
-        self.first_departure: float | None = inf  # departure of the first vehicle [s]; None: unknown
+        self.used_names: set[str] = set()  # ids of types and distributions that vehicles have
+        self.first_departure: float | None = inf  # earliest departure of a vehicle [s]; None: unknown
         self.has_bicycle_lanes = self.has_opposite_lanes = False
-        self.calibrates = False  # SUMO's number of expected vehicles excludes those that calibrators will add
-        self.last_end = 0.0  # latest end that a flow names, in calibrators and elsewhere [s]
-        self.has_spread_flows = False  # with a number of vehicles, which SUMO spreads until its end
-        self._distributions: dict[str, set[str]] = {}  # types of each; other files than the defining one can use it
-        self._current_type = ""  # the type that is being read; empty: none
+        self.has_calibrators = False  # calibrators may add vehicles that SUMO does not yet expect
+        self.last_end = 0.0  # latest end of a flow, within calibrators and elsewhere [s]
+        self.has_spread_flows = False  # whether SUMO spreads the vehicles of a flow until the end of the simulation
+        self._distributions: dict[str, set[str]] = {}  # types of each distribution, for all files
+        self._current_type = ""  # id of the type that is being read; empty: none
         self._current_distribution: set[str] = set()  # types of the distribution that is being read
 
-    def handlers(self) -> xml.XmlHandlers:
-        """Return the functions to call with the attributes of an element, by its name."""
+    def handlers(self) -> reader.XmlHandlers:
+        """Return the functions that receive the attributes of elements, by name of the element."""
         return {tag: partial(self._on_element, tag) for tag in READ_ELEMENTS}
 
     def _on_element(self, tag: str, attributes: XmlAttributes) -> None:
@@ -225,18 +236,18 @@ class _Demand:
                 if self._current_type:
                     self.type_parameters[self._current_type][attributes.get("key", "")] = attributes.get("value", "")
             case "person" | "personFlow":
-                self.first_departure = None  # persons may use their own car
+                self.first_departure = None  # unknown, as persons may drive their own car
                 self.has_spread_flows |= tag == "personFlow" and _is_spread(attributes)
             case "personTrip":
                 modes = attributes.get("modes", "").replace(",", " ").split()
                 default_types = {MODE_TYPES[mode] for mode in modes if mode in MODE_TYPES}
                 self.used_names |= set(attributes.get("vTypes", "").split()) or default_types
             case "calibrator":
-                self.calibrates = True
+                self.has_calibrators = True
             case "vType":
                 name = attributes.get("refId") or attributes.get("id", "")
                 self._current_distribution.add(name)
-                if not name:  # SUMO would read millions of them and report each
+                if not name:  # SUMO would report each of millions of such elements
                     raise BrokenFileError("vType: an element without id is not allowed; allowed: an id for each type")
                 if "refId" not in attributes:
                     if len(self.types) == MAX_VEHICLE_TYPES:
@@ -250,13 +261,13 @@ class _Demand:
                 self._distributions[attributes.get("id", "")] = self._current_distribution
             case "/vTypeDistribution":
                 self._current_distribution = set()
-            case _:  # an older file, with the car-following attributes of a type in an element of their own
+            case _:  # in older files, the car-following attributes of a type are in a separate element
                 if self._current_type:
                     self.types[self._current_type] |= attributes
 
     def _add_vehicles(self, attributes: XmlAttributes, depart_attribute: str) -> None:
         if "speed" in attributes and "vehsPerHour" not in attributes:
-            return  # a calibrator that only changes speeds
+            return  # the flow of a calibrator that changes only speeds
         self.used_names.add(attributes.get("type", DEFAULT_VEHICLE_TYPE))
         self.has_spread_flows |= depart_attribute == "begin" and _is_spread(attributes)
         if (end := attributes.get("end")) and isfinite(last := _parse_time(end)):
@@ -266,7 +277,7 @@ class _Demand:
             self.first_departure = min(self.first_departure, time) if isfinite(time) else None
 
     def used_types(self) -> set[str]:
-        """Return the types that vehicles have, and define SUMO's predefined types among them."""
+        """Return the types that vehicles have, and add SUMO's predefined types among them to `types`."""
         used, remaining = set[str](), set(self.used_names)
         while remaining:
             name = remaining.pop()
@@ -280,6 +291,7 @@ class _Demand:
 
 
 def _is_spread(flow: XmlAttributes) -> bool:
+    """Return whether a flow has a number of vehicles that SUMO spreads until the end of the simulation."""
     return "number" in flow and not flow.keys() & {"end", "period", "probability", "vehsPerHour", "perHour"}
 
 
@@ -295,7 +307,7 @@ def _main(command: str, path: str, *arguments: str) -> None:
         answer = {"result": commands[command](Path(path), *arguments)}
     except BrokenFileError as error:
         answer = {"error": str(error)}
-    except OSError as error:  # of the copy: errors of the files that are read have other classes here
+    except OSError as error:  # the copy cannot be written; errors of the files that are read have other classes
         answer = {"disk_error": [error.errno, error.strerror]}
     except (MemoryError, RecursionError):
         answer = {"error": f"{Path(path).name}: its files are too large to be read"}

@@ -11,7 +11,7 @@ from typing import IO, Any
 from unjam.drivers.registry import driver_from_recipe
 from unjam.errors import as_unjam_error
 from unjam.scenarios import scenario_from_recipe
-from unjam.sumo_files import take_answer
+from unjam.sumo_files import store_answer
 from unjam.tree import Arrays, pack
 from unjam.trust import expect_code
 from unjam.worlds.backend import Backend, open_backend
@@ -40,7 +40,7 @@ def _answer(open_once: Callable[[str], Backend], output: IO[bytes], request: dic
 
     try:
         if "files" in request:  # what the parent has read of the files; changed files are read again
-            take_answer(request["scenario"]["file"], request["files"])
+            store_answer(request["scenario"]["file"], request["files"])
         expect_code(request["code"])
         with seeded_generators(request["seed"]):  # a user's file or class may draw from them, too
             scenario = scenario_from_recipe(request["scenario"])

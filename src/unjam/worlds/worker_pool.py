@@ -21,7 +21,7 @@ from unjam.parameters import split_parameters
 from unjam.processes import PrivateFolder, check_owner, remove_stale_private_folders
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.sumo_files import MAX_READER_TIME, answer_of
+from unjam.sumo_files import MAX_READER_TIME, stored_answer
 from unjam.tree import Arrays, unpack
 from unjam.worlds.backend import BackendLike
 from unjam.worlds.messages import read_message, start_child, write_message
@@ -224,7 +224,7 @@ class _Worker:
         """Send a task, with the content of the user's files the first time that the process needs it."""
         assert process.stdin is not None
         file = content["scenario"].get("file")
-        if file and file not in self._sent_files and (answer := answer_of(file)):
+        if file and file not in self._sent_files and (answer := stored_answer(file)):
             self._sent_files.add(file)
             content = {**content, "files": answer}
         timer = threading.Timer(self._timeout, process.kill)  # a full pipe without a reader blocks forever

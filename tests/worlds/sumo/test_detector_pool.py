@@ -69,7 +69,7 @@ def test_a_lane_change_on_a_loop_has_no_speed_as_with_sumos_own_detectors(tmp_pa
 def test_a_lost_simulation_is_repeated_and_repeated_losses_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, left = DetectorPool._run_one, [0]
+    run, left = DetectorPool._run_seed, [0]
 
     def lost(self: DetectorPool, *arguments: Any) -> list[DetectorPassage]:
         if left[0] > 0:
@@ -77,7 +77,7 @@ def test_a_lost_simulation_is_repeated_and_repeated_losses_are_reported(
             raise LostWorkerError("SUMO was lost: its process ended with code -9")
         return run(self, *arguments)
 
-    monkeypatch.setattr(DetectorPool, "_run_one", lost)
+    monkeypatch.setattr(DetectorPool, "_run_seed", lost)
     with DetectorPool(1) as counting:
         left[0] = MAX_DETECTOR_ATTEMPTS - 1
         assert len(counting.run(road(tmp_path), [(1,)], [InductionLoop("road_0", 105.0)])[0]) == 9

@@ -66,7 +66,7 @@ class Commands:
             edges = {name: libsumo.vehicle.getRoadID(name) for name in ids}
             speeds = {name: libsumo.vehicle.getSpeed(name) for name in ids}
             streams = traffic._streams
-            places = dict(zip(streams.names, streams.positions, strict=True))
+            places = dict(zip(streams.vehicle_ids, streams.positions, strict=True))
             traffic._simulate({})
             after = {name: libsumo.vehicle.getSpeed(name) for name in libsumo.vehicle.getIDList()}
             assert asked.keys() == set(ids)

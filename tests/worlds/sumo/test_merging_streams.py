@@ -58,15 +58,15 @@ def drive(vehicles: list[Vehicle], wanted: list[float], step: float) -> None:
 
 def same(streams: MergingStreams, vehicles: list[Vehicle]) -> None:
     by_name = {vehicle.name: vehicle for vehicle in vehicles}
-    assert sorted(streams.names) == sorted(by_name)
+    assert sorted(streams.vehicle_ids) == sorted(by_name)
     leaders, states, on_junction = streams.leaders(), streams.states(), streams.is_on_junction(WAYS)
     gaps = streams.gaps(leaders)
-    for row, name in enumerate(streams.names):
+    for row, name in enumerate(streams.vehicle_ids):
         own = by_name[name]
         assert streams.positions[row] == pytest.approx(own.position, abs=1e-9)
         assert streams.speeds[row] == own.speed
         leader, follower = leader_of(own, vehicles), follower_of(own, vehicles)
-        assert (streams.names[leaders[row]] if leaders[row] >= 0 else None) == (leader and leader.name)
+        assert (streams.vehicle_ids[leaders[row]] if leaders[row] >= 0 else None) == (leader and leader.name)
         gap = ABSENT_LEADER_GAP if leader is None else leader.position - own.position - 5.0
         assert gaps[row] == pytest.approx(gap, abs=1e-9)
         near = leader is not None and gap < 100.0
@@ -91,7 +91,7 @@ def test_order_and_neighbors_agree_with_a_plain_search(data: st.DataObject) -> N
         streams.leave([each.name for each in left])
         drive(vehicles, [data.draw(speeds) for _ in vehicles], step)
         now = {each.name: each.speed for each in vehicles}
-        streams.move([now[name] for name in streams.names], step)
+        streams.move([now[name] for name in streams.vehicle_ids], step)
         for branch in data.draw(st.sets(st.integers(0, 1)), "entering"):
             last = min((each.position for each in vehicles if each.branch == branch), default=0.0)
             place = min(-60.0, last) - data.draw(st.sampled_from([0.5, 8.0, 40.0]), "place")
@@ -112,13 +112,13 @@ def standing(*positions: tuple[int, float]) -> MergingStreams:
 def test_of_two_vehicles_that_merge_in_one_step_the_one_further_ahead_leads() -> None:
     streams = standing((0, -6.0), (1, -0.5))
     streams.move([30.5, 32.0], 0.2)  # to 0.1 and 5.9
-    assert streams.names == ["b", "a"]
+    assert streams.vehicle_ids == ["b", "a"]
     assert streams.gaps(streams.leaders()).tolist() == pytest.approx([ABSENT_LEADER_GAP, 0.8])
 
 
 def test_the_first_vehicles_of_both_branches_follow_the_last_one_past_the_merge_point() -> None:
     streams = standing((0, 40.0), (0, 5.0), (0, -10.0), (0, -30.0), (1, -20.0))
-    assert streams.names == list("abcde")
+    assert streams.vehicle_ids == list("abcde")
     assert streams.leaders().tolist() == [-1, 0, 1, 2, 1]
     states = streams.states()
     np.testing.assert_allclose(states.leader_gap, [100.0, 30.0, 10.0, 15.0, 20.0])
@@ -129,7 +129,7 @@ def test_the_first_vehicles_of_both_branches_follow_the_last_one_past_the_merge_
 def test_a_vehicle_may_enter_past_the_merge_point() -> None:
     streams = standing((0, -10.0), (1, -10.0))
     streams.enter("x", Origin(0, 50.0), 3.0)
-    assert streams.names == ["x", "a", "b"]
+    assert streams.vehicle_ids == ["x", "a", "b"]
     assert streams.leaders().tolist() == [-1, 0, 0]
 
 
@@ -143,7 +143,7 @@ def test_an_empty_road_has_no_vehicles() -> None:
 def test_leaving_from_behind_another_vehicle_is_an_error() -> None:
     streams = standing((0, 90.0), (0, 50.0), (0, 10.0))
     streams.leave(["b", "a"])
-    assert streams.names == ["c"]
+    assert streams.vehicle_ids == ["c"]
     with pytest.raises(EpisodeError, match="b left the road from behind another vehicle"):
         standing((0, 90.0), (0, 50.0)).leave(["b"])
 
@@ -159,8 +159,8 @@ def test_positions_are_those_of_sumo(simulation: Simulation) -> None:
     for _ in range(60):
         traffic.advance(Command(np.zeros(len(traffic.cav_ids))))
         streams = traffic._streams
-        assert sorted(streams.names) == sorted(libsumo.vehicle.getIDList())
-        for name, position in zip(streams.names, streams.positions, strict=True):
+        assert sorted(streams.vehicle_ids) == sorted(libsumo.vehicle.getIDList())
+        for name, position in zip(streams.vehicle_ids, streams.positions, strict=True):
             edge = libsumo.vehicle.getRoadID(name)
             if edge in PLACES:
                 along = PLACES[edge] + libsumo.vehicle.getLanePosition(name)
@@ -182,11 +182,11 @@ def test_leaders_on_the_same_lane_are_those_of_sumo(simulation: Simulation) -> N
         streams = traffic._streams
         leaders = streams.leaders()
         gaps = streams.gaps(leaders)
-        for row, name in enumerate(streams.names):
+        for row, name in enumerate(streams.vehicle_ids):
             found = libsumo.vehicle.getLeader(name, 200.0)
             if not found or libsumo.vehicle.getLaneID(found[0]) != libsumo.vehicle.getLaneID(name):
                 continue
-            assert streams.names[leaders[row]] == found[0]
+            assert streams.vehicle_ids[leaders[row]] == found[0]
             kept = MIN_CAV_GAP if name in traffic.cav_ids else 2.5
             assert gaps[row] == pytest.approx(found[1] + kept, abs=1e-6)
             compared += 1

@@ -393,7 +393,7 @@ def test_a_collision_among_human_drivers_is_counted_and_ends_nothing(
     monkeypatch.setattr(simulation, "colliding_vehicles", lambda: humans)
     traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
     assert not traffic.has_crashed
-    assert len(traffic._vehicles.collided) == 2
+    assert len(traffic._vehicles.collided_vehicles) == 2
     monkeypatch.setattr(simulation, "colliding_vehicles", lambda: [humans[0], traffic.cav_ids[0]])
     traffic.advance(Command(np.full(traffic.cav_count, 100.0)))
     assert traffic.has_crashed

@@ -176,7 +176,7 @@ def test_a_road_that_cannot_be_made_leaves_nothing_behind(cache: Path) -> None:
 
 @pytest.mark.usefixtures("no_sumo")
 def test_a_missing_netconvert_is_named_with_the_way_to_get_it(cache: Path) -> None:
-    with pytest.raises(MissingPartError, match="netconvert is not there; install it: pip install eclipse-sumo"):
+    with pytest.raises(MissingPartError, match="netconvert is not installed; install it: pip install eclipse-sumo"):
         network_file(road_of(230))
     assert files_in(cache) <= {cache / "networks"}
 

@@ -52,7 +52,7 @@ def test_an_episode_is_the_same_wherever_sumo_runs(road: Scenario, sumo: SumoBac
 
 def test_a_sandboxed_simulation_returns_the_same_results(road: Scenario, simulation: Simulation) -> None:
     methods = [name for name, of in vars(Simulation).items() if not name.startswith("_") and callable(of)]
-    methods += ["speeds", "lane_offsets", "distances", "fuel", "now"]
+    methods += ["speeds", "lane_offsets", "distances", "fuel", "time"]
     others = {"load", "step", "close", "command_speeds", "replace_speeds", "command_humans", "limit_braking"}
     others |= {"take_control", "change_type", "end_with_trips", "is_in_contact", "teleport_count", "finish", "passages"}
     others |= {"stop_at", "end_stop", "replay"}  # of built-in roads
@@ -62,7 +62,7 @@ def test_a_sandboxed_simulation_returns_the_same_results(road: Scenario, simulat
             make_traffic(road, (0,), each).start(is_controlled=False)  # pyright: ignore[reportArgumentType]
             names = ["0", "1"]
             arguments = dict[str, tuple[object, ...]]({"neighbors": ("1", 100.0), "left": (), "expects_vehicles": ()})
-            arguments |= dict.fromkeys(("lanes", "now", "has_refused", "jam_teleport_count"), ())
+            arguments |= dict.fromkeys(("lanes", "time", "has_refused", "jam_teleport_count"), ())
             arguments |= dict.fromkeys(("type_of", "route_of"), ("1",)) | {"type_limits": ("DEFAULT_VEHTYPE",)}
             answers.append(
                 {name: getattr(each, name)(*arguments.get(name, (names,))) for name in methods if name not in others}

@@ -97,10 +97,10 @@ def test_only_an_error_of_the_first_task_ends_a_run(tmp_path: Path) -> None:
 def test_workers_get_the_content_of_the_files(tmp_path: Path) -> None:
     file = straight(tmp_path, '<flow id="f" type="car" route="along" begin="0" end="50" period="9"/>')
     task = EpisodeTask(make_scenario(str(file), {"penetration_rate": 0.5}), Human(), (0,))
-    answer = json.loads(json.dumps(sumo_files.answer_of(str(file))))
-    assert sumo_files.take_answer(str(file), answer) == read_sumo_files(file)
+    answer = json.loads(json.dumps(sumo_files.stored_answer(str(file))))
+    assert sumo_files.store_answer(str(file), answer) == read_sumo_files(file)
     answer["end"] = 30.0  # what no file says shows that the worker has not read them
-    sumo_files.take_answer(str(file), answer)
+    sumo_files.store_answer(str(file), answer)
     with WorkerPool(1) as workers:
         first, second = workers.run([task, task])
     assert first.status == second.status == "completed"

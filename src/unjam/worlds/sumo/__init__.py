@@ -1,1 +1,1 @@
-"""The environment in SUMO. Only this package knows SUMO's files and speed modes."""
+"""The worlds of all roads in SUMO. Only this package uses SUMO's input files and speed modes."""

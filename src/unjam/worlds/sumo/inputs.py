@@ -1,4 +1,4 @@
-"""The files and options that SUMO reads for an episode: network, vehicle types, vehicles."""
+"""SUMO's inputs for an episode: network, vehicle types, vehicles and options."""
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -15,33 +15,33 @@ from unjam.worlds.sumo.networks import XMLAttributes, network_file, xml_element
 
 SUMO_CAV_COLOR = "215,38,61"
 W99_ACCELERATION = 2.0
-"""SUMO's default of `cc8`, the acceleration from a standstill of its model W99 [m/s2]"""
+"""SUMO's default of `cc8`, the acceleration of its model W99 from a standstill [m/s2]"""
 CAR_FOLLOWING_ATTRIBUTES = {"carFollowModel", "tau", "minGap", "sigma", "delta", "stepping"}
-"""attributes of a vehicle type that belong to its car-following model: a CAV keeps all others"""
+"""attributes of the car-following model of a vehicle type; a CAV keeps all other attributes"""
 COLLISION_OPTIONS = ("--collision.mingap-factor", "0", "--collision.check-junctions", "true")
-"""options of built-in roads, where a collision is physical contact and each is reported; users' networks have their own
-settings"""
+"""options of built-in roads, which define a collision as physical contact; users' networks have their own settings"""
 
 
 class SumoInputs(NamedTuple):
-    """What SUMO reads for an episode."""
+    """The inputs of SUMO for an episode."""
 
     options: tuple[str, ...]
     existing_files: dict[str, tuple[Path, ...]]
-    """the network and other existing files, by the option that names them"""
+    """paths of the network and other existing files, by SUMO's option"""
     traffic_xml: str
-    """XML of vehicle types, and of routes and vehicles unless they are the user's"""
+    """XML of vehicle types and, on built-in roads, of routes and vehicles"""
     traffic_option: str
+    """SUMO's option for the file with `traffic_xml`"""
     copied_files: Mapping[Path, tuple[Path, ...]] = MappingProxyType({})
-    """files that SUMO must only read as a harmless copy, and the files from which the copy is made"""
+    """sources of the harmless copy that SUMO reads instead of a file, by file"""
     driver_count: int = 0
-    """number of calibrated drivers: lists of vehicle types also name their types"""
+    """number of calibrated drivers; copies of lists of vehicle types include the types with these drivers"""
     records_trips: bool = False
-    """whether SUMO records all trips: see `Simulation.end_with_trips`"""
+    """whether SUMO records all trips, for `Simulation.end_with_trips`"""
 
 
 def single_lane_inputs(scenario: Scenario, road: BuiltRoad) -> SumoInputs:
-    """Return SUMO's inputs for a road with one lane that is built for the episode."""
+    """Return SUMO's inputs for a built-in road with one lane."""
     humans = {"human": scenario.humans}
     if scenario.human_control == "native":
         humans |= {f"of_{name}": idm for name, idm in road.human_parameters.items()}
@@ -51,25 +51,25 @@ def single_lane_inputs(scenario: Scenario, road: BuiltRoad) -> SumoInputs:
 
 
 def motorway_inputs(scenario: Scenario, road: MotorwayRoad) -> SumoInputs:
-    """Return SUMO's inputs for a motorway; each vehicle type has one of the CAV that may replace it."""
-    lines = []
-    for name, kind in road.vehicle_types.items():
-        common = {"length": kind.length, "emissionClass": kind.emission_class or scenario.emission_class}
-        common |= {"speedFactor": kind.speed_factor, "speedDev": 0.0, "emergencyDecel": 9.0}
-        common |= {"maxSpeed": kind.max_speed, "vClass": kind.vehicle_class, **dict(kind.parameters)}
-        model = {"carFollowModel": kind.model, "tau": kind.time_headway, "minGap": kind.minimum_gap}
-        model |= {"accel": kind.acceleration, "decel": kind.deceleration}
-        lines.append(xml_element("vType", id=name, **common, **model))
+    """Return SUMO's inputs for a motorway, with a type of CAVs for each vehicle type."""
+    types = []
+    for name, vehicle in road.vehicle_types.items():
+        common = {"length": vehicle.length, "emissionClass": vehicle.emission_class or scenario.emission_class}
+        common |= {"speedFactor": vehicle.speed_factor, "speedDev": 0.0, "emergencyDecel": 9.0}
+        common |= {"maxSpeed": vehicle.max_speed, "vClass": vehicle.vehicle_class, **dict(vehicle.parameters)}
+        model = {"carFollowModel": vehicle.model, "tau": vehicle.time_headway, "minGap": vehicle.minimum_gap}
+        model |= {"accel": vehicle.acceleration, "decel": vehicle.deceleration}
+        types.append(xml_element("vType", id=name, **common, **model))
         cav = {"id": reader.CAV_TYPE_TEMPLATE.format(name), **common, **_cav_attributes(scenario)}
-        lines.append(xml_element("vType", **cav))
-    # Vehicles that overlap would block each other; after a collision of a CAV the episode ends.
-    return _built_road_inputs(road, lines, collision_action="remove")
+        types.append(xml_element("vType", **cav))
+    # Otherwise overlapping vehicles would block each other. The episode ends after a collision of a CAV.
+    return _built_road_inputs(road, types, collision_action="remove")
 
 
 def _built_road_inputs(
     road: BuiltRoad, types: list[str], humans: Collection[str] = (), collision_action: str = "warn"
 ) -> SumoInputs:
-    """Return SUMO's inputs for a road with the XML of its vehicle types; `humans` has types of single vehicles."""
+    """Return SUMO's inputs for a built-in road; `types` are XML, `humans` has ids of types of single vehicles."""
     lines = [*types]
     for route in road.routes:
         laps = route.laps if route.laps > 1 else None
@@ -80,7 +80,7 @@ def _built_road_inputs(
         attributes = {
             "id": entry.name,
             "type": entry.vehicle_type or (own_type if own_type in humans else "human"),
-            # SUMO would not insert a vehicle below the gap that its driver keeps.
+            # With all checks, SUMO would not insert a vehicle at a gap below the desired one.
             "insertionChecks": "collision" if entry.vehicle_type else "none" if is_unchecked else None,
             "route": entry.route,
             "depart": f"{entry.time:.2f}",
@@ -97,9 +97,9 @@ def _built_road_inputs(
 
 
 def user_network_inputs(scenario: Scenario, road: UserNetworkRoad) -> SumoInputs:
-    """Return SUMO's inputs for a user's network: never its configuration file itself."""
+    """Return SUMO's inputs for a user's network; SUMO does not read the user's configuration file."""
     files = road.files
-    # Vehicles of the insertion backlog must not vanish: their waiting time counts.
+    # Vehicles stay in the insertion backlog, as their waiting time counts.
     options = ["--max-depart-delay=-1", *(f"--{name}={value}" for name, value in files.options.items())]
     # Validation would download the schemas that the files name.
     options += [f"--xml-validation{suffix}=never" for suffix in ("", ".net", ".routes")]
@@ -110,63 +110,68 @@ def user_network_inputs(scenario: Scenario, road: UserNetworkRoad) -> SumoInputs
         "--weight-files": files.weight_files,
     }
     types = _user_network_types_xml(scenario, road)
-    copies, drivers = files.copy_sources, len(road.drivers)
-    return SumoInputs(tuple(options), existing, types, "--additional-files", copies, drivers, records_trips=True)
+    copies, driver_count = files.copy_sources, len(road.drivers)
+    return SumoInputs(tuple(options), existing, types, "--additional-files", copies, driver_count, records_trips=True)
 
 
 def _user_network_types_xml(scenario: Scenario, road: UserNetworkRoad) -> str:
-    """Return the XML of the types of CAVs and calibrated drivers, from which SUMO draws no speed factor."""
+    """Return the XML of the vehicle types of CAVs and calibrated drivers, which have no random speed factor."""
     cav = {"sigma": 0.0, "delta": IDMParameters().exponent, **_cav_attributes(scenario)}
     if scenario.actuation != "cruise":
-        cav["accel"] = None  # commands cannot exceed the acceleration of the vehicle
+        cav["accel"] = None  # the CAV keeps the maximum acceleration of its vehicle
     cav = {key: value for key, value in cav.items() if value is not None}
     files, lines, cav_types = road.files, list[str](), road.eligible_types.union(road.cav_types)
     for name, attributes in files.types.items():
         drivers = enumerate(road.drivers if name in road.calibrated_types else ())
-        models = {reader.CALIBRATED_TYPE_TEMPLATE.format(name, number): _idm_attributes(idm) for number, idm in drivers}
+        models = {reader.CALIBRATED_TYPE_TEMPLATE.format(name, index): _idm_attributes(idm) for index, idm in drivers}
         if name in cav_types:
             bases = {name: {}, **models}.items()
             models |= {reader.CAV_TYPE_TEMPLATE.format(base): {**model, **cav} for base, model in bases}
         for variant, model in models.items():
-            lines.append(_variant_xml(variant, attributes, model, files.type_parameters.get(name, {})))
+            lines.append(_derived_type_xml(variant, attributes, model, files.type_parameters.get(name, {})))
     return "\n".join(["<additional>", *lines, "</additional>"])
 
 
-def _variant_xml(name: str, attributes: XMLAttributes, car_following: XMLAttributes, parameters: dict[str, str]) -> str:
+def _derived_type_xml(
+    name: str, attributes: XMLAttributes, car_following: XMLAttributes, parameters: dict[str, str]
+) -> str:
+    """Return the XML of a user's vehicle type with another car-following model, and without harmful attributes."""
     keys = filter(reader.is_harmless_attribute, attributes.keys() - CAR_FOLLOWING_ATTRIBUTES)
-    others = {key: attributes[key] for key in sorted(keys)}
-    if attributes.get("carFollowModel") == "W99":  # which accelerates by its own parameter
-        others["accel"] = attributes.get("cc8", W99_ACCELERATION)
-    element = xml_element("vType", **{**others, "speedFactor": 1.0, "speedDev": 0.0, **car_following, "id": name})
+    other_attributes = {key: attributes[key] for key in sorted(keys)}
+    if attributes.get("carFollowModel") == "W99":  # its acceleration has another name
+        other_attributes["accel"] = attributes.get("cc8", W99_ACCELERATION)
+    element = xml_element(
+        "vType", **{**other_attributes, "speedFactor": 1.0, "speedDev": 0.0, **car_following, "id": name}
+    )
     harmless = filter(reader.is_harmless_parameter, parameters)
     nested = "".join(xml_element("param", key=key, value=parameters[key]) for key in harmless)
     return f"{element.removesuffix('/>')}>{nested}</vType>"
 
 
 def vehicle_class_by_type(road: UserNetworkRoad) -> dict[str, str]:
-    """Return the vehicle class of all types of vehicles: the user's types, and those derived from them."""
-    derived, own = dict[str, str](), dict[str, str]()
+    """Return the vehicle class of each of the user's vehicle types, and of the types derived from them."""
+    derived, original = dict[str, str](), dict[str, str]()
     for name, attributes in road.files.types.items():
-        own[name] = attributes.get("vClass", PASSENGER_CLASS)
-        bases = [name, *(reader.CALIBRATED_TYPE_TEMPLATE.format(name, number) for number in range(len(road.drivers)))]
-        derived |= dict.fromkeys([*bases, *map(reader.CAV_TYPE_TEMPLATE.format, bases)], own[name])
-    return derived | own
+        original[name] = attributes.get("vClass", PASSENGER_CLASS)
+        bases = [name, *(reader.CALIBRATED_TYPE_TEMPLATE.format(name, index) for index in range(len(road.drivers)))]
+        derived |= dict.fromkeys([*bases, *map(reader.CAV_TYPE_TEMPLATE.format, bases)], original[name])
+    return derived | original
 
 
 def _vehicle_type_xml(name: str, scenario: Scenario, attributes: XMLAttributes) -> str:
     """Return the XML of a vehicle type without SUMO's default randomness."""
     common = {"id": name, "length": VEHICLE_LENGTH, "sigma": 0.0, "impatience": scenario.impatience}
-    common |= {"speedFactor": 1.0, "speedDev": 0.0}  # otherwise SUMO draws factors between 0.8 and 1.2
+    common |= {"speedFactor": 1.0, "speedDev": 0.0}  # by default, SUMO draws factors between 0.8 and 1.2
     return xml_element("vType", **{**common, "emissionClass": scenario.emission_class, **attributes})
 
 
 def _human_attributes(scenario: Scenario, humans: IDMParameters) -> dict[str, Any]:
-    """Return how SUMO drives human-driven vehicles: its own IDM, or Flow's safety layer for commanded ones."""
+    """Return the attributes of human-driven vehicles: SUMO's IDM, or for commanded ones Flow's safety layer."""
     population = scenario.driver_population
     attributes = {**_idm_attributes(humans), "maxSpeed": humans.desired_speed}
     if scenario.human_control == "commanded":
         attributes |= {"accel": SUMO_ACCELERATION, "decel": 4.5, "tau": 1.0, "minGap": scenario.sumo_human_gap}
-        if population:  # the layer must not slow down drivers that keep less than a second
+        if population:  # the safety layer must not slow down drivers with a time headway below 1 s
             attributes |= {"tau": min(1.0, population.min_time_headway), "maxSpeed": population.max_desired_speed}
     return attributes
 
@@ -183,26 +188,26 @@ def _idm_attributes(parameters: IDMParameters) -> XMLAttributes:
 
 
 def _single_lane_cav_attributes(scenario: Scenario) -> XMLAttributes:
-    if scenario.actuation == "flow":  # without a gap CAVs would creep up to contact
+    if scenario.actuation == "flow":  # without a minimum gap, CAVs would creep up to contact
         attributes = _human_attributes(scenario, scenario.humans)
         return {"color": SUMO_CAV_COLOR, **attributes, "minGap": max(attributes["minGap"], MIN_CAV_GAP)}
     return {**_cav_attributes(scenario), "maxSpeed": scenario.top_speed}
 
 
 def _cav_attributes(scenario: Scenario) -> XMLAttributes:
-    """Return the attributes of a CAV: those of its own ACC, or of a type that executes any safe command exactly."""
+    """Return the attributes of CAVs: those of their ACC, or of a model that executes any safe command exactly."""
     cruise, step = scenario.cruise, scenario.simulation_step
     if scenario.actuation == "cruise":
         return {
             "color": SUMO_CAV_COLOR,
             "carFollowModel": "IDM",
             "tau": cruise.time_gap,
-            "accel": cruise.acceleration,  # None: that of the vehicle
+            "accel": cruise.acceleration,  # None: of the vehicle's type
             "decel": cruise.deceleration,
             "minGap": cruise.minimum_gap,
         }
-    # Such a Krauss vehicle follows commands until one would lead to a crash. With a safety filter, it has a car's
-    # limits, which other vehicles expect, and SUMO only makes it yield.
+    # SUMO limits the commands to this Krauss vehicle only to prevent a crash. With a safety filter, SUMO only makes it
+    # yield, and it has the acceleration of a car, which other vehicles expect.
     car_acceleration = max(SUMO_ACCELERATION, scenario.acceleration_limits.highest)
     return {
         "color": SUMO_CAV_COLOR,
@@ -210,13 +215,13 @@ def _cav_attributes(scenario: Scenario) -> XMLAttributes:
         "accel": car_acceleration if scenario.safety.active else UNLIMITED_ACCELERATION,
         **dict.fromkeys(("decel", "emergencyDecel", "apparentDecel"), scenario.cav_max_braking),
         "tau": step,
-        "actionStepLength": step,  # replaces that of the user's types
+        "actionStepLength": step,  # instead of the value of the user's type
         "minGap": MIN_CAV_GAP,
     }
 
 
 def lane_change_parameters(scenario: Scenario) -> dict[str, str]:
-    """Return the parameters of SUMO's LC2013 that a vehicle gets as a CAV, which its new type does not change.
+    """Return the parameters of SUMO's lane-change model LC2013 for a CAV; a change of the type does not set them.
 
     https://sumo.dlr.de/docs/Definition_of_Vehicles,_Vehicle_Types,_and_Routes.html#lane-changing_models
     """

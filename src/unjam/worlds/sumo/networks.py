@@ -1,4 +1,4 @@
-"""Network files for SUMO, made once for each content and cached; and SUMO's programs."""
+"""Network files of built-in roads, which netconvert makes and unjam caches; and SUMO's programs and messages."""
 
 import errno
 import os
@@ -25,18 +25,18 @@ from unjam.sumo_files import file_stamp, read_lanes
 from unjam.worlds.record import Floats
 
 STALE_FILE_SECONDS = 3600.0
-"""age of a temporary file after which no process uses it any more"""
+"""age after which no process uses a temporary file any more [s]"""
 MESSAGE_TOTAL_MARKER = "total messages of type:"
-"""text of the lines at the end of a log that count its messages"""
+"""text in the lines at the end of a log that have the numbers of its messages"""
 XMLAttributes = dict[str, Any]
 UNCONTROLLED_LINK_STATES = "MZ-"
-"""states of connections without waiting vehicles: right of way, zipper merge, dead end"""
+"""states of connections at which no vehicle has to wait: right of way, zipper merge, dead end"""
 _intact_networks: dict[Path, tuple[int, int]] = {}
-"""cached networks that this process has verified, with their stamps"""
+"""stamps of the cached networks that this process has verified"""
 
 
 class NetworkLane(NamedTuple):
-    """A lane of a network outside of junctions; length [m], speed limit [m/s]."""
+    """A lane of a network outside of junctions, with length [m], speed limit [m/s], and the lanes that follow it."""
 
     name: str
     edge: str
@@ -44,12 +44,12 @@ class NetworkLane(NamedTuple):
     speed_limit: float
     successors: tuple[str, ...]
     has_stop_line: bool = False
-    """whether vehicles may have to wait at its end: at a signal, a stop sign, or to yield"""
+    """whether vehicles may have to wait at the end of the lane, at a signal or stop sign, or to yield"""
 
 
 @cache
 def sumo_program(name: str) -> str:
-    """Return the path of a SUMO program: the package's, or the one on the PATH; raise `MissingPartError` if missing."""
+    """Return the path of a program of SUMO, in its package or on the PATH; raise `MissingPartError` if missing."""
     with suppress(ImportError, AttributeError):
         import sumo
 
@@ -58,7 +58,7 @@ def sumo_program(name: str) -> str:
             return str(bundled)
     if path := shutil.which(name):
         return path
-    raise MissingPartError(f"SUMO's {name} is not there; install it: pip install eclipse-sumo==1.28.0")
+    raise MissingPartError(f"SUMO's {name} is not installed; install it: pip install eclipse-sumo==1.28.0")
 
 
 @cache
@@ -71,12 +71,12 @@ def sumo_version() -> str:
 
 
 def sumo_message(lines: Iterable[str]) -> str:
-    """Return the error message of one of SUMO's programs as one line."""
+    """Return the error message in the output of one of SUMO's programs, as one line."""
     return "; ".join(text for line in lines if (text := line.strip()) and text != "Quitting (on error).")
 
 
 def last_error_message(log_path: Path) -> str:
-    """Return SUMO's last error message from its log, without the warnings before it."""
+    """Return the error message at the end of SUMO's log, without the warnings before it; empty without one."""
     try:
         lines = [line for line in log_path.read_text(errors="replace").splitlines() if MESSAGE_TOTAL_MARKER not in line]
     except OSError:
@@ -85,7 +85,7 @@ def last_error_message(log_path: Path) -> str:
 
 
 def network_file(network: RoadNetwork) -> Path:
-    """Return SUMO's network file, made with netconvert unless the cache has an intact one with this content.
+    """Return the network file of a built-in road, which netconvert makes unless an intact one is cached.
 
     Raise `MissingPartError` if netconvert is missing, `DiskError` if the cache cannot be written.
     """
@@ -98,7 +98,7 @@ def network_file(network: RoadNetwork) -> Path:
     files["--edge-files", "road.edg.xml"] = xml_document("edges", "edge", edges)
     if network.connections:
         names = "from", "to", "fromLane", "toLane"
-        connections = [dict[str, Any](zip(names, each, strict=True)) for each in network.connections]
+        connections = [dict[str, Any](zip(names, connection, strict=True)) for connection in network.connections]
         files["--connection-files", "road.con.xml"] = xml_document("connections", "connection", connections)
     options = ["--no-turnarounds", "true", *([] if network.has_internal_links else ["--no-internal-links", "true"])]
     content = "\n".join([sumo_version(), *options, *files.values()])
@@ -108,16 +108,16 @@ def network_file(network: RoadNetwork) -> Path:
         return target
     try:
         make_folder(target.parent)
-    except (DiskError, FileNotFoundError) as error:  # the second below /proc
+    except (DiskError, FileNotFoundError) as error:  # the latter below /proc
         reason = error if isinstance(error, DiskError) else disk_error(error, target.parent)
         raise DiskError(f"{reason}; UNJAM_CACHE can name another folder") from None
     remove_leftovers(target.parent, min_age=STALE_FILE_SECONDS)
     try:
         with PrivateFolder() as folder:
-            made = run_netconvert(files, options, Path(folder)).read_bytes()
+            network_bytes = run_netconvert(files, options, Path(folder)).read_bytes()
     except OSError as error:
         raise (disk_error(error, "a temporary file") if error.errno in DISK_ERRNOS else error) from None
-    atomic_write(target, made + checksum_line(made))  # so that several workers can do this at the same time
+    atomic_write(target, network_bytes + checksum_line(network_bytes))  # several workers may do this at the same time
     return target
 
 
@@ -125,15 +125,15 @@ class NetworkGeometry(NamedTuple):
     """Geometry and speed limits of a network file; lengths [m]."""
 
     lane_lines: Floats
-    """center lines of all lanes: rows (x, y) [m], a row of NaN between two lines"""
+    """center lines of all lanes: rows (x, y) [m], with a row of NaN after each line"""
     edge_lengths: dict[str, float]
     lane_counts: dict[str, int]
     speed_limits: dict[str, float]
-    """largest of the lanes of an edge [m/s]"""
+    """highest speed limit of the lanes of each edge [m/s]"""
 
 
 def network_geometry(path: Path) -> NetworkGeometry:
-    """Return the geometry of a network file, which is read again after a change."""
+    """Return the geometry of a network file; the file is read again if it has changed."""
     return _read_geometry(path, file_stamp(path))
 
 
@@ -146,33 +146,36 @@ def _read_geometry(path: Path, stamp: tuple[int, int]) -> NetworkGeometry:
     return NetworkGeometry(np.array(rows, np.float64).reshape(-1, 2), lengths, dict(counts), limits)
 
 
-def _edge_attributes(edge: Edge, speed: float) -> XMLAttributes:
+def _edge_attributes(edge: Edge, default_speed_limit: float) -> XMLAttributes:
     ends = {"id": edge.name, "from": edge.from_node, "to": edge.to_node}
     shape = " ".join(f"{x:.6f},{y:.6f}" for x, y in edge.shape) or None
-    lane = {"numLanes": edge.lanes, "speed": edge.speed_limit or speed, "length": repr(edge.length)}
+    lane = {"numLanes": edge.lanes, "speed": edge.speed_limit or default_speed_limit, "length": repr(edge.length)}
     return {**ends, **lane, "priority": edge.priority, "shape": shape}
 
 
 def xml_document(root: str, tag: str, elements: Iterable[XMLAttributes]) -> str:
-    """Return an XML document of elements of one kind."""
-    return "\n".join([f"<{root}>", *(xml_element(tag, **each) for each in elements), f"</{root}>"])
+    """Return an XML document whose elements all have one tag."""
+    return "\n".join([f"<{root}>", *(xml_element(tag, **attributes) for attributes in elements), f"</{root}>"])
 
 
 def xml_element(tag: str, /, **attributes: Any) -> str:
-    """Return an XML element without content, and without the attributes that are None."""
+    """Return an XML element without content; attributes that are None are left out."""
     pairs = [f"{key}={quoteattr(str(value))}" for key, value in attributes.items() if value is not None]
     return f"<{tag} {' '.join(pairs)}/>"
 
 
 def run_netconvert(files: dict[tuple[str, str], str], options: list[str], folder: Path) -> Path:
-    """Return the network that netconvert makes of files by (option, name); or raise `EpisodeError` with its message."""
+    """Return the network that netconvert makes in a folder; `files` are contents by (option, name of the file).
+
+    Raise `EpisodeError` with netconvert's message if it fails, and `OSError` if the disk is full.
+    """
     network = folder / "road.net.xml"
     for (_, name), content in files.items():
         (folder / name).write_text(content)
     inputs = [f"{option}={folder / name}" for option, name in files]
-    fixed = [f"--output-file={network}", "--offset.disable-normalization=true", "--precision=6"]
-    command = [sumo_program("netconvert"), *inputs, *fixed, *options]
-    # Without the signal of a file size limit, which Python ignores, netconvert writes a cut file, as on a full disk.
+    fixed_options = [f"--output-file={network}", "--offset.disable-normalization=true", "--precision=6"]
+    command = [sumo_program("netconvert"), *inputs, *fixed_options, *options]
+    # At a limit of file sizes, netconvert gets a signal, which Python ignores; it would write an incomplete file.
     result = subprocess.run(command, capture_output=True, text=True, check=False, restore_signals=False)
     if result.returncode == 0 and network.exists():
         if network.read_bytes().rstrip().endswith(b"</net>"):
@@ -183,7 +186,7 @@ def run_netconvert(files: dict[tuple[str, str], str], options: list[str], folder
 
 
 def cache_folder() -> Path:
-    """Return the folder for networks; raise `InputError` if SUMO would read its name as a list or a variable."""
+    """Return the folder of the cache; raise `InputError` if SUMO would read its name as a list or a variable."""
     folder = os.environ.get("UNJAM_CACHE") or platformdirs.user_cache_dir("unjam")
     if any(character in folder for character in ",;$%"):
         raise invalid_value("UNJAM_CACHE", folder, "a folder without , ; $ % in its name")
@@ -191,12 +194,12 @@ def cache_folder() -> Path:
 
 
 def checksum_line(content: bytes) -> bytes:
-    """Return the last line of a cached network: the hash of the lines before it."""
+    """Return the last line of a cached network, which has the hash of the lines before it."""
     return f"<!-- sha256 {sha256_of(content)} -->\n".encode()
 
 
 def is_intact(network: Path) -> bool:
-    """Return whether a cached network exists, and was neither changed nor cut since it was made."""
+    """Return whether a cached network exists, and is complete and unchanged."""
     try:
         stamp = file_stamp(network)
         if _intact_networks.get(network) != stamp:

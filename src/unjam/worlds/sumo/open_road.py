@@ -1,4 +1,4 @@
-"""Traffic on roads with ends: vehicles enter and leave, and each trip of a CAV is a trajectory."""
+"""Traffic on open roads: vehicles enter and leave, and each trip of a CAV is one trajectory."""
 
 from collections.abc import Callable, Hashable, Sequence
 from math import inf
@@ -32,95 +32,100 @@ def neighbor_state(
     speeds: Floats,
     leader_gaps: Callable[[NDArray[np.intp], NDArray[np.intp]], Floats],
 ) -> LocalState:
-    """Return the local states of some rows, given rows of neighbors (-1: none) and a function for gaps [m]."""
-    values = [speeds[rows]]
+    """Return the local states of the vehicles in `rows`.
+
+    `leaders` and `followers` are rows of their neighbors; -1: none. `leader_gaps` returns gaps [m] of rows to rows.
+    """
+    fields = [speeds[rows]]
     for neighbors, gaps in ((leaders, leader_gaps(rows, leaders)), (followers, leader_gaps(followers, rows))):
-        values += observe_neighbor(neighbors >= 0, gaps, speeds[neighbors], speeds[rows])
-    return LocalState(*values, route_position=positions[rows], loop_length=np.full(len(rows), np.nan))
+        fields += observe_neighbor(neighbors >= 0, gaps, speeds[neighbors], speeds[rows])
+    return LocalState(*fields, route_position=positions[rows], loop_length=np.full(len(rows), np.nan))
 
 
 class ActiveVehicles:
-    """The vehicles on a road with ends, and counts of arrivals, teleports and collisions."""
+    """The vehicles on an open road, and counts of arrivals, teleports and collisions."""
 
     def __init__(self) -> None:
         self.is_cav: dict[str, bool] = {}
         """whether each vehicle on the road is a CAV, in order of entry"""
         self.teleported: dict[str, bool] = {}
-        """the same for vehicles that SUMO has teleported and not yet reinserted"""
+        """whether each vehicle is a CAV that SUMO has teleported and not yet reinserted"""
         self.off_road: dict[str, bool] = {}
-        """the same for vehicles that SUMO is removing, which it lists as arrived or teleported only later"""
+        """whether each vehicle is a CAV that SUMO is removing, but lists as arrived or teleported only later"""
         self._removed_unlisted = set[str]()
-        self.collided = set[str]()
+        """vehicles that were removed in a collision, and that SUMO has not yet listed as arrived"""
+        self.collided_vehicles = set[str]()
         self.arrivals = self.teleports = 0
         self.removed_count = 0
-        """vehicles that SUMO removed for good, among the teleports: they never arrive"""
+        """number of vehicles that SUMO removed for good; they are also counted as teleports, and never arrive"""
 
     def update(self, simulation: Simulation, is_cav: Callable[[str], bool]) -> tuple[list[str], Sequence[str]]:
-        """Update after a step, and return the vehicles that left and that entered, which `is_cav` judges."""
+        """Update after a step, and return the vehicles that left and that entered; `is_cav` selects the CAVs."""
         entered, arrived = simulation.departed_vehicles(), simulation.arrived_vehicles()
         teleporting = simulation.teleporting_vehicles()
         self.arrivals += len(set(arrived) - self._removed_unlisted)
         self._removed_unlisted.difference_update(arrived)
         self.teleports += len(teleporting)
         known = {**self.off_road, **self.is_cav} if self.off_road else self.is_cav
-        self.teleported |= {name: known[name] for name in teleporting if name in known}
+        self.teleported |= {vehicle_id: known[vehicle_id] for vehicle_id in teleporting if vehicle_id in known}
         left = [*arrived, *teleporting]
-        for name in left:
-            self.is_cav.pop(name, None)
-            self.off_road.pop(name, None)
-        for name in arrived:  # SUMO may teleport a vehicle to the end of its route
-            self.teleported.pop(name, None)
-        for name in entered:
-            self.is_cav[name] = is_cav(name)
-        for name in filter(self.teleported.__contains__, simulation.reinserted_vehicles()):
-            self.is_cav[name] = self.teleported.pop(name)
+        for vehicle_id in left:
+            self.is_cav.pop(vehicle_id, None)
+            self.off_road.pop(vehicle_id, None)
+        for vehicle_id in arrived:  # SUMO may have teleported the vehicle to the end of its route
+            self.teleported.pop(vehicle_id, None)
+        for vehicle_id in entered:
+            self.is_cav[vehicle_id] = is_cav(vehicle_id)
+        for vehicle_id in filter(self.teleported.__contains__, simulation.reinserted_vehicles()):
+            self.is_cav[vehicle_id] = self.teleported.pop(vehicle_id)
         return left, entered
 
-    def take_off_road(self, names: Sequence[str]) -> None:
-        """Take vehicles from the road which SUMO is removing: calibrators do so, and collisions."""
-        self.off_road |= {name: self.is_cav.pop(name) for name in names}
+    def take_off_road(self, ids: Sequence[str]) -> None:
+        """Take vehicles from the road that SUMO is removing because of a calibrator or a collision."""
+        self.off_road |= {vehicle_id: self.is_cav.pop(vehicle_id) for vehicle_id in ids}
 
     def add_collision(self, colliding: Sequence[str], simulation: Simulation) -> None:
-        """Count a collision in the last step; vehicles that SUMO removes for it are teleports, not arrivals."""
-        self.collided.update(colliding)
+        """Count the vehicles that collided in the last step; those that SUMO removes are teleports, not arrivals."""
+        self.collided_vehicles.update(colliding)
         removed = set(colliding) & {*simulation.arrived_vehicles(), *self.off_road}
-        removed -= set(simulation.teleporting_vehicles())  # one that is teleported to its end has arrived
+        removed -= set(simulation.teleporting_vehicles())  # a vehicle that is teleported to its destination arrives
         unlisted = removed & self.off_road.keys()
         self._removed_unlisted |= unlisted
         self.teleports += len(removed)
         self.add_removals(len(removed))
-        self.arrivals += len(unlisted)  # not counted as arrived so far
+        self.arrivals += len(unlisted)  # `add_removals` has subtracted them, but they were not yet counted
 
     def add_removals(self, count: int) -> None:
-        """Count vehicles that SUMO has removed, and lists as arrived; they are counted as teleports, too."""
+        """Count vehicles that SUMO has removed, and that were counted both as arrivals and as teleports."""
         self.arrivals -= count
         self.removed_count += count
 
 
 class OpenTraffic(Traffic[OpenRoadT]):
-    """Common part of the roads with ends.
+    """Base class of the worlds of open roads in SUMO.
 
-    A vehicle becomes a CAV at the first control step after its entry. Its trip ends with the last control step after
-    which it is still on the road.
+    A vehicle becomes a CAV at the first control step after its entry. The trip of a CAV ends with the last control step
+    after which it is still on the road.
     """
 
     _fuel_interval = 1
+    """number of control steps between two measurements of fuel"""
     _cav_type_template = "cav"
-    """vehicle type of a CAV; `{}` stands for its own type"""
+    """id of the vehicle type of CAVs; `{}` stands for the type that the vehicle had before"""
 
-    # What the kinds of roads do in their own way:
+    # Methods that the kinds of roads override:
 
     def _network_file(self) -> Path:
         return network_file(cast(BuiltRoad, self.road).network)
 
-    def _is_cav(self, name: str) -> bool:
-        return name in self.road.cav_ids
+    def _is_cav(self, vehicle_id: str) -> bool:
+        return vehicle_id in self.road.cav_ids
 
-    def _update_vehicles(self, left_names: Sequence[str], entered_names: Sequence[str]) -> None:
-        """Update what is known of the vehicles after a simulation step."""
+    def _update_vehicles(self, left_ids: Sequence[str], entered_ids: Sequence[str]) -> None:
+        """Update the states of the vehicles after a simulation step."""
 
     def _command_humans(self) -> None:
-        """Command the speeds of human drivers, unless SUMO drives them."""
+        """Command the speeds of human-driven vehicles that SUMO does not drive itself."""
 
     def _command_cavs(self, speeds: dict[str, float]) -> None:
         self._simulation.command_speeds(speeds.keys(), speeds.values())
@@ -130,31 +135,31 @@ class OpenTraffic(Traffic[OpenRoadT]):
         colliding = self._simulation.colliding_vehicles()
         return colliding, bool(colliding)
 
-    def _names_and_speeds(self) -> tuple[Sequence[str], Floats]:
+    def _ids_and_speeds(self) -> tuple[Sequence[str], Floats]:
         """Return the vehicles on the road after the last step, and their speeds [m/s], in the same order."""
         if self._cached_speeds is None:
-            names = list(self._vehicles.is_cav)
-            self._cached_speeds = names, np.array(self._simulation.speeds(names), np.float64)
+            ids = list(self._vehicles.is_cav)
+            self._cached_speeds = ids, np.array(self._simulation.speeds(ids), np.float64)
         return self._cached_speeds
 
     def _vehicles_off_road(self) -> list[str]:
-        """Return the vehicles that SUMO is removing, and does not yet list as arrived: on user networks only."""
+        """Return the vehicles that SUMO is removing, but does not yet list as arrived; only user networks have some."""
         return []
 
-    def _local_states(self, names: Sequence[str]) -> LocalState:
+    def _local_states(self, ids: Sequence[str]) -> LocalState:
         """Return the local states of CAVs; called once after each control step."""
         raise NotImplementedError
 
-    def _following_states(self, names: Sequence[str]) -> list[FollowingState]:
-        """Return the states that the safety filter uses; without a filter, there is no leader."""
-        return [FollowingState(speed, speed, inf) for speed in self._simulation.speeds(names)]
+    def _following_states(self, ids: Sequence[str]) -> list[FollowingState]:
+        """Return the states that the safety filter uses; without a filter, states without a leader."""
+        return [FollowingState(speed, speed, inf) for speed in self._simulation.speeds(ids)]
 
-    def _snapshot(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return `positions` [m], `gaps` to the leaders [m] and other values of these vehicles for figures."""
+    def _snapshot(self, ids: Sequence[str]) -> dict[str, Any]:
+        """Return `positions` [m], `gaps` to the leaders [m] and other columns for figures, by name."""
         raise NotImplementedError
 
     def _snapshot_fields(self, columns: NDArray[np.intp]) -> dict[str, Any]:
-        """Return the fields of the record that are made from snapshots, and others of this kind of road."""
+        """Return the fields of the record from snapshots in `columns`, and fields that only this kind of road has."""
         names = ("positions", "gaps", "poses") if self.options.record_details else ("positions", "gaps")
         return {name: self._log.traffic.snapshots(name, columns) for name in names}
 
@@ -166,22 +171,22 @@ class OpenTraffic(Traffic[OpenRoadT]):
         return [""] * len(vehicles)
 
     def _make_log(self) -> OpenRoadLog:
-        return OpenRoadLog(self.scenario, *self._names_and_speeds())
+        return OpenRoadLog(self.scenario, *self._ids_and_speeds())
 
-    # What they have in common:
+    # Methods that all kinds of roads share:
 
     @property
     def expects_cavs(self) -> bool:
-        """Whether a CAV may still enter: not all CAVs of the road have entered."""
+        """Whether a CAV may still enter, as not all CAVs of the road have entered."""
         return self.entered_count < len(self.road.cav_ids)
 
     @property
     def backlog(self) -> int:
-        """The insertion backlog now, including teleported and removed vehicles."""
+        """The current insertion backlog, including teleported and removed vehicles."""
         return self._log.backlog[-1]
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Run the warm-up, then hand the CAVs to the driver, without a history."""
+        """Run the warm-up, and let the driver control the CAVs if `is_controlled`; return no history."""
         self._vehicles = ActiveVehicles()
         self._controlled_cavs = set[str]()
         self.cav_ids = []
@@ -191,58 +196,58 @@ class OpenTraffic(Traffic[OpenRoadT]):
         self._warm_up(lambda: self._simulate({}), on_progress)
         self.is_controlled = is_controlled
         self._vehicles.arrivals = self._vehicles.teleports = 0
-        self._vehicles.collided.clear()
+        self._vehicles.collided_vehicles.clear()
         self._log = self._make_log()
         self._log_moment()
 
     def exact_state(self) -> LocalState:
-        """Return the exact local state of the CAVs now."""
+        """Return the exact current local state of the CAVs."""
         return self._log.trips.states[-1].as_read_only()
 
     def advance(self, command: Command | None) -> None:
-        """Simulate one control step; None: the CAVs stay human."""
+        """Simulate one control step; with the command None, the CAVs drive as human-driven vehicles."""
         self._simulation.check()
-        scenario, names, trips = self.scenario, self.cav_ids, self._log.trips
+        scenario, ids, trips = self.scenario, self.cav_ids, self._log.trips
         is_exact = scenario.actuation != "cruise"
         requested = self.limited_accelerations(command) if self.is_controlled else []
-        before = trips.states[-1].speed
-        shield = dict.fromkeys(names, 0.0)
-        reductions: dict[str, list[float]] = {name: [] for name in names}
+        previous_speeds = trips.states[-1].speed
+        shield_brakings = dict.fromkeys(ids, 0.0)
+        reductions: dict[str, list[float]] = {vehicle_id: [] for vehicle_id in ids}
         for _ in range(scenario.steps_per_control_step):
-            values = zip(names, requested, strict=False)
-            active = {name: value for name, value in values if name in self._vehicles.is_cav}
+            pairs = zip(ids, requested, strict=False)
+            active = {vehicle_id: value for vehicle_id, value in pairs if vehicle_id in self._vehicles.is_cav}
             commanded, safe = self._safe_speeds(active)
-            for name, value in safe.items():
-                reductions[name].append(active[name] - value)
+            for vehicle_id, value in safe.items():
+                reductions[vehicle_id].append(active[vehicle_id] - value)
             self._simulate(commanded)
-            remaining = [name for name in commanded if name in self._vehicles.is_cav]
-            moved = dict(zip(remaining, self._simulation.speeds(remaining), strict=True)) if is_exact else {}
-            slower = [name for name, speed in moved.items() if speed < commanded[name]]
-            # A CAV at the allowed speed is not overridden.
-            for name, allowed in zip(slower, self._simulation.allowed_speeds(slower), strict=True):
-                added = (float(np.fmin(commanded[name], allowed)) - moved[name]) / scenario.simulation_step
-                shield[name] = max(shield[name], added)
+            remaining = [vehicle_id for vehicle_id in commanded if vehicle_id in self._vehicles.is_cav]
+            actual = dict(zip(remaining, self._simulation.speeds(remaining), strict=True)) if is_exact else {}
+            slower = [vehicle_id for vehicle_id, speed in actual.items() if speed < commanded[vehicle_id]]
+            # SUMO does not override a CAV that drives at the allowed speed.
+            for vehicle_id, allowed in zip(slower, self._simulation.allowed_speeds(slower), strict=True):
+                difference = float(np.fmin(commanded[vehicle_id], allowed)) - actual[vehicle_id]
+                shield_brakings[vehicle_id] = max(shield_brakings[vehicle_id], difference / scenario.simulation_step)
             if self.has_crashed or self.stop_reason:
                 break
         self.control_steps += 1
         self._log_moment()
-        if not (self.is_controlled and is_exact):  # the actual accelerations, zero for vehicles that have left
-            after = dict(zip(self._log.traffic.names, self.speeds, strict=True))
-            changes = (after.get(name, speed) - speed for name, speed in zip(names, before, strict=True))
+        if not (self.is_controlled and is_exact):  # use actual accelerations, zero for vehicles that have left
+            new = dict(zip(self._log.traffic.names, self.speeds, strict=True))
+            changes = (new.get(vehicle_id, old) - old for vehicle_id, old in zip(ids, previous_speeds, strict=True))
             requested = [change / scenario.control_step for change in changes]
         means = [sum(values) / scenario.steps_per_control_step * is_exact for values in reductions.values()]
         trips.applied_accelerations.append([value - mean for value, mean in zip(requested, means, strict=True)])
         trips.filter_brakings.append([max(values, default=0.0) for values in reductions.values()])
-        trips.shield_brakings.append(list(shield.values()))
+        trips.shield_brakings.append(list(shield_brakings.values()))
         if self.options.record_details and (self.control_steps - 1) % self._fuel_interval == 0:
             self._log.fuel.append(sum(self._simulation.fuel(self._log.traffic.names)))
 
     def _safe_speeds(self, accelerations: dict[str, float]) -> tuple[dict[str, float], dict[str, float]]:
         """Return the CAVs' speeds after this step [m/s], and their accelerations after the safety filter [m/s2]."""
         speeds, safe = dict[str, float](), dict[str, float]()
-        for name, state in zip(accelerations, self._following_states(list(accelerations)), strict=True):
-            safe[name], actual = self.filtered_acceleration(name, accelerations[name], state)
-            speeds[name] = next_speed(state.speed, actual, self.scenario.simulation_step)
+        for vehicle_id, state in zip(accelerations, self._following_states(list(accelerations)), strict=True):
+            safe[vehicle_id], actual = self.filtered_acceleration(vehicle_id, accelerations[vehicle_id], state)
+            speeds[vehicle_id] = next_speed(state.speed, actual, self.scenario.simulation_step)
         return speeds, safe
 
     def _simulate(self, cav_speeds: dict[str, float]) -> None:
@@ -250,7 +255,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         self._command_cavs(cav_speeds)
         self._simulation.step()
         self._update_active_vehicles()
-        self._log.add_step(*self._names_and_speeds(), self.cav_ids if self.is_controlled else ())
+        self._log.add_step(*self._ids_and_speeds(), self.cav_ids if self.is_controlled else ())
         colliding, ends_episode = self._collisions()
         if colliding:
             self._vehicles.add_collision(colliding, self._simulation)
@@ -262,37 +267,38 @@ class OpenTraffic(Traffic[OpenRoadT]):
         if off_road := self._vehicles_off_road():
             self._vehicles.take_off_road(off_road)
             left, self._cached_speeds = [*left, *off_road], None
-        self._controlled_cavs.difference_update(entered)  # SUMO allows the name of a vehicle that has left
+        self._controlled_cavs.difference_update(entered)  # a new vehicle may have the id of one that has left
         self._update_vehicles(left, entered)
 
     def _log_moment(self) -> None:
-        """Take control of CAVs that have entered, and log the state after a control step."""
-        simulation, scenario, known = self._simulation, self.scenario, set(self.cav_ids)
-        rows = [row for row, name in enumerate(self.cav_ids) if name in self._vehicles.is_cav]
-        new = [name for name, is_cav in self._vehicles.is_cav.items() if is_cav and name not in known]
-        self.remaining_rows = rows if new or len(rows) < len(known) else None
+        """Take control of the CAVs that have entered, and log the state after a control step."""
+        simulation, scenario, previous = self._simulation, self.scenario, set(self.cav_ids)
+        rows = [row for row, vehicle_id in enumerate(self.cav_ids) if vehicle_id in self._vehicles.is_cav]
+        new = [vehicle for vehicle, is_cav in self._vehicles.is_cav.items() if is_cav and vehicle not in previous]
+        self.remaining_rows = rows if new or len(rows) < len(previous) else None
         if self.remaining_rows is not None:
             self.cav_ids = [*(self.cav_ids[row] for row in rows), *new]
         self.entered_count += len(new)
         if self.is_controlled:
-            new = [name for name in new if name not in self._controlled_cavs]
+            new = [vehicle_id for vehicle_id in new if vehicle_id not in self._controlled_cavs]
             self._controlled_cavs.update(new)
-            changes = lane_change_parameters(scenario)
-            simulation.take_control(new, scenario.actuation, scenario.right_of_way, self._cav_type_template, changes)
-        names, self.speeds = self._names_and_speeds()
+            parameters = lane_change_parameters(scenario)
+            template = self._cav_type_template
+            simulation.take_control(new, scenario.actuation, scenario.right_of_way, template, parameters)
+        ids, self.speeds = self._ids_and_speeds()
         log, states = self._log, self._local_states(self.cav_ids)
-        log.traffic.add(names, self.speeds)
+        log.traffic.add(ids, self.speeds)
         if log.traffic.needs_snapshot:
-            poses = {"poses": simulation.poses(names)} if self.options.record_details else {}
-            log.traffic.add_snapshot({**self._snapshot(names), **poses})
+            poses = {"poses": simulation.poses(ids)} if self.options.record_details else {}
+            log.traffic.add_snapshot({**self._snapshot(ids), **poses})
         log.trips.cav_ids.append(self.cav_ids)
         log.trips.states.append(states)
-        waiting = len(simulation.pending_vehicles()) + len(self._vehicles.teleported)
-        log.backlog.append(waiting + self._waiting_removed_count)
+        outside = len(simulation.pending_vehicles()) + len(self._vehicles.teleported)
+        log.backlog.append(outside + self._waiting_removed_count)
 
     @property
     def _waiting_removed_count(self) -> int:
-        """Number of removed vehicles that count until the end; zero where a removal ends the episode."""
+        """Number of removed vehicles in the backlog until the end; zero where a removal ends the episode."""
         return 0
 
     def _make_record(self, driver_log: DriverLog) -> Episode:
@@ -306,7 +312,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
             "arrivals": vehicles.arrivals,
             "teleports": vehicles.teleports,
             "removed": self._waiting_removed_count,
-            "collisions": len(vehicles.collided),
+            "collisions": len(vehicles.collided_vehicles),
             "planned_duration": self.scenario.horizon * self.scenario.control_step,
             "lane_lines": network_geometry(self._network_file()).lane_lines if details else np.zeros((0, 2)),
         }
@@ -319,54 +325,54 @@ class OpenTraffic(Traffic[OpenRoadT]):
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""
         self._simulation.check()
-        names = self._log.traffic.names
-        is_cav = np.array([name in self.cav_ids for name in names], bool)
+        ids = self._log.traffic.names
+        is_cav = np.array([vehicle_id in self.cav_ids for vehicle_id in ids], bool)
         lines = network_geometry(self._network_file()).lane_lines
-        return RoadScene(lines, self._simulation.poses(names), np.array(self.speeds), is_cav)
+        return RoadScene(lines, self._simulation.poses(ids), np.array(self.speeds), is_cav)
 
 
 class MultiLaneTraffic(OpenTraffic[OpenRoadT]):
-    """Common part of the roads with lanes, on which the CAV's own ACC may carry out commands."""
+    """Base class of the worlds of open roads with several lanes, on which an ACC may carry out commands."""
 
     def _prepare(self) -> None:
         self._speed_caps = SpeedCaps(self._simulation)
         self._time_gaps: dict[str, float] = {}
-        """current time gap of CAVs with a time gap command to their ACC [s]"""
+        """current time gap of the CAVs that have received a time gap command for their ACC [s]"""
 
     def _make_log(self) -> OpenRoadLog:
-        return MultiLaneLog(self.scenario, *self._names_and_speeds(), self._tracked_leaders)
+        return MultiLaneLog(self.scenario, *self._ids_and_speeds(), self._tracked_leaders)
 
     def advance(self, command: Command | None) -> None:
-        """Simulate one control step, after time gap commands to the CAVs' own ACCs, if any."""
+        """Set the time gaps that the command has for the ACCs of CAVs, and simulate one control step."""
         has_time_gaps = command is not None and command.time_gap is not None
         if self.scenario.actuation == "cruise" and (has_time_gaps or self._time_gaps):
             default = self.scenario.cruise.time_gap
             commanded = commanded_time_gaps(command, default, self.cav_ids, self.control_steps)
-            for name, time_gap in zip(self.cav_ids, commanded, strict=True):
-                if time_gap != self._time_gaps.get(name, default):
-                    self._simulation.set_time_gap(name, time_gap)
-                    self._time_gaps[name] = time_gap
+            for vehicle_id, time_gap in zip(self.cav_ids, commanded, strict=True):
+                if time_gap != self._time_gaps.get(vehicle_id, default):
+                    self._simulation.set_time_gap(vehicle_id, time_gap)
+                    self._time_gaps[vehicle_id] = time_gap
         super().advance(command)
 
-    def _tracked_leaders(self, names: Sequence[str]) -> list[TrackedLeader]:
+    def _tracked_leaders(self, ids: Sequence[str]) -> list[TrackedLeader]:
         raise NotImplementedError
 
-    def _acc_limits(self, names: Sequence[str]) -> tuple[Floats, Floats] | None:
-        """Return acceleration and comfortable deceleration of CAVs [m/s2]; None: those of the ACC."""
+    def _acc_limits(self, ids: Sequence[str]) -> tuple[Floats, Floats] | None:
+        """Return acceleration and comfortable deceleration of CAVs [m/s2]; None: the ACC's settings apply."""
         return None
 
-    def _is_uncapped(self, name: str) -> bool:
-        """Whether a set-speed cap is not allowed where a CAV is."""
+    def _is_uncapped(self, vehicle_id: str) -> bool:
+        """Return whether a CAV gets no set-speed cap at its position."""
         return False
 
     def _command_cavs(self, speeds: dict[str, float]) -> None:
-        """Give a CAV with its own ACC, which SUMO still drives, a set-speed cap, or none if it may drive freely."""
-        cruise, simulation, names = self.scenario.cruise, self._simulation, list(speeds)
+        """Set the set-speed caps of CAVs with an ACC, which SUMO drives; command the speeds of other CAVs."""
+        cruise, simulation, ids = self.scenario.cruise, self._simulation, list(speeds)
         if self.scenario.actuation != "cruise":
             super()._command_cavs(speeds)
             return
-        current, targets = np.array(simulation.speeds(names)), np.array([*speeds.values()])
-        step, limits = self.scenario.simulation_step, self._acc_limits(names)
+        current, targets = np.array(simulation.speeds(ids)), np.array([*speeds.values()])
+        step, limits = self.scenario.simulation_step, self._acc_limits(ids)
         caps = cruise.set_speed(current, targets, self.limits.highest, step, limits)
-        for name, cap in zip(names, caps.tolist(), strict=True):
-            self._speed_caps.set(name, "set speed", inf if self._is_uncapped(name) else cap)
+        for vehicle_id, cap in zip(ids, caps.tolist(), strict=True):
+            self._speed_caps.set_cap(vehicle_id, "set speed", inf if self._is_uncapped(vehicle_id) else cap)

@@ -1,6 +1,6 @@
-"""Traffic on a road with one lane: the same vehicles in the same order from the first step to the last.
+"""Traffic on a road with one lane, which has the same vehicles in the same order from the first step to the last.
 
-The inner loop works on lists of floats: between two steps of SUMO the caches are cold, and NumPy is slower.
+The inner loop uses lists of floats: after a step of SUMO, the processor's caches are cold, and NumPy is slower.
 """
 
 from collections.abc import Sequence
@@ -30,19 +30,20 @@ from unjam.worlds.world import DriverLog, ProgressCallback
 
 
 class OrderedTraffic(Traffic[OrderedRoad]):
-    """The SUMO environment of a road with one lane and always the same vehicles."""
+    """The world in SUMO of a road with one lane and always the same vehicles."""
 
     def _prepare(self) -> None:
-        scenario, simulation, road, vehicles = self.scenario, self._simulation, self.road, len(self.road.vehicle_ids)
+        scenario, simulation, road = self.scenario, self._simulation, self.road
+        vehicle_count = len(road.vehicle_ids)
         self.cav_ids, self.entered_count = road.cav_ids, len(road.cav_ids)
         self.is_scalar = self.options.accepts_floats and self.cav_count == 1
         self._collided_vehicles: set[str] = set()
-        self._cav_indices = [road.vehicle_ids.index(name) for name in road.cav_ids]
-        self._neighbors = ordered_road.loop_neighbors(np.array(self._cav_indices), vehicles)
-        self._scalar_neighbors = ordered_road.loop_neighbors(self._cav_indices[0], vehicles)
+        self._cav_indices = [road.vehicle_ids.index(cav_id) for cav_id in road.cav_ids]
+        self._neighbors = ordered_road.loop_neighbors(np.array(self._cav_indices), vehicle_count)
+        self._scalar_neighbors = ordered_road.loop_neighbors(self._cav_indices[0], vehicle_count)
         self._commands_humans = scenario.human_control == "commanded"
         self._idm_parameters = self._human_parameters(road.vehicle_ids)
-        tracked = range(vehicles) if self._commands_humans else np.concatenate(self._neighbors).tolist()
+        tracked = range(vehicle_count) if self._commands_humans else np.concatenate(self._neighbors).tolist()
         self._tracked_positions = {index: float(road.start_positions[index]) for index in tracked}
         self._set_human_vehicles(road.vehicle_ids)
         if self._commands_humans:
@@ -55,20 +56,20 @@ class OrderedTraffic(Traffic[OrderedRoad]):
 
     def _set_human_vehicles(self, ids: Sequence[str]) -> None:
         self._human_ids = ids
-        self._human_mask = [name in ids for name in self.road.vehicle_ids]
+        self._human_mask = [vehicle_id in ids for vehicle_id in self.road.vehicle_ids]
         self._human_indices = [index for index, is_human in enumerate(self._human_mask) if is_human]
         self._noise_rows: list[list[float]] = []
 
     def _reset_log(self) -> None:
-        start = self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
-        self._recorder = ordered_road.OrderedRoadRecorder(self.scenario, self.road, start, self._speeds)
+        positions = self.road.start_positions + np.array(self._simulation.distances(self.road.vehicle_ids))
+        self._recorder = ordered_road.OrderedRoadRecorder(self.scenario, self.road, positions, self._speeds)
         self._series = self._recorder.series
         self._fuel: list[Sequence[float]] = []
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
-        """Run the warm-up, then hand the CAVs to the driver unless they stay human (`is_controlled` false).
+        """Run the warm-up, and let the driver control the CAVs if `is_controlled`.
 
-        Return the CAVs' states in the last minute of the warm-up, (CAVs, moments), oldest first, or None.
+        Return the CAVs' states in the last minute of the warm-up, shape (CAVs, times), oldest first, or None.
         """
         scenario, road, history = self.scenario, self.road, None
         self._penetration_rate = road.provided_penetration_rate(self.options.measured_fields)
@@ -77,19 +78,18 @@ class OrderedTraffic(Traffic[OrderedRoad]):
         if scenario.warmup and scenario.remember_warmup:
             stride = scenario.steps_per_control_step
             count = round(ordered_road.MAX_RECALL_SECONDS / scenario.control_step)
-            moments = list(range(scenario.warmup - stride, -1, -stride))[:count]
-            series = self.speeds_and_positions()
-            history = ordered_road.loop_state(*series, self._neighbors, *self._loop_arguments)
-            history = history.select(np.s_[:, moments[::-1]])
+            steps = list(range(scenario.warmup - stride, -1, -stride))[:count]
+            history = ordered_road.loop_state(*self.speeds_and_positions(), self._neighbors, *self._loop_arguments)
+            history = history.select(np.s_[:, steps[::-1]])
         self.is_controlled = is_controlled
         if is_controlled:
             self._simulation.take_control(road.cav_ids, scenario.actuation, scenario.right_of_way)
-            self._set_human_vehicles([name for name in road.vehicle_ids if name not in road.cav_ids])
+            self._set_human_vehicles([vehicle_id for vehicle_id in road.vehicle_ids if vehicle_id not in road.cav_ids])
         self._reset_log()
         return history
 
     def exact_state(self) -> LocalState:
-        """Return the exact local state of the CAVs now."""
+        """Return the exact current local state of the CAVs."""
         if self._current_state is None:
             self._current_state = self._compute_state()
         return self._current_state
@@ -104,7 +104,7 @@ class OrderedTraffic(Traffic[OrderedRoad]):
         return state.as_read_only()
 
     def advance(self, command: Command | None) -> None:
-        """Simulate one control step; None: the CAVs stay human."""
+        """Simulate one control step; with the command None, the CAVs drive as human-driven vehicles."""
         self._simulation.check()
         accelerations = self.limited_accelerations(command) if self.is_controlled else []
         self._series["requested_accelerations"].fromlist(accelerations)
@@ -118,20 +118,24 @@ class OrderedTraffic(Traffic[OrderedRoad]):
 
     def _drive_cavs(self, accelerations: list[float]) -> None:
         speeds, positions, step = self._speeds, self._tracked_positions, self.scenario.simulation_step
-        loop, last, apply_acceleration = self.road.loop_length, len(speeds) - 1, self.filtered_acceleration
+        loop, last_index, filtered_acceleration = self.road.loop_length, len(speeds) - 1, self.filtered_acceleration
         safe, commanded = [], []
-        for name, index, acceleration in zip(self.cav_ids, self._cav_indices, accelerations, strict=True):
-            speed, leader = speeds[index], index + 1 if index < last else 0
+        for cav_id, index, acceleration in zip(self.cav_ids, self._cav_indices, accelerations, strict=True):
+            speed, leader = speeds[index], index + 1 if index < last_index else 0
             gap = gap_on_loop(positions[index], positions[leader], loop, VEHICLE_LENGTH)
-            allowed, actual = apply_acceleration(name, acceleration, FollowingState(speed, speeds[leader], gap))
-            safe.append(allowed)
+            state = FollowingState(speed, speeds[leader], gap)
+            safe_acceleration, actual = filtered_acceleration(cav_id, acceleration, state)
+            safe.append(safe_acceleration)
             commanded.append(next_speed(speed, actual, step))
         self._series["safe_accelerations"].fromlist(safe)
         self._series["commanded_speeds"].fromlist(commanded)
         self._simulation.command_speeds(self.cav_ids, commanded)
 
     def _simulate(self) -> None:
-        """Simulate one step, and add noise to human drivers' speeds; formulas of `kinematics` are inlined for speed."""
+        """Simulate one step, and add noise to the speeds of human-driven vehicles.
+
+        The formulas of `kinematics` are inlined, as function calls take time.
+        """
         simulation, positions, step = self._simulation, self._tracked_positions, self.scenario.simulation_step
         if self._commands_humans:
             self._command_humans()
@@ -158,7 +162,7 @@ class OrderedTraffic(Traffic[OrderedRoad]):
             raise EpisodeError(f"{format_count(present, 'vehicle')} on the road; expected: {expected}")
 
     def _command_humans(self) -> None:
-        """Command speeds of the IDM with noise, as Flow does it; on a crossing SUMO drives."""
+        """Command the IDM's speeds with noise, as Flow does, except on a crossing, where SUMO drives."""
         scenario, road, speeds, positions = self.scenario, self.road, self._speeds, self._tracked_positions
         noise = self._next_speed_noise() if scenario.noise > 0 else [0.0] * len(speeds)
         step, loop, crossings = scenario.simulation_step, road.loop_length, road.crossings
@@ -167,9 +171,9 @@ class OrderedTraffic(Traffic[OrderedRoad]):
         rows: list[tuple[int, float, float, float, float]] = []
         for index in self._human_indices:
             position = positions[index]
-            on_road = position % loop
-            for start, end in crossings:  # any() would take as long as the rest
-                if start <= on_road < end:
+            loop_position = position % loop
+            for start, end in crossings:  # any() would take as long as the other statements together
+                if start <= loop_position < end:
                     break
             else:
                 speed, leader = speeds[index], index + 1 if index + 1 < len(speeds) else 0
@@ -179,7 +183,7 @@ class OrderedTraffic(Traffic[OrderedRoad]):
                     commanded[index] = clamp_min(speed + acceleration * step + noise[index], 0.0)
                 else:
                     rows.append((index, acceleration, speed, speeds[leader], gap))
-        if rows:  # one call of the population's network for all vehicles
+        if rows:  # apply the population's network once to all vehicles
             _, *columns = (np.array(column, np.float64) for column in zip(*rows, strict=True))
             accelerations = apply_population(population, *columns).tolist()
             for (index, _, speed, *_), acceleration in zip(rows, accelerations, strict=True):
@@ -187,7 +191,7 @@ class OrderedTraffic(Traffic[OrderedRoad]):
         self._simulation.command_speeds(self._human_ids, commanded.values())
 
     def noise(self, episode_noise_size: int = 0) -> Array:
-        """Return standard normal noise of this control step, drawn once for the whole episode."""
+        """Return the standard normal noise of this control step, which is drawn for the whole episode at once."""
         if episode_noise_size:
             return super().noise(episode_noise_size)
         if self._exploration_noise is None:
@@ -209,13 +213,13 @@ class OrderedTraffic(Traffic[OrderedRoad]):
         return self._recorder.make_log(has_crashed=self.has_crashed, fuel=fuel, penetration_rate=rate)
 
     def speeds_and_positions(self) -> tuple[Floats, Floats]:
-        """Return those of the log in every simulation step, after checking positions against SUMO's odometer."""
+        """Return speeds and positions in every simulation step, after a check against SUMO's odometer."""
         speeds, positions = self._make_log().speeds_and_positions()
         self._check_odometer(self.road.vehicle_ids, self.road.start_positions, positions[:, -1])
         return speeds, positions
 
     def record_so_far(self) -> Episode:
-        """Return the record since the start without the driver's decisions; SUMO goes on."""
+        """Return the record so far without the decisions of the driver; SUMO continues."""
         return self._make_record(DriverLog())
 
     def _make_record(self, driver_log: DriverLog) -> Episode:
@@ -224,16 +228,16 @@ class OrderedTraffic(Traffic[OrderedRoad]):
         return self._make_log().episode(self.speeds_and_positions(), fields, driver_log, rows)
 
     def last_applied_acceleration(self) -> Array:
-        """Return the CAVs' accelerations in the last control step, as `RoadWorld.last_applied_acceleration`."""
+        """Return the CAVs' accelerations in the last control step, as `RoadWorld.last_applied_acceleration` does."""
         if self.is_scalar and self.scenario.steps_per_control_step == 1:
             return self._series["safe_accelerations"][-1]
         return self._recorder.last_applied_acceleration()
 
     @property
     def speeds(self) -> Sequence[float]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Speeds of all vehicles with a driver [m/s]."""
-        newest = self._series["speeds"][-len(self._speeds) :]  # NumPy reads it faster than lists
-        return newest[: self.road.driven_count]
+        """Current speeds of all vehicles with a driver [m/s]."""
+        speeds = self._series["speeds"][-len(self._speeds) :]  # an array, which NumPy reads faster than a list
+        return speeds[: self.road.driven_count]
 
     def scene(self) -> RoadScene:
         """Return the current state of the road for pictures."""
@@ -243,19 +247,19 @@ class OrderedTraffic(Traffic[OrderedRoad]):
 
 
 class RecordedTraffic(OrderedTraffic):
-    """The SUMO environment of a recorded road: the first vehicle on it replays a recording."""
+    """The world in SUMO of a recorded road, on which the first vehicle replays a recording."""
 
     def _prepare(self) -> None:
         *_, self._replayed_id = self.road.vehicle_ids
         self._upcoming_speeds = np.asarray(self.road.replayed_speeds)[:0:-1].tolist()
-        # Not as they enter: SUMO inserts no vehicle above its desired speed.
+        # Set speeds after the insertion: SUMO inserts no vehicle above its desired speed.
         ids = self.road.vehicle_ids
         self._simulation.replace_speeds(ids, [self.road.start_speed] * len(ids))
         self._simulation.replay(self._replayed_id, self.scenario.top_speed)
         super()._prepare()
 
     def _set_human_vehicles(self, ids: Sequence[str]) -> None:
-        super()._set_human_vehicles([name for name in ids if name != self._replayed_id])
+        super()._set_human_vehicles([vehicle_id for vehicle_id in ids if vehicle_id != self._replayed_id])
 
     @property
     def has_ended(self) -> bool:

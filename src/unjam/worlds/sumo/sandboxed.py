@@ -1,7 +1,7 @@
-"""SUMO in a sandboxed process, which may neither write nor listen: for networks from any source.
+"""SUMO in a sandboxed process, which may neither write files nor open ports, for networks from any source.
 
-Programs that drive on such a network call the functions of `Simulation` over a pipe: SUMO is sandboxed, while the
-driver stays in their own process. Started as `python -m unjam.worlds.sumo.sandboxed`.
+The process runs `python -m unjam.worlds.sumo.sandboxed`, and receives calls of the functions of `Simulation` over a
+pipe. The driver runs outside the sandbox, in the calling process.
 """
 
 import locale
@@ -26,15 +26,15 @@ from unjam.worlds.sumo.simulation import Simulation
 from unjam.worlds.sumo.transports import InUseError
 
 MAX_NETWORK_MEMORY = 16 * 2**30
-"""memory limit of a process that drives on a user's network [bytes]"""
+"""memory limit of a sandboxed process [bytes]"""
 MAX_ANSWER_SECONDS = 150.0
-"""time without an answer after which SUMO counts as lost [s]; reading a large network takes longest"""
+"""time without an answer after which SUMO counts as lost [s]; SUMO needs most time to read a large network"""
 
 
 def open_simulation(is_sandboxed: bool) -> Simulation:
-    """Open a sandboxed simulation or one in this process.
+    """Open a sandboxed simulation, or one in this process.
 
-    It is in its own, with a warning, if libsumo holds one here, or could not read numbers.
+    If libsumo already runs a simulation here, or could not read numbers, warn and open a sandboxed one.
     """
     if not is_sandboxed and (point := locale.localeconv()["decimal_point"]) != ".":
         warnings.warn(
@@ -64,16 +64,16 @@ def enter_sandbox() -> None:
 
 @cache
 def _process_starter(process: int) -> ThreadPoolExecutor:
-    """Return the thread that starts all child processes: they end with the thread that has started them."""
+    """Return the thread that starts all child processes of a process: they end with the thread that started them."""
     return ThreadPoolExecutor(1)
 
 
 _process_starter_lock = Lock()
-"""prevents a second such thread: its processes would end with its executor"""
+"""prevents a second such thread, whose processes would end with its executor"""
 
 
 class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
-    """A `Simulation` in a sandboxed process, which carries out all calls."""
+    """Proxy of a `Simulation` in a sandboxed process, to which it sends all calls."""
 
     is_sandboxed = True
 
@@ -109,9 +109,10 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
         check_owner(self._owner, "simulation: it")
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        # Names and numbers come in many kinds of sequences.
+        # Arguments may be sequences or iterators of any kind; messages have lists.
         lists = [
-            list(each) if hasattr(each, "__iter__") and not isinstance(each, str | dict) else each for each in arguments
+            list(value) if hasattr(value, "__iter__") and not isinstance(value, str | dict) else value
+            for value in arguments
         ]
         try:
             messages.write_message(self._process.stdin, {"call": name, "arguments": lists})
@@ -120,7 +121,7 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
             content, arrays = messages.read_message(self._process.stdout)
         except (BrokenPipeError, EOFError):
             raise LostWorkerError(f"SUMO was lost: its process ended with code {self._process.wait()}") from None
-        except BaseException:  # silence, or an interrupt: the next call would take this answer for its own
+        except BaseException:  # a timeout or an interrupt: the next call would read the answer to this one
             self._process.kill()
             self._process.wait()
             raise
@@ -134,7 +135,7 @@ class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):
             return
         self._process.kill()
         for pipe in (self._process.stdin, self._process.stdout):
-            with suppress(OSError, ValueError):  # an unsent message; at the end of Python it may be closed
+            with suppress(OSError, ValueError):  # it has an unsent message, or Python has closed it at its end
                 assert pipe is not None
                 pipe.close()
         self._process.wait()
@@ -152,25 +153,26 @@ def _return_type(name: str) -> Any:
 
 def _answer_request(simulation: Simulation, output: IO[bytes], request: dict[str, Any], arrays: Arrays) -> None:
     try:
-        answer, arrays = pack(_execute(simulation, request["call"], request["arguments"]))
+        answer, arrays = pack(_call_function(simulation, request["call"], request["arguments"]))
         messages.write_message(output, {"answer": answer}, arrays)
     except Exception as error:
         unjam_error = as_unjam_error(error)
         messages.write_message(output, {"error": [type(unjam_error).__name__, str(unjam_error)]})
 
 
-def _execute(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
+def _call_function(simulation: Simulation, name: str, arguments: list[Any]) -> Any:
+    """Call a function of the simulation; `load` gets its inputs as a dictionary."""
     if name == "load":
-        fields, *others = arguments
+        fields, *step_and_seed = arguments
         existing = {option: tuple(map(Path, paths)) for option, paths in fields["existing_files"].items()}
         copied = {Path(path): tuple(map(Path, sources)) for path, sources in fields["copied_files"].items()}
         fields |= {"options": tuple(fields["options"]), "existing_files": existing, "copied_files": copied}
-        arguments = [SumoInputs(**fields), *others]
+        arguments = [SumoInputs(**fields), *step_and_seed]
     return getattr(simulation, name)(*arguments)
 
 
 if __name__ == "__main__":
     answer_pipe = messages.open_answer_pipe()
     enter_sandbox()
-    with Simulation(owns_stdout=True) as own_simulation:
-        messages.answer_requests(partial(_answer_request, own_simulation, answer_pipe))
+    with Simulation(owns_stdout=True) as sandboxed_simulation:
+        messages.answer_requests(partial(_answer_request, sandboxed_simulation, answer_pipe))

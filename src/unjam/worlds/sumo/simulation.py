@@ -1,4 +1,4 @@
-"""A SUMO simulation: start, read, command, step; and how vehicles carry out commands."""
+"""A SUMO simulation: load inputs, read and command vehicles, and simulate steps."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -27,17 +27,17 @@ from unjam.worlds.sumo.sublane import INTERNAL_EDGE_PREFIX, find_lateral_neighbo
 from unjam.worlds.sumo.transports import Libsumo, NeighborStates, Traci, Transport, sumo_function
 
 MIN_CONTACT_OVERLAP = 0.01
-"""overlap that is not a rounding error [m]"""
+"""smallest overlap that is not a rounding error [m]"""
 SPEED_MODES = {"shielded": 31, "raw": 30, "flow": 25, "cruise": 31}
-"""SUMO's speed mode for each kind of actuation: bit 0 is the check for a safe speed"""
+"""SUMO's speed mode for each kind of actuation; with bit 0, SUMO keeps the speed safe"""
 NO_SPEED_CHECKS = 32
-"""SUMO's speed mode without any check, not even of the right of way"""
+"""SUMO's speed mode in which a vehicle obeys every command, and also ignores the right of way"""
 SAFE_SPEED_BIT = 1
-"""the bit that stays without right of way: surprised vehicles still stop"""
+"""the only bit that is kept if vehicles ignore the right of way: SUMO still prevents collisions"""
 ACCELERATION_LIMIT_BITS = 2 | 4
-"""bits by which vehicles keep the acceleration and deceleration limits of their type"""
+"""bits of a speed mode by which vehicles keep the acceleration and deceleration limits of their type"""
 _consume = deque(maxlen=0).extend
-"""exhausts an iterator in C: a loop would take as long as the calls"""
+"""exhausts an iterator in C; a Python loop would take as long as the calls themselves"""
 
 
 class VehicleLimits(NamedTuple):
@@ -56,26 +56,28 @@ class InductionLoop(NamedTuple):
 
 
 class DetectorPassage(NamedTuple):
-    """A vehicle that drove over a loop."""
+    """A passage of a vehicle over an induction loop."""
 
     loop: int
+    """index of the loop"""
     vehicle: str
     time: float
     """time at which its front bumper reached the loop [s]"""
     speed: float
-    """mean speed above the loop [m/s]; NaN if it changed lanes before its rear had passed"""
+    """mean speed above the loop [m/s]; NaN if the vehicle changed lanes before its rear had passed"""
 
 
-def loop_name(number: int) -> str:
-    """Return the name of an induction loop in SUMO."""
-    return f"unjam_loop_{number}"
+def loop_name(index: int) -> str:
+    """Return the id that an induction loop has in SUMO."""
+    return f"unjam_loop_{index}"
 
 
 class Simulation(AbstractContextManager["Simulation"]):
     """One SUMO simulation, loaded again for each episode.
 
-    libsumo silently replaces the simulation of a process by a second one. So this class refuses to open another, and
-    detects if other code starts, steps or closes one meanwhile. Over TraCI each has its own process.
+    libsumo runs one simulation per process, and silently replaces it when another is started. This class therefore
+    refuses to open a second one, and detects whether other code has started, stepped or closed a simulation. Over
+    TraCI, each simulation has its own process.
     """
 
     is_sandboxed = False
@@ -83,8 +85,8 @@ class Simulation(AbstractContextManager["Simulation"]):
     def __init__(
         self, transport: Transport = "libsumo", gui_options: Sequence[str] = (), owns_stdout: bool = False
     ) -> None:
-        """Open a simulation; raise `InUseError` if libsumo already runs one. `owns_stdout`: nothing else is printed."""
-        if "," in (folder := gettempdir()):  # separates the names of SUMO's files
+        """Open a simulation; raise `InUseError` if libsumo already runs one. `owns_stdout`: only SUMO prints here."""
+        if "," in (folder := gettempdir()):  # SUMO reads a comma as the end of a file name
             raise invalid_value("TMPDIR", folder, "a folder without , in its name")
         self.transport = transport
         self._gui_options = gui_options
@@ -97,52 +99,57 @@ class Simulation(AbstractContextManager["Simulation"]):
         files = (folder / name for name in ("error.log", "trips.xml", "traffic.rou.xml"))
         self._error_log, self._trip_file, self._traffic_file = files
         self._stdout_log = folder / "printed.log" if owns_stdout else None
-        """SUMO's messages before it has a log"""
+        """file for the messages that SUMO prints before it opens its log"""
         self._harmless_copies: dict[tuple[Path, int], tuple[list[tuple[int, int]], Path]] = {}
-        """harmless copies of users' files, with the stamps of the files from which they are made"""
+        """stamps of the sources, and the harmless copy, of a user's file with a number of calibrated drivers"""
         self.episode_lock = Lock()
         if transport == "libsumo":
-            self._bind()
+            self._bind_functions()
 
-    def _bind(self) -> None:
+    def _bind_functions(self) -> None:
+        """Look up the functions of libsumo or TraCI, which takes time, only once."""
         self._sumo: Any = self._library.functions
-        call = partial(sumo_function, self._sumo)
-        self._get_speed, self._get_lane = call("vehicle", "getSpeed"), call("vehicle", "getLaneID")
-        self._get_lane_position = call("vehicle", "getLanePosition")
-        self._get_allowed_speed = call("vehicle", "getAllowedSpeed")
-        self._set_speed, self._set_previous_speed = call("vehicle", "setSpeed"), call("vehicle", "setPreviousSpeed")
+        get_function = partial(sumo_function, self._sumo)
+        self._get_speed, self._get_lane = get_function("vehicle", "getSpeed"), get_function("vehicle", "getLaneID")
+        self._get_lane_position = get_function("vehicle", "getLanePosition")
+        self._get_allowed_speed = get_function("vehicle", "getAllowedSpeed")
+        self._set_speed, self._set_previous_speed = (
+            get_function("vehicle", "setSpeed"),
+            get_function("vehicle", "setPreviousSpeed"),
+        )
 
-        def call_for_each(name: str) -> Callable[[Sequence[str]], list[float]]:
-            function = call("vehicle", name)
+        def make_list_reader(name: str) -> Callable[[Sequence[str]], list[float]]:
+            function = get_function("vehicle", name)
             return lambda ids: list(map(function, ids))
 
-        self.speeds = call_for_each("getSpeed")
-        self.lane_offsets = call_for_each("getLanePosition")
+        self.speeds = make_list_reader("getSpeed")
+        self.lane_offsets = make_list_reader("getLanePosition")
         """positions of vehicles along their lanes [m]"""
-        self.distances = call_for_each("getDistance")
+        self.distances = make_list_reader("getDistance")
         """distances that vehicles have driven since their entry [m]"""
-        self.fuel = call_for_each("getFuelConsumption")
-        """fuel rates of vehicles in the last step [mg/s], by their emission class"""
-        self.now: Callable[[], float] = call("simulation", "getTime")
-        self.max_speed: Callable[[str], float] = call("vehicle", "getMaxSpeed")
-        """maximum speed of a vehicle, whatever the road allows [m/s]"""
-        self.set_max_speed: Callable[[str, float], object] = call("vehicle", "setMaxSpeed")
-        self.set_time_gap: Callable[[str, float], object] = call("vehicle", "setTau")
-        self.vehicles_on_lane: Callable[[str], Sequence[str]] = call("lane", "getLastStepVehicleIDs")
-        self.vehicle_count: Callable[[], int] = call("vehicle", "getIDCount")
-        self.departed_vehicles: Callable[[], Sequence[str]] = call("simulation", "getDepartedIDList")
+        self.fuel = make_list_reader("getFuelConsumption")
+        """fuel rates of vehicles in the last step [mg/s], by SUMO's model of their emission class"""
+        self.time: Callable[[], float] = get_function("simulation", "getTime")
+        self.max_speed: Callable[[str], float] = get_function("vehicle", "getMaxSpeed")
+        """maximum speed of a vehicle itself, on any road [m/s]"""
+        self.set_max_speed: Callable[[str, float], object] = get_function("vehicle", "setMaxSpeed")
+        self.set_time_gap: Callable[[str, float], object] = get_function("vehicle", "setTau")
+        self.vehicles_on_lane: Callable[[str], Sequence[str]] = get_function("lane", "getLastStepVehicleIDs")
+        self.vehicle_count: Callable[[], int] = get_function("vehicle", "getIDCount")
+        self.departed_vehicles: Callable[[], Sequence[str]] = get_function("simulation", "getDepartedIDList")
         """vehicles that entered the road in the last step"""
-        self.arrived_vehicles: Callable[[], Sequence[str]] = call("simulation", "getArrivedIDList")
+        self.arrived_vehicles: Callable[[], Sequence[str]] = get_function("simulation", "getArrivedIDList")
         """vehicles that left the road at the end of their route in the last step"""
-        self.teleporting_vehicles: Callable[[], Sequence[str]] = call("simulation", "getStartingTeleportIDList")
-        """vehicles that SUMO teleported in the last step; below: those that it reinserted"""
-        self.reinserted_vehicles: Callable[[], Sequence[str]] = call("simulation", "getEndingTeleportIDList")
-        self.colliding_vehicles: Callable[[], Sequence[str]] = call("simulation", "getCollidingVehiclesIDList")
-        self._vehicles_on_loop = call("inductionloop", "getVehicleData")
-        self.pending_vehicles: Callable[[], Sequence[str]] = call("simulation", "getPendingVehicles")
+        self.teleporting_vehicles: Callable[[], Sequence[str]] = get_function("simulation", "getStartingTeleportIDList")
+        """vehicles that SUMO started to teleport in the last step"""
+        self.reinserted_vehicles: Callable[[], Sequence[str]] = get_function("simulation", "getEndingTeleportIDList")
+        """teleported vehicles that SUMO reinserted in the last step"""
+        self.colliding_vehicles: Callable[[], Sequence[str]] = get_function("simulation", "getCollidingVehiclesIDList")
+        self._vehicles_on_loop = get_function("inductionloop", "getVehicleData")
+        self.pending_vehicles: Callable[[], Sequence[str]] = get_function("simulation", "getPendingVehicles")
 
     def has_refused(self) -> bool:
-        """Return whether a step of this episode has failed: SUMO refuses later content of a file."""
+        """Return whether a step has failed in this episode, as it does at an error in a later part of a file."""
         return self._library.has_refused
 
     def load(self, inputs: SumoInputs, step: float, seed: int) -> None:
@@ -156,10 +163,10 @@ class Simulation(AbstractContextManager["Simulation"]):
         existing = inputs.existing_files.items()
         paths = {option: [self._readable_path(path, inputs) for path in files] for option, files in existing}
         paths.setdefault(inputs.traffic_option, []).append(str(self._traffic_file))
-        options = [f"{option}={','.join(each)}" for option, each in paths.items() if each]
+        options = [f"{option}={','.join(files)}" for option, files in paths.items() if files]
         options += [*inputs.options, "--step-length", str(step), "--seed", str(seed)]
         options += ["--no-step-log", "true", "--duration-log.disable", "true"]
-        # Warnings only go to the log, which keeps one example and the number of each kind.
+        # SUMO writes warnings only to the log: one example of each kind, and their number.
         options += ["--no-warnings", "true", "--error-log", str(self._error_log)]
         options += ["--aggregate-warnings", MAX_EXAMPLES_OPTION]
         options += trip_options(self._trip_file) if inputs.records_trips else []
@@ -171,42 +178,42 @@ class Simulation(AbstractContextManager["Simulation"]):
                     program = sumo_program("sumo-gui" if self.transport == "gui" else "sumo")
                     self._library.start([program, *options, *self._gui_options], self._error_log)
                     if self.transport != "libsumo":  # over TraCI each start makes another connection
-                        self._bind()
+                        self._bind_functions()
                 self._has_sublanes = float(self._sumo.simulation.getOption("lateral-resolution")) > 0.0
                 self.step()  # the first step inserts the vehicles and moves none
         except Exception as error:
             self._library.end()  # then SUMO's message is in its log, and the next episode can start
             logs = [self._error_log, *([self._stdout_log] if self._stdout_log else [])]
             message = next(filter(None, map(last_error_message, logs)), "")
-            kind = SumoInputError if message or self.transport != "gui" else EpisodeError  # a window may be missing
-            raise kind(f"SUMO cannot start: {message or ' '.join(str(error).split())}") from error
+            error_class = SumoInputError if message or self.transport != "gui" else EpisodeError  # no screen
+            raise error_class(f"SUMO cannot start: {message or ' '.join(str(error).split())}") from error
 
     def _readable_path(self, path: Path, inputs: SumoInputs) -> str:
-        """Return the file that SUMO reads: the given one, or a harmless copy of its content."""
+        """Return the path that SUMO reads: of the file itself, or of its harmless copy, which is written if needed."""
         if path not in inputs.copied_files:
             return str(path)
         new_copy = Path(self._folder.name) / f"{len(self._harmless_copies)}.xml"
         key = path, inputs.driver_count
-        before, copy = self._harmless_copies.get(key, ([], new_copy))
-        if (stamps := list(map(file_stamp, inputs.copied_files[path]))) != before:
+        known_stamps, copy = self._harmless_copies.get(key, ([], new_copy))
+        if (stamps := list(map(file_stamp, inputs.copied_files[path]))) != known_stamps:
             self._harmless_copies[key] = [], copy
             write_harmless_copy(path, copy, inputs.driver_count)
             self._harmless_copies[key] = stamps, copy
         return str(copy)
 
     def allowed_speeds(self, ids: Sequence[str]) -> list[float]:
-        """Return the speeds that the road allows to vehicles [m/s]; NaN for one that is parked off the road."""
+        """Return the speeds that the road allows to vehicles [m/s]; NaN for vehicles that are parked off the road."""
         return [speed if speed >= 0.0 else nan for speed in map(self._get_allowed_speed, ids)]
 
     def uncapped_speeds(self, ids: Sequence[str]) -> list[float]:
-        """Return lane limit times speed factor of vehicles [m/s], whatever their maximum speed; NaN off the road."""
+        """Return the speed limits of the vehicles' lanes times their speed factors [m/s]; NaN off the road."""
         limit, factor, lanes = self._sumo.lane.getMaxSpeed, self._sumo.vehicle.getSpeedFactor, map(self._get_lane, ids)
-        return [limit(lane) * factor(name) if lane else nan for name, lane in zip(ids, lanes, strict=True)]
+        return [limit(lane) * factor(vehicle) if lane else nan for vehicle, lane in zip(ids, lanes, strict=True)]
 
     def poses(self, ids: Sequence[str]) -> Floats:
-        """Return rows (x, y, heading) of front bumpers: [m], and [rad] against the x axis."""
+        """Return rows (x, y, heading) of front bumpers [m, m, rad]; the heading is relative to the x axis."""
         vehicle = self._sumo.vehicle
-        rows = [(*vehicle.getPosition(name)[:2], vehicle.getAngle(name)) for name in ids]
+        rows = [(*vehicle.getPosition(vehicle_id)[:2], vehicle.getAngle(vehicle_id)) for vehicle_id in ids]
         poses = np.array(rows, np.float64).reshape(-1, 3)
         poses[:, 2] = np.radians(90.0 - poses[:, 2])  # SUMO's angles are clockwise from north, in degrees
         return poses
@@ -215,19 +222,19 @@ class Simulation(AbstractContextManager["Simulation"]):
         """Return whether vehicles that wait for no passenger or other vehicle are on the road or will enter."""
         return self._sumo.simulation.getMinExpectedNumber() > 0
 
-    def route_of(self, name: str) -> tuple[str, ...]:
+    def route_of(self, vehicle_id: str) -> tuple[str, ...]:
         """Return the edges of a vehicle's route."""
-        return tuple(self._sumo.vehicle.getRoute(name))
+        return tuple(self._sumo.vehicle.getRoute(vehicle_id))
 
     def lanes(self) -> list[NetworkLane]:
-        """Return all lanes of the network except those of junctions."""
+        """Return all lanes of the network except those within junctions."""
         lane = self._sumo.lane
         names = [name for name in lane.getIDList() if not name.startswith(":")]
         links = [lane.getLinks(name) for name in names]
-        successors = (tuple(link[0] for link in each) for each in links)
-        has_stop_line = (any(link[5] not in UNCONTROLLED_LINK_STATES for link in each) for each in links)
-        values = map(lane.getEdgeID, names), map(lane.getLength, names), map(lane.getMaxSpeed, names)
-        return list(map(NetworkLane, names, *values, successors, has_stop_line))
+        successors = (tuple(link[0] for link in lane_links) for lane_links in links)
+        has_stop_line = (any(link[5] not in UNCONTROLLED_LINK_STATES for link in lane_links) for lane_links in links)
+        properties = map(lane.getEdgeID, names), map(lane.getLength, names), map(lane.getMaxSpeed, names)
+        return list(map(NetworkLane, names, *properties, successors, has_stop_line))
 
     def lane_positions(self, ids: Sequence[str]) -> list[tuple[str, float]]:
         """Return the vehicles' lanes, and positions along them [m]."""
@@ -236,108 +243,114 @@ class Simulation(AbstractContextManager["Simulation"]):
     def remaining_routes(self, ids: Sequence[str]) -> list[tuple[str, ...]]:
         """Return the remaining edges of the vehicles' routes, the current edge first."""
         vehicle = self._sumo.vehicle
-        return [tuple(vehicle.getRoute(name)[vehicle.getRouteIndex(name) :]) for name in ids]
+        return [tuple(vehicle.getRoute(vehicle_id)[vehicle.getRouteIndex(vehicle_id) :]) for vehicle_id in ids]
 
     def desired_speeds(self, ids: Sequence[str]) -> list[tuple[float, float]]:
-        """Return the vehicles' desired speeds over the speed limit, and their maximum speeds [m/s]."""
+        """Return the vehicles' speed factors (desired speed divided by speed limit) and maximum speeds [m/s]."""
         return list(zip(map(self._sumo.vehicle.getSpeedFactor, ids), map(self.max_speed, ids), strict=True))
 
     def neighbors(self, ids: Sequence[str], max_distance: float) -> list[NeighborStates]:
-        """Return the vehicles' neighbors as SUMO sees them; beyond `max_distance` [m], this gap and their own speed."""
-        return [self._neighbors_of(name, max_distance) for name in ids]
+        """Return leaders and followers of vehicles; an absent one has the gap `max_distance` [m] and their speed."""
+        return [self._neighbor_states(vehicle_id, max_distance) for vehicle_id in ids]
 
-    def _neighbors_of(self, name: str, max_distance: float) -> NeighborStates:
-        vehicle, speed = self._sumo.vehicle, self._get_speed(name)
+    def _neighbor_states(self, vehicle_id: str, max_distance: float) -> NeighborStates:
+        vehicle, speed = self._sumo.vehicle, self._get_speed(vehicle_id)
         if self._has_sublanes:
-            leader, leader_gap, follower, follower_gap = find_lateral_neighbors(self._sumo, name, max_distance)
+            leader, leader_gap, follower, follower_gap = find_lateral_neighbors(self._sumo, vehicle_id, max_distance)
         else:
-            leader, leader_gap = vehicle.getLeader(name, max_distance) or ("", 0.0)
-            follower, follower_gap = vehicle.getFollower(name, max_distance)
-            # SUMO's gap does not include the minimum gap of the vehicle behind.
-            leader_gap += vehicle.getMinGap(name)
+            leader, leader_gap = vehicle.getLeader(vehicle_id, max_distance) or ("", 0.0)
+            follower, follower_gap = vehicle.getFollower(vehicle_id, max_distance)
+            # SUMO subtracts the minimum gap of the vehicle behind from a gap.
+            leader_gap += vehicle.getMinGap(vehicle_id)
             follower_gap += vehicle.getMinGap(follower) if follower else 0.0
-        values: list[float] = []
-        for other, net_gap in ((leader, leader_gap), (follower, follower_gap)):
-            gap = net_gap if other else max_distance
-            values += [self._get_speed(other) if gap < max_distance else speed, min(max(gap, 0.0), max_distance)]
-        return NeighborStates(leader if values[1] < max_distance else "", *values)
+        speeds_and_gaps: list[float] = []
+        for neighbor, net_gap in ((leader, leader_gap), (follower, follower_gap)):
+            gap = net_gap if neighbor else max_distance
+            neighbor_speed = self._get_speed(neighbor) if gap < max_distance else speed
+            speeds_and_gaps += [neighbor_speed, min(max(gap, 0.0), max_distance)]
+        return NeighborStates(leader if speeds_and_gaps[1] < max_distance else "", *speeds_and_gaps)
 
     def vehicles_on_opposite_lanes(self, ids: Sequence[str]) -> list[str]:
-        """Return the vehicles that drive on a lane of the opposite direction, to overtake."""
+        """Return those of the vehicles that overtake on a lane of the opposite direction."""
         edges = [self._sumo.lane.getEdgeID(lane) if lane else "" for lane in map(self._get_lane, ids)]
         rows = zip(ids, edges, self.remaining_routes(ids), strict=True)
-        return [name for name, edge, route in rows if edge not in ("", *route[:1]) and edge[0] != INTERNAL_EDGE_PREFIX]
+        return [
+            vehicle for vehicle, edge, route in rows if edge not in ("", *route[:1]) and edge[0] != INTERNAL_EDGE_PREFIX
+        ]
 
-    def is_in_contact(self, name: str, leader: str) -> bool:
-        """Return whether a vehicle overlaps with the leader on its lane, longitudinally and laterally."""
+    def is_in_contact(self, vehicle_id: str, leader: str) -> bool:
+        """Return whether a vehicle overlaps with its leader on the same lane, longitudinally and laterally."""
         vehicle = self._sumo.vehicle
-        gap = self._get_lane_position(leader) - vehicle.getLength(leader) - self._get_lane_position(name)
-        lateral = vehicle.getLateralLanePosition(name) - vehicle.getLateralLanePosition(leader)
-        overlaps = 2.0 * abs(lateral) < vehicle.getWidth(name) + vehicle.getWidth(leader)
-        return self._get_lane(name) == self._get_lane(leader) and gap < -MIN_CONTACT_OVERLAP and overlaps
+        gap = self._get_lane_position(leader) - vehicle.getLength(leader) - self._get_lane_position(vehicle_id)
+        offset = vehicle.getLateralLanePosition(vehicle_id) - vehicle.getLateralLanePosition(leader)
+        overlaps = 2.0 * abs(offset) < vehicle.getWidth(vehicle_id) + vehicle.getWidth(leader)
+        return self._get_lane(vehicle_id) == self._get_lane(leader) and gap < -MIN_CONTACT_OVERLAP and overlaps
 
     def teleport_count(self) -> int:
-        """Return SUMO's number of teleports since its start, without intended jumps from stop to stop."""
+        """Return SUMO's number of teleports since its start, without scheduled jumps between stops."""
         return int(self._sumo.simulation.getParameter("", "stats.teleports.total"))
 
     def jam_teleport_count(self) -> int:
-        """Return SUMO's number of teleports since its start that are no consequence of a collision."""
+        """Return SUMO's number of teleports since its start except those after collisions."""
         get = self._sumo.simulation.getParameter
         return sum(int(get("", f"stats.teleports.{reason}")) for reason in ("jam", "yield", "wrongLane"))
 
     def command_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
-        """Command the vehicles' speeds after the next step [m/s]: plain floats."""
+        """Command the speeds that vehicles have after the next step [m/s]; `speeds` are Python floats."""
         _consume(starmap(self._set_speed, zip(ids, speeds, strict=True)))
 
     def replace_speeds(self, ids: Iterable[str], speeds: Iterable[float]) -> None:
-        """Replace the vehicles' current speeds [m/s], plain floats: this adds noise."""
+        """Replace the vehicles' current speeds [m/s], to add noise; `speeds` are Python floats."""
         _consume(map(self._set_previous_speed, ids, speeds))
 
     def command_humans(self, ids: Iterable[str], right_of_way: bool, has_acceleration_limits: bool) -> None:
-        """Set which of SUMO's checks apply to commanded human-driven vehicles; their speed is always safe."""
+        """Set which limits SUMO applies to commanded human-driven vehicles; it always keeps their speeds safe."""
         mode = _speed_mode("flow", right_of_way) | (ACCELERATION_LIMIT_BITS if has_acceleration_limits else 0)
-        for name in ids:
-            self._sumo.vehicle.setSpeedMode(name, mode)
+        for vehicle_id in ids:
+            self._sumo.vehicle.setSpeedMode(vehicle_id, mode)
 
-    def replay(self, name: str, max_speed: float) -> None:
+    def replay(self, vehicle_id: str, max_speed: float) -> None:
         """Let a vehicle obey `command_speeds` without any check, at up to `max_speed` [m/s]."""
-        self._sumo.vehicle.setSpeedMode(name, NO_SPEED_CHECKS)
-        self.set_max_speed(name, max_speed)
+        self._sumo.vehicle.setSpeedMode(vehicle_id, NO_SPEED_CHECKS)
+        self.set_max_speed(vehicle_id, max_speed)
 
-    def change_type(self, name: str, kind: str, is_modified_later: bool = False) -> None:
-        """Change the type of a vehicle but not its speed factor, now and when its properties are first modified."""
+    def change_type(self, vehicle_id: str, type_id: str, is_modified_later: bool = False) -> None:
+        """Change the type of a vehicle but not its speed factor.
+
+        `is_modified_later`: keep the factor also when one of the vehicle's properties is set for the first time.
+        """
         vehicle = self._sumo.vehicle
-        factor = vehicle.getSpeedFactor(name)
-        vehicle.setType(name, kind)
+        factor = vehicle.getSpeedFactor(vehicle_id)
+        vehicle.setType(vehicle_id, type_id)
         if is_modified_later:
-            vehicle.setMaxSpeed(name, vehicle.getMaxSpeed(name))
-        vehicle.setSpeedFactor(name, factor)
+            vehicle.setMaxSpeed(vehicle_id, vehicle.getMaxSpeed(vehicle_id))
+        vehicle.setSpeedFactor(vehicle_id, factor)
 
-    def type_of(self, name: str) -> str:
+    def type_of(self, vehicle_id: str) -> str:
         """Return a vehicle's type, without the suffix that SUMO adds when properties of one vehicle change."""
-        return self._sumo.vehicle.getTypeID(name).removesuffix(f"@{name}")
+        return self._sumo.vehicle.getTypeID(vehicle_id).removesuffix(f"@{vehicle_id}")
 
-    def type_limits(self, kind: str) -> VehicleLimits:
+    def type_limits(self, type_id: str) -> VehicleLimits:
         """Return the acceleration limits of a vehicle type."""
         types = self._sumo.vehicletype
-        return VehicleLimits(types.getAccel(kind), types.getDecel(kind), types.getEmergencyDecel(kind))
+        return VehicleLimits(types.getAccel(type_id), types.getDecel(type_id), types.getEmergencyDecel(type_id))
 
-    def limit_braking(self, kind: str, max_braking: float) -> None:
+    def limit_braking(self, type_id: str, max_braking: float) -> None:
         """Limit the braking of a vehicle type [m/s2]."""
         types = self._sumo.vehicletype
         for set_limit in (types.setDecel, types.setEmergencyDecel, types.setApparentDecel):
-            set_limit(kind, max_braking)
+            set_limit(type_id, max_braking)
 
-    def stop_at(self, name: str, edge: str, position: float) -> None:
-        """Let a vehicle stop on the first lane of an edge [m], until `end_stop`."""
-        self._sumo.vehicle.setStop(name, edge, pos=position, laneIndex=0)
+    def stop_at(self, vehicle_id: str, edge: str, position: float) -> None:
+        """Let a vehicle stop at a position [m] on the first lane of an edge, until `end_stop`."""
+        self._sumo.vehicle.setStop(vehicle_id, edge, pos=position, laneIndex=0)
 
-    def end_stop(self, name: str, edge: str, position: float) -> None:
-        """Let a vehicle drive on, whether it stands at its stop or has not yet reached it."""
-        if self._sumo.vehicle.isStopped(name):
-            self._sumo.vehicle.resume(name)
+    def end_stop(self, vehicle_id: str, edge: str, position: float) -> None:
+        """End or cancel the stop of a vehicle, which stands there or has not yet reached it."""
+        if self._sumo.vehicle.isStopped(vehicle_id):
+            self._sumo.vehicle.resume(vehicle_id)
         else:
-            self._sumo.vehicle.setStop(name, edge, pos=position, laneIndex=0, duration=0.0)
+            self._sumo.vehicle.setStop(vehicle_id, edge, pos=position, laneIndex=0, duration=0.0)
 
     def take_control(
         self,
@@ -347,34 +360,34 @@ class Simulation(AbstractContextManager["Simulation"]):
         type_template: str = "cav",
         parameters: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        """Make vehicles CAVs, which obey `command_speeds`, with or without right of way.
+        """Make vehicles CAVs, which obey `command_speeds`; `right_of_way`: SUMO makes them yield.
 
-        In `type_template`, `{}` stands for the old type; `parameters` are further ones, by SUMO's names.
+        Their type becomes `type_template`, in which `{}` stands for the old type. `parameters` are set by SUMO's names.
         """
-        for name in ids:
-            self.change_type(name, type_template.format(self.type_of(name)), actuation == "cruise")
-            self._sumo.vehicle.setSpeedMode(name, _speed_mode(actuation, right_of_way))
+        for vehicle_id in ids:
+            self.change_type(vehicle_id, type_template.format(self.type_of(vehicle_id)), actuation == "cruise")
+            self._sumo.vehicle.setSpeedMode(vehicle_id, _speed_mode(actuation, right_of_way))
             for key, value in parameters.items():
-                self._sumo.vehicle.setParameter(name, key, value)
+                self._sumo.vehicle.setParameter(vehicle_id, key, value)
 
     def passages(self, loops: Sequence[InductionLoop], steps: int) -> list[DetectorPassage]:
-        """Simulate steps, until no vehicle is expected, and return the passages over these loops.
+        """Simulate up to `steps` steps, until no vehicle is expected, and return the passages over these loops.
 
         A vehicle that leaves a loop by changing lanes counts without a speed, as with SUMO's own detectors.
         """
-        found: dict[tuple[int, str, float], DetectorPassage] = {}
+        passages: dict[tuple[int, str, float], DetectorPassage] = {}
         for _ in range(steps):
             self.step()
-            for number, loop in enumerate(loops):
-                for vehicle, length, entry_time, exit_time, _ in self._vehicles_on_loop(loop_name(number)):
-                    key = number, vehicle, entry_time
-                    if exit_time > entry_time and key not in found:  # -1 while the vehicle is on the loop
+            for index, loop in enumerate(loops):
+                for vehicle, length, entry_time, exit_time, _ in self._vehicles_on_loop(loop_name(index)):
+                    key = index, vehicle, entry_time
+                    if exit_time > entry_time and key not in passages:  # the exit is -1 until the vehicle has left
                         has_passed = self._has_passed(vehicle, length, *loop)
                         speed = length / (exit_time - entry_time) if has_passed else nan
-                        found[key] = DetectorPassage(*key, speed)
+                        passages[key] = DetectorPassage(*key, speed)
             if not self.expects_vehicles():
                 break
-        return list(found.values())
+        return list(passages.values())
 
     def _has_passed(self, vehicle: str, length: float, loop_lane: str, loop_position: float) -> bool:
         """Return whether a vehicle that has just left a loop passed it completely, without a lane change."""
@@ -387,8 +400,8 @@ class Simulation(AbstractContextManager["Simulation"]):
         return not is_same_edge or position - length >= loop_position
 
     def end_with_trips(self, vehicle_classes: dict[str, str], warmup_end: float, removes_jammed: bool) -> Trips:
-        """End the episode, so that SUMO writes its last records, and return the trips as `read_trips` does."""
-        end = self.now()
+        """End the episode, so that SUMO completes its trip records, and return the trips as `read_trips` does."""
+        end = self.time()
         self._library.end()
         return read_trips(self._trip_file, vehicle_classes, warmup_end, end, removes_jammed)
 
@@ -404,7 +417,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         self._folder.cleanup()
 
     def finish(self) -> tuple[SumoWarning, ...]:
-        """End the episode and return SUMO's warnings: its log is only complete after its end."""
+        """End the episode, which completes SUMO's log, and return the warnings in it."""
         self._library.end()
         return read_warnings(self._error_log)
 

@@ -1,6 +1,6 @@
-"""Transports to SUMO, and the only module that imports libsumo or traci; `sandboxed` puts one into another process.
+"""Transports to SUMO: libsumo in this process, or TraCI to a child process. Only this module imports libsumo and traci.
 
-unjam never closes, steps or replaces the user's simulation in this process, and their TraCI connection stays active.
+If the user runs a simulation in this process, unjam never closes, steps or replaces it, nor its TraCI connection.
 """
 
 import importlib
@@ -23,33 +23,37 @@ from unjam.processes import check_owner
 from unjam.sandbox import restrict_writing
 
 Transport = Literal["libsumo", "traci", "gui"]
-"""`libsumo`: in this process; `traci`: SUMO as a child process; `gui`: the same, with its window."""
+"""`libsumo`: SUMO in this process; `traci`: SUMO as a child process; `gui`: the same with SUMO's window"""
 TRANSPORT_MODULES = {"libsumo": "libsumo", "traci": "traci.main", "gui": "traci.main"}
-"""module of each transport; `import traci` would depend on LIBSUMO_AS_TRACI and LIBTRACI_AS_TRACI"""
+"""module of each transport; what `import traci` loads depends on LIBSUMO_AS_TRACI and LIBTRACI_AS_TRACI"""
 MAX_START_SECONDS = 600.0
-"""time limit for SUMO to accept a connection [s]: it reads the network first"""
+"""time limit for SUMO to accept a connection [s]; SUMO reads the network first"""
 CONNECT_RETRY_SECONDS = 0.02
+"""time between two attempts to connect to SUMO [s]"""
 _libsumo_lock = threading.Lock()
-"""held by the one simulation that runs on libsumo in this process; nothing waits for it"""
+"""lock of the simulation that uses libsumo in this process; nothing waits for it"""
 
 
 class InUseError(UnjamError):
-    """libsumo, which holds one simulation per process, already holds one."""
+    """libsumo already runs a simulation in this process, and can run only one."""
 
 
 class Libsumo:
-    """SUMO in this process, for one simulation; changes of that simulation by other code are detected."""
+    """SUMO in this process. It detects whether other code has changed its simulation."""
 
     def __init__(self) -> None:
-        """Claim libsumo; raise `InUseError` if another simulation, unjam's or the user's, is open in this process."""
+        """Claim libsumo; raise `InUseError` if a simulation of unjam or of the user is open in this process."""
         self.functions: Any = import_library("libsumo")
-        call = partial(sumo_function, self.functions)
-        self._is_loaded = call("simulation", "isLoaded")
-        self._get_time, self._step = call("simulation", "getTime"), call("simulation", "step")
-        self._get_time_step, self._get_option = call("simulation", "getDeltaT"), call("simulation", "getOption")
+        get_function = partial(sumo_function, self.functions)
+        self._is_loaded = get_function("simulation", "isLoaded")
+        self._get_time, self._step = get_function("simulation", "getTime"), get_function("simulation", "step")
+        self._get_time_step, self._get_option = (
+            get_function("simulation", "getDeltaT"),
+            get_function("simulation", "getOption"),
+        )
         self._time_step = 1.0
         self._log_path: str | None = None
-        """the error log of the running simulation, by which it is identified; None: it does not run"""
+        """error log of the running simulation, which identifies it; None: no simulation runs"""
         self._step_count, self._begin_time = 0, 0.0
         self.has_refused = False
         self._is_claimed = _libsumo_lock.acquire(blocking=False)
@@ -72,7 +76,7 @@ class Libsumo:
         return round((self._get_time() - self._begin_time) / self._time_step) != self._step_count
 
     def check(self) -> None:
-        """Raise `LostWorkerError` if other code has changed the simulation. It takes less than a microsecond."""
+        """Raise `LostWorkerError` if other code has changed the simulation. The check takes less than a microsecond."""
         if self.is_lost:
             raise LostWorkerError(
                 "SUMO was lost: other code in this process has started, stepped or closed a simulation "
@@ -80,16 +84,17 @@ class Libsumo:
             )
 
     def start(self, command: Sequence[str], log_path: Path) -> None:
-        """Start SUMO, which writes its errors to a log."""
+        """Start SUMO with an error log at `log_path`."""
         self._log_path = str(log_path)
-        self._start(self.functions.start, command)
+        self._start_simulation(self.functions.start, command)
 
     def load(self, options: Sequence[str]) -> None:
         """Start the simulation again with other options."""
-        self._start(self.functions.load, options)
+        self._start_simulation(self.functions.load, options)
 
-    def _start(self, start: Callable[[list[str]], object], options: Sequence[str]) -> None:
-        start([*options])
+    def _start_simulation(self, function: Callable[[list[str]], object], arguments: Sequence[str]) -> None:
+        """Start or load a simulation, and record its begin time and time step."""
+        function([*arguments])
         self._begin_time, self._time_step = self._get_time(), self._get_time_step()
         self._step_count, self.has_refused = 0, False
 
@@ -103,29 +108,29 @@ class Libsumo:
         self._step_count += 1
 
     def end(self) -> None:
-        """End the simulation unless it has ended already; that of other code goes on."""
+        """End the simulation unless it has ended already; a simulation of other code continues."""
         if self._log_path is not None and self._is_own():
             close_sumo(self.functions)
         self._log_path = None
 
     def close(self) -> None:
-        """Release libsumo; may be called twice."""
+        """Release libsumo for other simulations; may be called twice."""
         if self._is_claimed:
             self._is_claimed = False
             _libsumo_lock.release()
 
     def _is_own(self) -> bool:
-        """Return whether libsumo holds this simulation, or none if it does not run."""
+        """Return whether libsumo runs this simulation, or none if this one does not run."""
         if self._log_path is None or not self._is_loaded():
             return self._log_path is None and not self._is_loaded()
         return self._get_option("error-log") == self._log_path
 
 
 class Traci:
-    """SUMO as a child process, over a connection that other code in this process does not get."""
+    """SUMO as a child process, over a connection that other code in this process cannot use."""
 
     is_lost = has_refused = False
-    """an interrupt within a step makes it lost: the next call would take the answer of this one for its own"""
+    """`is_lost` after an interrupt within a step: the next call would read the answer to that step"""
 
     def __init__(self) -> None:
         self._traci, self._owner = import_library("traci"), os.getpid()
@@ -137,25 +142,25 @@ class Traci:
         return self.functions is not None
 
     def check(self) -> None:
-        """Raise `LostWorkerError` in a fork of the process that opened the connection; no other code can change it."""
+        """Raise `LostWorkerError` in a fork of the process that opened the connection."""
         check_owner(self._owner, "simulation: it")
 
     def start(self, command: Sequence[str], log_path: Path) -> None:
-        """Start SUMO, which may only write into the folder of its log, and connect to it."""
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
+        """Start SUMO, which may write only into the folder of its log, and connect to it."""
+        with socket.socket() as free_socket:
+            free_socket.bind(("127.0.0.1", 0))
+            port = free_socket.getsockname()[1]
 
         def start_process() -> subprocess.Popen[bytes]:
-            restrict_writing(log_path.parent, Path("/dev"))  # it needs screens and sockets
+            restrict_writing(log_path.parent, Path("/dev"))  # SUMO needs screens and sockets
             return subprocess.Popen([*command, "--remote-port", str(port)], stdout=subprocess.DEVNULL)
 
-        # In a thread of its own, which ends here: the restriction applies to a thread and its child processes.
+        # The restriction applies to a thread and its child processes. This thread ends here.
         with ThreadPoolExecutor(1) as restricted_thread:
             process = restricted_thread.submit(start_process).result()
         deadline = time.monotonic() + MAX_START_SECONDS
         while self.functions is None:
-            try:  # one attempt at a time: traci prints each of several
+            try:  # a single attempt: with several, traci prints each
                 self.functions = self._traci.connect(port, numRetries=0, host="127.0.0.1", proc=process)
             except self._traci.FatalTraCIError:
                 if time.monotonic() > deadline:
@@ -185,11 +190,11 @@ class Traci:
         self.functions = None
 
     def close(self) -> None:
-        """Do nothing more."""
+        """Do nothing: `end` has closed the connection."""
 
 
 class NeighborStates(NamedTuple):
-    """Leader and follower of a vehicle: speeds [m/s] and net gaps [m]; empty name: no leader."""
+    """Speeds [m/s] and net gaps [m] of a vehicle's leader and follower; `leader` is its id, empty without a leader."""
 
     leader: str
     leader_speed: float
@@ -199,13 +204,13 @@ class NeighborStates(NamedTuple):
 
 
 def close_sumo(sumo: Any) -> None:
-    """End a simulation; one that has ended already is no error."""
+    """End a simulation that may have ended already."""
     with suppress(Exception):
         sumo.close()
 
 
 def sumo_function(sumo: Any, domain: str, name: str) -> Callable[..., Any]:
-    """Return a function of libsumo or traci; of libsumo without its Python wrapper, a third of the time of a call."""
+    """Return a function of libsumo or traci; of libsumo the compiled one, three times as fast as its Python wrapper."""
     compiled = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
     wrapper = sumo.simulationStep if name == "step" else getattr(getattr(sumo, domain), name)
     return getattr(compiled, f"{domain}_{name}", wrapper)

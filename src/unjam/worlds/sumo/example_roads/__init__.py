@@ -10,18 +10,24 @@ from unjam.processes import PrivateFolder
 from unjam.worlds.sumo.networks import run_netconvert
 
 EXAMPLE_ROADS = ("on-ramp",)
-INPUTS = {"--node-files": "nodes.nod.xml", "--edge-files": "edges.edg.xml", "--connection-files": "connections.con.xml"}
+NETCONVERT_FILES = {
+    "--node-files": "nodes.nod.xml",
+    "--edge-files": "edges.edg.xml",
+    "--connection-files": "connections.con.xml",
+}
 
 
 def write_example_road(name: str, folder: Path) -> Path:
-    """Write the files of an example network into a folder that exists, and return SUMO's configuration."""
+    """Write the files of an example network into an existing folder, and return the path of SUMO's configuration."""
     if name not in EXAMPLE_ROADS:
         raise unknown_name("road", name, EXAMPLE_ROADS)
-    contents = {each.name: each.read_text(encoding="utf-8") for each in files(__name__).joinpath(name).iterdir()}
-    inputs = {(option, file): contents[file] for option, file in INPUTS.items()}
+    contents = {file.name: file.read_text(encoding="utf-8") for file in files(__name__).joinpath(name).iterdir()}
+    inputs = {(option, file): contents[file] for option, file in NETCONVERT_FILES.items()}
     with PrivateFolder() as private:
         network = run_netconvert(inputs, [], Path(private)).read_text(encoding="utf-8")
-    contents[f"{name}.net.xml"] = re.sub(r"<!--.*?-->\n*", "", network, count=1, flags=re.DOTALL)  # it names files
+    contents[f"{name}.net.xml"] = re.sub(
+        r"<!--.*?-->\n*", "", network, count=1, flags=re.DOTALL
+    )  # the comment has names of temporary files
     for file, content in contents.items():
         atomic_write(folder / file, content)
     return folder / f"{name}.sumocfg"
