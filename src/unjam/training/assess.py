@@ -32,8 +32,8 @@ from unjam.measures.statistics import metric_estimate
 from unjam.reports.assessment import (
     ASSESSMENT_FILE,
     ASSESSMENT_PAGE,
-    count_answered_seeds,
-    keep_earlier_answer,
+    archive_assessment,
+    count_assessed_seeds,
     write_assessment,
 )
 from unjam.scenarios import scenario_recipe
@@ -198,14 +198,14 @@ def assess(
         save_evaluation(folder / SELECTION_FOLDER, Evaluation(selection_rows, {}), metadata)
         save_evaluation(folder, Evaluation(test_rows, pictures), metadata)
         seeds = len(findings.rows[HUMAN_BASELINE])
-        if kept_page := keep_earlier_answer(folder, request.penetration_rates, document["drivers"], seeds):
-            on_message(f"the earlier answer is now in {kept_page}")
+        if archived_page := archive_assessment(folder, request.penetration_rates, document["drivers"], seeds):
+            on_message(f"the earlier answer is now in {archived_page}")
         atomic_write(folder / ASSESSMENT_FILE, to_json(document, indent=1))
         page = write_assessment(folder, folder / ASSESSMENT_PAGE)
         return Assessment(findings.controller_results, findings.acc_results, json.loads(to_json(document)), page)
 
     def write_interim_answer(findings: AssessmentFindings) -> None:
-        known = count_answered_seeds(folder, request.penetration_rates, _driver_recipes(request))
+        known = count_assessed_seeds(folder, request.penetration_rates, _driver_recipes(request))
         if new_episodes and len(findings.rows[HUMAN_BASELINE]) > known:
             on_message(f"the answer so far is in {write_answer(findings, first.plot_episodes, False).page}")
 
