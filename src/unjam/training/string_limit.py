@@ -14,7 +14,7 @@ from unjam.measures.metrics import measure
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import tuning_seeds
-from unjam.training.export import driver_with_filter, without_filter
+from unjam.training.export import driver_with_filter, remove_filter
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 MAX_STRING_GAIN = 1.0 + GAIN_TOLERANCE
@@ -38,7 +38,7 @@ class OperatingPoint:
 
         It is infinite for a driver that falls behind its leader.
         """
-        in_car = driver_with_filter(without_filter(driver), self.road)  # a file may have a filter for another car
+        in_car = driver_with_filter(remove_filter(driver), self.road)  # a file may have a filter for another car
         gains = string_gains(in_car, self.speeds, self.road.humans, self.loop_length)
         return float(np.nan_to_num(gains, nan=np.inf).max(initial=0.0))
 
