@@ -164,7 +164,7 @@ def train_in_process(
         run_folder.make_new_folder(folder, f", or --resume {folder}")
     with run_folder.removing_if_empty(folder), expecting_code(), lock_folder(folder):
         (run_folder.resume_run_folder if resume else run_folder.create_run_folder)(folder, config)
-        refusals = nullcontext() if resume else run_folder.discarding_refused(folder)
+        refusals = nullcontext() if resume else run_folder.empty_if_refused(folder)
         with refusals, ExitStack() as locks, WorkerPool(config.workers) as workers:
             for task_folder in [folder / name for name in config.task_configs() if name]:
                 make_folder(task_folder)
