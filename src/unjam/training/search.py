@@ -102,10 +102,7 @@ def search(
                 if changed := {name for name, _ in files.items() ^ _file_hashes(base, space).items()}:
                     raise changed_file_error(min(changed))
                 exit_code = future.result()
-                if exit_code not in (
-                    0,
-                    *TRIAL_FAILURE_CODES,
-                ):  # the reason, such as a full disk, may concern all trials
+                if exit_code not in (0, *TRIAL_FAILURE_CODES):  # such as a full disk, which concerns all trials
                     log_file = _log_file(folder, number)
                     reason = f"trial {number} was stopped with exit code {exit_code}; its log: {log_file}"
                     raise (DiskError if exit_code == DiskError.exit_code else UnjamError)(reason)
