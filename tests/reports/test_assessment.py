@@ -17,9 +17,9 @@ from unjam.measures.recommendation import AccResult, ControllerResult, acc_findi
 from unjam.measures.statistics import Estimate
 from unjam.reports.assessment import (
     ASSESSMENT_FILE,
+    archive_assessment,
     effect_figure,
     feasibility_text,
-    keep_earlier_answer,
     render_assessment,
     write_assessment,
 )
@@ -218,7 +218,7 @@ def test_names_of_drivers_have_no_hidden_characters(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rates", "drivers", "seeds", "is_kept"),
+    ("rates", "drivers", "seeds", "is_archived"),
     [
         ([0.1], {"pi": {"window": 30.0}}, 10, False),
         ([0.1], {"pi": {"window": 30.0}}, 9, True),
@@ -226,14 +226,14 @@ def test_names_of_drivers_have_no_hidden_characters(tmp_path: Path) -> None:
         ([0.1], {"pi": {}}, 10, True),
     ],
 )
-def test_the_answer_to_another_question_or_with_more_seeds_is_kept(
-    rates: list[float], drivers: dict[str, Any], seeds: int, is_kept: bool, tmp_path: Path
+def test_the_answer_to_another_question_or_with_more_seeds_is_archived(
+    rates: list[float], drivers: dict[str, Any], seeds: int, is_archived: bool, tmp_path: Path
 ) -> None:
     stored = {"penetration_rates": [0.1], "drivers": {"pi": {"window": 30.0}}, "seeds": {"test": 10}}
     (tmp_path / "assessment.json").write_text(json.dumps(stored))
     (tmp_path / "assessment.html").write_text("page")
     (tmp_path / "assessment-1.html").write_text("of an interrupted call")
-    kept = keep_earlier_answer(tmp_path, rates, drivers, seeds)
-    assert kept == (tmp_path / "assessment-2.html" if is_kept else None)
+    archived = archive_assessment(tmp_path, rates, drivers, seeds)
+    assert archived == (tmp_path / "assessment-2.html" if is_archived else None)
     names = {path.name for path in tmp_path.iterdir()} - {"assessment-1.html"}
-    assert names == {f"assessment{'-2' if is_kept else ''}.{suffix}" for suffix in ("json", "html")}
+    assert names == {f"assessment{'-2' if is_archived else ''}.{suffix}" for suffix in ("json", "html")}

@@ -100,7 +100,7 @@ def test_lines_at_the_start_have_one_estimate_and_a_smaller_question(file: str) 
         "the budget is at most 60 episodes, about 3 min or 5 min, which is too small for a verdict",
         "a smaller question, --penetration-rates 0.2 -d acc, needs at least 32 episodes, about 96 s",
     ]
-    assert len(budget_lines(request.smallest_question, budget)) == 2
+    assert len(budget_lines(request.smallest_request, budget)) == 2
     assert budget_lines(request, budget, 50)[0].endswith("86 episodes, 50 of them stored, about 2 min")
 
 

@@ -54,8 +54,8 @@ def write_detectors(path: Path, file: Path, places: tuple[float, ...] = (200.0, 
     file.write_text("\n".join([head, *rows]) + "\n")
     corridor = load_corridor(str(path), file)
     with DetectorPool(1) as counting:
-        (passed,) = counting.run(corridor.scenario(path), [(12345,)], corridor.loops)
-    flows, speeds = aggregate_passages(corridor.measurements, corridor.loop_numbers, passed)
+        (passed,) = counting.run(corridor.load_scenario(path), [(12345,)], corridor.loops)
+    flows, speeds = aggregate_passages(corridor.measurements, corridor.loop_indices, passed)
     lines = [
         row.removesuffix("0,") + f"{flow:.1f},{'' if isnan(speed) else f'{speed:.3f}'}"
         for row, flow, speed in zip(rows, flows, speeds, strict=True)
@@ -109,8 +109,10 @@ def test_written_network_has_the_reported_agreement(corridor: Corridor, done: tu
     assert float(files.types["person"]["speedFactor"]) == pytest.approx(found.factors["speedFactor"])
     assert {**files.types["person"], "speedFactor": own["speedFactor"]} == own
     with DetectorPool(1) as counting:
-        (passed,) = counting.run(corridor.scenario(folder / CALIBRATED_NETWORK_FILE), held_out_seeds(1), corridor.loops)
-    flows, speeds = aggregate_passages(corridor.measurements, corridor.loop_numbers, passed)
+        (passed,) = counting.run(
+            corridor.load_scenario(folder / CALIBRATED_NETWORK_FILE), held_out_seeds(1), corridor.loops
+        )
+    flows, speeds = aggregate_passages(corridor.measurements, corridor.loop_indices, passed)
     assert compute_agreement(corridor.measurements, flows, speeds) == found.calibrated[0]
     road = load_user_network(str(folder / CALIBRATED_NETWORK_FILE), {"penetration_rate": 0.2})
     episode = run_episode(road, PISaturation(time_step=road.control_step), 1)

@@ -109,7 +109,7 @@ def test_a_trained_controller_keeps_the_limit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "allowed"),
     [
-        ({"scenario_options__warmup": 300}, "at least 1.*, the gain of its first policy, or another expert"),
+        ({"scenario_options__warmup": 300}, "at least 1.*, the gain of the first policy, or another expert"),
         ({"scenario": "merge", "scenario_options": {}}, "none on merge: it is no closed road"),
     ],
 )

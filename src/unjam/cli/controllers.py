@@ -27,7 +27,12 @@ from unjam.errors import InputError, invalid_value
 from unjam.files import atomic_write, check_parent_folder, remove
 from unjam.processes import continue_in_limited_child
 from unjam.scenarios import scenario_from_recipe
-from unjam.training.export import export_controller, has_usual_car, measure_test_episode, read_in_car
+from unjam.training.export import (
+    export_controller,
+    has_default_actuator,
+    measure_test_episode,
+    read_exported_controller,
+)
 from unjam.training.run_folder import check_controller
 
 
@@ -160,10 +165,10 @@ def _read_with_filter(name: str, settings: dict[str, Any]) -> Controller:
     recipe = controller.manifest.get("scenario")
     if recipe is None:
         raise invalid_value("file", name, "a controller for one road: it selects its controller by the road")
-    is_usual = has_usual_car(scenario_from_recipe(recipe))
+    is_usual = has_default_actuator(scenario_from_recipe(recipe))
     if isinstance(controller.driver, FilteredDriver) and is_usual and not settings:
         return controller
-    return read_in_car(name, settings)
+    return read_exported_controller(name, settings)
 
 
 def verify_command(

@@ -1,1 +1,1 @@
-"""Learners: the residual policy, and Stable-Baselines3 fed with whole episodes."""
+"""Learners: algorithms that train the residual policy on whole episodes, most of them from Stable-Baselines3."""

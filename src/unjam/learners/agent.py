@@ -1,4 +1,4 @@
-"""What an agent is made for, and where it comes from: a learner of the package, or a class of the user's own."""
+"""Construction of agents, which are learners of the package or classes of the user, and checks of their results."""
 
 import inspect
 import json
@@ -24,7 +24,7 @@ from unjam.worlds.record import Floats
 
 @dataclass(frozen=True)
 class AgentSpec:
-    """What an agent is made for: its tasks, the inputs of its networks, and the bounds of the residual."""
+    """Specification of an agent: its tasks, the inputs of its networks, and the bounds of the residual."""
 
     tasks: Sequence[Task]
     policy: PolicySettings
@@ -32,9 +32,9 @@ class AgentSpec:
     gamma: float
     """discount from one action of the network to the next"""
     seed: int
-    """of the whole run"""
+    """seed of the whole run"""
     string_gain: Callable[[Network], float] | None = None
-    """largest string gain of the full policy with a network, on all tasks; None: it has no limit"""
+    """function that returns the largest string gain of the full policy with a network on all tasks; None: no limit"""
 
     @property
     def inputs(self) -> int:
@@ -63,9 +63,9 @@ class AgentSpec:
         return self.policy.exploration_std * self.action_limit
 
     def privileged_inputs(self, task_index: int, drawn_values: Floats) -> Floats:
-        """Return the inputs of the critic alone in rows of a task with `drawn_values`, shape (rows, m).
+        """Return the additional inputs of the critic in rows of a task with `drawn_values`, shape (rows, m).
 
-        With several tasks these are the values that each of them draws, zeros for the others, and a one-hot task index.
+        With several tasks, these are the drawn values of each task, zeros for other tasks, and a one-hot task index.
         """
         if not self.policy.privileged_critic:
             return drawn_values[:, :0]
@@ -77,14 +77,14 @@ class AgentSpec:
 
 
 def make_agent(name: str, settings: LearnerSettings, spec: AgentSpec) -> Any:
-    """Return a new agent: a `Learner` of the class that its settings name, or an object of the user's class."""
+    """Return a new agent: a `Learner` of the package, or an object of the user's class."""
     if isinstance(settings, UserAgentSettings):
-        kind = _user_class(name)
+        user_class = _load_user_class(name)
         try:
-            inspect.signature(kind).bind(spec, **settings.options)
+            inspect.signature(user_class).bind(spec, **settings.options)
         except TypeError as error:
             raise InputError(f"user.options: {FileReference.parse(name)}: {error}") from None
-        return kind(spec, **settings.options)
+        return user_class(spec, **settings.options)
     return learner_class(settings)(spec, settings)
 
 
@@ -95,29 +95,29 @@ def learner_class(settings: LearnerSettings) -> type[Any]:
 
 
 def is_algorithm(agent: Any) -> bool:
-    """Return whether an agent, or its class, is an `Algorithm` and no `Learner`."""
+    """Return whether an agent, or its class, is an `Algorithm` instead of a `Learner`."""
     return callable(getattr(agent, "iterate", None))
 
 
 def check_agent(name: str) -> None:
-    """Raise `InputError` if `path.py:Class` is not a class of learners or algorithms; the file runs for it."""
+    """Run the file of `path.py:Class`, and raise `InputError` if this is not a class of learners or algorithms."""
     from unjam.learners.algorithm import Algorithm  # these modules import this one
     from unjam.learners.learner import Learner
 
-    found = _user_class(name)
-    protocol: Any = Algorithm if is_algorithm(found) else Learner
+    user_class = _load_user_class(name)
+    protocol: Any = Algorithm if is_algorithm(user_class) else Learner
     required = ("network", "state", "restore", "iterate" if protocol is Algorithm else "learn")
-    # What a class inherits from the protocol does nothing.
-    if missing := [f"{each}()" for each in required if getattr(found, each, None) in (None, getattr(protocol, each))]:
+    unusable = [None, *(getattr(protocol, method) for method in required)]  # the methods of a protocol are empty
+    if missing := [f"{method}()" for method in required if getattr(user_class, method, None) in unusable]:
         allowed = "a class with network(), state(), restore() and iterate(), an algorithm, or learn(), a learner"
         raise InputError(f"agent: {FileReference.parse(name)} has no {', '.join(missing)}; allowed: {allowed}")
-    if protocol is Learner and Learner not in found.__mro__:
+    if protocol is Learner and Learner not in user_class.__mro__:
         allowed = "allowed: a class that inherits from unjam.learners.learner.Learner"
         raise InputError(f"agent: {FileReference.parse(name)} has no exploring_network() and others; {allowed}")
 
 
 def check_network(name: str, network: Any, spec: AgentSpec) -> Network:
-    """Return the network of an agent; raise `InputError` if it is none that workers can drive."""
+    """Return the network of an agent; raise `InputError` if workers cannot drive with it."""
     if not isinstance(network, Network):
         allowed = "allowed: an unjam.drivers.network.Network"
         raise InputError(f"agent: network() of {name} returns {type(network).__name__}; {allowed}")
@@ -134,7 +134,7 @@ def check_state(name: str, state: Any) -> tuple[dict[str, Any], dict[str, Tensor
     """Return copies of the values and tensors of an agent; raise `InputError` if a checkpoint cannot store them."""
     try:
         values, tensors = state
-        copies = {key: torch.as_tensor(each).detach().clone().contiguous() for key, each in tensors.items()}
+        copies = {key: torch.as_tensor(array).detach().clone().contiguous() for key, array in tensors.items()}
         return json.loads(json.dumps(values)), copies
     except (TypeError, ValueError, RuntimeError, AttributeError) as error:
         allowed = "allowed: (values for JSON, tensors or arrays by name)"
@@ -142,8 +142,8 @@ def check_state(name: str, state: Any) -> tuple[dict[str, Any], dict[str, Tensor
 
 
 @contextmanager
-def reporting_user_errors(name: str) -> Iterator[None]:
-    """Raise `InputError` with the last executed line if code of the user's agent fails within the block."""
+def convert_user_errors(name: str) -> Iterator[None]:
+    """Raise errors of the user's agent in the block as an `InputError` with the last executed line."""
     try:
         yield
     except UnjamError:
@@ -155,9 +155,9 @@ def reporting_user_errors(name: str) -> Iterator[None]:
         raise InputError(f"agent: {reference}: {type(error).__name__}: {error}{line}") from error
 
 
-def _user_class(name: str) -> type[Any]:
+def _load_user_class(name: str) -> type[Any]:
     reference = FileReference.parse(name)
-    found = reference.load_object()
-    if not inspect.isclass(found):
+    user_class = reference.load_object()
+    if not inspect.isclass(user_class):
         raise InputError(f"agent: {reference} is not a class; allowed: a class of learners or algorithms")
-    return found
+    return user_class

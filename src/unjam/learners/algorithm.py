@@ -1,4 +1,4 @@
-"""The protocol of algorithms: what a training runs, iteration by iteration."""
+"""The protocol of algorithms, and the loop in which a training runs the iterations of one."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -20,34 +20,34 @@ TaskEpisodes = Sequence[Sequence[Episode]]
 
 @dataclass(frozen=True)
 class IterationLog:
-    """What an iteration of an algorithm reports for the rows of progress; all of it may be empty."""
+    """Report of one iteration for the rows of progress; all entries are optional."""
 
     values: Mapping[str, float] = field(default_factory=dict)
-    """of its updates, by name"""
+    """numbers about the updates, by name"""
     model_steps: int = 0
     """control steps in learned models, of all iterations so far"""
     model: Sequence[dict[str, Any]] = ()
     """facts about the model of each task"""
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """wall time of its parts; that of episodes is measured in any case"""
+    """wall time of each stage by name [s], without the episodes, which the training measures"""
 
 
 class Collector:
-    """Runs the episodes of an iteration, in the workers of a training, and counts their control steps."""
+    """Runs the episodes of iterations in the workers of a training, and counts their control steps."""
 
     def __init__(self, run: Callable[[Network, int], TaskEpisodes]) -> None:
         self._run = run
         self.iteration = 0
-        """number of the present iteration, from 1"""
+        """index of the present iteration, from 1"""
         self.environment_steps = 0
-        """of all iterations so far"""
+        """environment steps of all iterations so far"""
         self.episodes: list[list[Episode]] = []
-        """of the present iteration, by task"""
+        """episodes of the present iteration, by task"""
         self.seconds = 0.0
-        """wall time of these episodes"""
+        """wall time of these episodes [s]"""
 
     def start_iteration(self) -> None:
-        """Count the next iteration, without episodes."""
+        """Begin the next iteration, which has no episodes yet."""
         self.iteration += 1
         self.episodes, self.seconds = [], 0.0
 
@@ -56,41 +56,41 @@ class Collector:
 
         Further calls in an iteration run the same roads and vehicles again.
         """
-        start = time.perf_counter()
-        found = self._run(network, self.iteration)
-        self.seconds += time.perf_counter() - start
-        self.environment_steps += sum(episode.control_steps for each in found for episode in each)
-        before = self.episodes or [[] for _ in found]
-        self.episodes = [[*earlier, *each] for earlier, each in zip(before, found, strict=True)]
-        return found
+        start_time = time.perf_counter()
+        new_episodes = self._run(network, self.iteration)
+        self.seconds += time.perf_counter() - start_time
+        self.environment_steps += sum(episode.control_steps for episodes in new_episodes for episode in episodes)
+        earlier_episodes = self.episodes or [[] for _ in new_episodes]
+        self.episodes = [[*earlier, *new] for earlier, new in zip(earlier_episodes, new_episodes, strict=True)]
+        return new_episodes
 
 
 class Agent(Protocol):
-    """What a training learns with: a policy, and all that is needed to resume."""
+    """A policy that learns; the common part of the protocols `Algorithm` and `Learner`."""
 
     def network(self) -> Network:
-        """Return the present policy: a NumPy network, which workers and exported controllers drive without torch."""
+        """Return the present policy as a NumPy network: workers and exported controllers need no torch for it."""
         ...
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
-        """Return all that is needed to resume exactly: values for JSON, and tensors."""
+        """Return values for JSON and tensors, with which an agent of the same configuration resumes exactly."""
         ...
 
     def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
-        """Resume, made with the same configuration, from what `state` returned."""
+        """Resume from the values and tensors that `state` returned."""
         ...
 
 
 class Algorithm(Agent, Protocol):
-    """What a training runs: it learns in iterations from the episodes that it collects.
+    """An agent that decides itself which episodes it collects in an iteration, and learns from them.
 
-    A class of the user's own, `--agent path.py:Class`, is made with an `AgentSpec`, and with `user.options` as keyword
-    arguments. The training runs episodes, validates, keeps the best policy, writes progress and checkpoints, and ends.
-    Before each iteration, the global generators of NumPy and torch are seeded by run and iteration.
+    A class of the user, `--agent path.py:Class`, is made with an `AgentSpec`, and with `user.options` as keyword
+    arguments. The training runs the episodes, validates, saves the best policy, writes progress and checkpoints, and
+    ends. Before each iteration, the global generators of NumPy and torch are seeded by run and iteration.
     """
 
     def iterate(self, collect: Collector) -> IterationLog:
-        """Collect episodes, at least once, and learn from them."""
+        """Call `collect` at least once, and learn from the episodes that it returns."""
         ...
 
 
@@ -101,9 +101,9 @@ def run_iterations(
     seed: int,
     on_iteration: Callable[[IterationLog], object],
 ) -> None:
-    """Continue up to `max_environment_steps`, those of earlier iterations included, or until `on_iteration` is true.
+    """Run iterations until `on_iteration` returns true, or all iterations have `max_environment_steps` together.
 
-    Raise `UnjamError` if an iteration runs no episodes.
+    Raise `UnjamError` if an iteration runs no episodes, or returns a log with other values than numbers.
     """
     while collect.environment_steps < max_environment_steps:
         collect.start_iteration()
@@ -112,8 +112,9 @@ def run_iterations(
         if not isinstance(log, IterationLog):
             raise UnjamError(f"algorithm: iterate() returns {type(log).__name__}; allowed: an IterationLog")
         if not collect.episodes:
-            allowed = "allowed: at least one collect()"
-            raise UnjamError(f"algorithm: iteration {collect.iteration} runs no episodes; {allowed}")
+            raise UnjamError(
+                f"algorithm: iteration {collect.iteration} runs no episodes; allowed: at least one collect()"
+            )
         _check_numbers({**log.values, **log.seconds})
         if on_iteration(log):
             return
@@ -128,14 +129,14 @@ def _check_numbers(values: Mapping[str, Any]) -> None:
             raise UnjamError(f"algorithm: {name} of the log is {value!r}; allowed: a number") from None
 
 
-def seed_iteration(run_seed: int, iteration: int, part: int | None = None) -> None:
-    """Seed the global generators by run, iteration and part: a resumed run draws the same random numbers."""
-    key = (1,) if part is None else (1, 1 + part)  # a trailing zero would change nothing
+def seed_iteration(run_seed: int, iteration: int, update: int | None = None) -> None:
+    """Seed the global generators by run, iteration and update, so that a resumed run draws the same random numbers."""
+    key = (1,) if update is None else (1, 1 + update)  # NumPy ignores a trailing zero
     torch_seed, numpy_seed = np.random.SeedSequence([run_seed, iteration, *key]).generate_state(2)
     torch.manual_seed(int(torch_seed))
     np.random.seed(int(numpy_seed))
 
 
 def tensors_with_prefix(prefix: str, tensors: Tensors) -> Tensors:
-    """Return copies of the tensors with names that begin with `prefix`, without it."""
+    """Return copies of the tensors with names that begin with `prefix`, by the rest of the name."""
     return {name: tensor.clone() for name, tensor in select_prefix(prefix, tensors).items()}

@@ -21,31 +21,34 @@ from unjam.learners.model_rollouts import ModelRollouts
 from unjam.learners.settings import LearnerSettings
 
 MAX_COMPARED_ROWS = 2000
-"""maximum number of visited states at which the policy is compared before and after an update"""
+"""maximum number of visited states at which the policies before and after an iteration are compared"""
 
 
 class Algorithm1:
-    """Algorithm 1 with any learner; line 3, repeat, and line 9, until it performs well, are `run_iterations`."""
+    """Algorithm 1 with any learner; the loop of its lines 3 and 9 is in `run_iterations`."""
 
     def __init__(self, spec: AgentSpec, learner: Learner) -> None:
-        """Line 1: pi_theta and its value network, in `learner`; pi_H is the tasks'. Line 2: T and an empty D_a."""
+        """Make T and an empty D_a (line 2); `learner` has pi_theta and its value network, the tasks have pi_H (line 1).
+
+        Raise `InputError` if the first policy or the learner does not fit the limit on the string gain.
+        """
         self.spec, self.learner = spec, learner
-        tasks = range(len(spec.tasks) if spec.model.model_ratio > 0 else 0)
-        self.model_rollouts = [ModelRollouts(spec, index) for index in tasks]
-        """of each task, with its model and D_a; empty: model-free"""
+        task_indices = range(len(spec.tasks) if spec.model.model_ratio > 0 else 0)
+        self.model_rollouts = [ModelRollouts(spec, index) for index in task_indices]
+        """model and D_a of each task; empty for model-free learning"""
         if spec.string_gain is not None:
-            self._check_limit(spec.string_gain)
+            self._check_string_gain_limit(spec.string_gain)
 
     def network(self) -> Network:
         """Return pi_theta."""
         return self.learner.network()
 
     def iterate(self, collect: Collector) -> IterationLog:
-        """Make an iteration, lines 4 to 8 of the paper; raise `UnjamError` if a number is not finite."""
+        """Run lines 4 to 8 of the paper's algorithm; raise `UnjamError` if a number is not finite."""
         learner, model_rollouts = self.learner, self.model_rollouts
-        timed_parts = ("fit", "roll_out", "update") if model_rollouts else ("update",)
-        timed_parts += ("string_gain",) if self.spec.string_gain is not None else ()
-        seconds: dict[str, float] = dict.fromkeys(timed_parts, 0.0)
+        stages = ("fit", "roll_out", "update") if model_rollouts else ("update",)
+        stages += ("string_gain",) if self.spec.string_gain is not None else ()
+        seconds: dict[str, float] = dict.fromkeys(stages, 0.0)
 
         # Line 4: collect transitions from the environment using pi_theta and pi_H, ...
         episodes = collect(learner.exploring_network(collect.environment_steps))
@@ -53,14 +56,14 @@ class Algorithm1:
         if collect.iteration == 1:
             learner.set_value_scale(environment_rows)
         stride = -(-len(environment_rows.rewards) // MAX_COMPARED_ROWS)
-        compared = torch.as_tensor(environment_rows.observations[::stride])
-        before = learner.residual_distribution(compared)
-        parameters = [each.detach().clone() for each in learner.policy_parameters()]
+        compared_observations = torch.as_tensor(environment_rows.observations[::stride])
+        old_distribution = learner.residual_distribution(compared_observations)
+        old_parameters = [parameter.detach().clone() for parameter in learner.policy_parameters()]
 
         # ... and add them to D_a. Line 5: train T on D_a. Line 6: eps_m gives the rollout length k*.
-        for each, task_episodes in zip(model_rollouts, episodes, strict=False):  # none: model-free
+        for rollouts, task_episodes in zip(model_rollouts, episodes, strict=False):  # model-free: no model_rollouts
             with _measure_seconds(seconds, "fit"):
-                each.learn(task_episodes, collect.iteration)
+                rollouts.learn(task_episodes, collect.iteration)
 
         plan = self._plan_updates(collect.environment_steps)
         for with_environment, part, parts in plan:
@@ -77,37 +80,40 @@ class Algorithm1:
             with _measure_seconds(seconds, "update"):
                 try:
                     learner.learn(Update(*rows, 1.0 / len(plan), collect.environment_steps))
-                finally:  # torch also raises an error for a distribution with such a parameter
+                finally:  # replaces the error of torch for a parameter that is not finite
                     learner.check_parameters(collect.iteration)
 
         log = learner.log()
         if self.spec.string_gain is not None:
             with _measure_seconds(seconds, "string_gain"):
-                log |= {"kept_update": limit_update(learner, parameters, self._is_allowed)}
-        eps_pi = policy_distance(before, learner.residual_distribution(compared))
+                log |= {"kept_update": limit_update(learner, old_parameters, self._has_allowed_string_gain)}
+        eps_pi = policy_distance(old_distribution, learner.residual_distribution(compared_observations))
         log |= {"eps_pi_mean": float(eps_pi.mean()), "eps_pi_max": float(eps_pi.max())}
-        for each in model_rollouts:
-            eps_m = each.facts["eps_m_by_estimator"]["transitions"]
-            each.facts["bound"] = each.bound(each.k_star, log["eps_pi_max"], eps_m)
-        model_steps = sum(each.model_steps for each in model_rollouts)
-        return IterationLog(log, model_steps, [each.facts for each in model_rollouts], seconds)
+        for rollouts in model_rollouts:
+            eps_m = rollouts.facts["eps_m_by_estimator"]["transitions"]
+            rollouts.facts["bound"] = rollouts.bound(rollouts.k_star, log["eps_pi_max"], eps_m)
+        model_steps = sum(rollouts.model_steps for rollouts in model_rollouts)
+        return IterationLog(log, model_steps, [rollouts.facts for rollouts in model_rollouts], seconds)
 
-    def _check_limit(self, string_gain: Callable[[Network], float]) -> None:
-        """Raise `InputError` if the string gain of the first policy is too large, or updates cannot be taken back."""
+    def _check_string_gain_limit(self, string_gain: Callable[[Network], float]) -> None:
+        """Raise `InputError` if the first policy has a larger string gain, or the learner has no policy parameters."""
         if not self.learner.policy_parameters():
             name = type(self.learner).__name__
-            raise InputError(f"policy.max_string_gain: {name} has no policy_parameters(), as such a limit needs")
+            raise InputError(f"policy.max_string_gain: {name} has no policy_parameters(), which this limit needs")
         limit, gain = self.spec.policy.max_string_gain, string_gain(self.network())
         if gain > limit:
-            allowed = f"at least {gain:.3f}, the gain of its first policy, or another expert"
+            allowed = f"at least {gain:.3f}, the gain of the first policy, or another expert"
             raise invalid_value("policy.max_string_gain", limit, allowed)
 
-    def _is_allowed(self, network: Network) -> bool:
+    def _has_allowed_string_gain(self, network: Network) -> bool:
         string_gain = self.spec.string_gain
         return string_gain is None or string_gain(network) <= self.spec.policy.max_string_gain
 
     def _plan_updates(self, environment_steps: int) -> list[tuple[bool, int, int]]:
-        """Return the updates of this iteration: (with environment rows, part of the model rows, number of parts)."""
+        """Return the updates of this iteration.
+
+        Each is (whether it uses environment rows, index of its part of the model rows, number of these parts).
+        """
         without_model = (True, 0, 0)
         if not self.model_rollouts or not self.learner.is_learning(environment_steps):
             return [without_model]
@@ -117,39 +123,40 @@ class Algorithm1:
         return [without_model, *((False, part, settings.model_updates) for part in range(settings.model_updates))]
 
     def _model_experience(self, iteration: int, part: int, parts: int) -> Experience | None:
-        """Return one of `parts` of the experience of the present policy in all models, if there is any."""
+        """Return part `part` of `parts` of the present policy's experience in all models; None if there is none."""
         network = self.network()
-        results = [each.roll_out(network, iteration, part, parts) for each in self.model_rollouts]
-        rows = [each for each in results if each is not None]
+        results = [rollouts.roll_out(network, iteration, part, parts) for rollouts in self.model_rollouts]
+        rows = [experience for experience in results if experience is not None]
         return join_experience(rows) if rows else None
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return all values and tensors that are needed to resume after an iteration."""
         values, tensors = check_state(type(self.learner).__name__, self.learner.state())
-        for each in self.model_rollouts:
-            values[each.name], model_tensors = each.state()
-            tensors |= {f"{each.name}/{name}": tensor.detach().clone() for name, tensor in model_tensors.items()}
+        for rollouts in self.model_rollouts:
+            values[rollouts.name], model_tensors = rollouts.state()
+            tensors |= {f"{rollouts.name}/{name}": tensor.detach().clone() for name, tensor in model_tensors.items()}
         return values, tensors
 
     def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
-        """Resume, with the same configuration, from what `state` returned."""
+        """Resume from the values and tensors that `state` returned with the same configuration."""
         self.learner.restore(values, tensors)
-        for each in self.model_rollouts:
-            each.restore(values[each.name], tensors_with_prefix(f"{each.name}/", tensors))
+        for rollouts in self.model_rollouts:
+            rollouts.restore(values[rollouts.name], tensors_with_prefix(f"{rollouts.name}/", tensors))
 
 
 def make_algorithm(agent: str, settings: LearnerSettings, spec: AgentSpec) -> Algorithm:
-    """Return the algorithm of an agent: the user's own, or Algorithm 1 with the learner."""
-    made = make_agent(agent, settings, spec)
-    if not is_algorithm(made):
-        return Algorithm1(spec, made)
+    """Return the agent itself if it is an algorithm, else Algorithm 1 with the agent as its learner."""
+    algorithm_or_learner = make_agent(agent, settings, spec)
+    if not is_algorithm(algorithm_or_learner):
+        return Algorithm1(spec, algorithm_or_learner)
     if spec.string_gain is not None:
         raise invalid_value("policy.max_string_gain", spec.policy.max_string_gain, f"none with {agent}, an algorithm")
-    return made
+    return algorithm_or_learner
 
 
 @contextmanager
-def _measure_seconds(seconds: dict[str, float], part: str) -> Iterator[None]:
-    start = time.perf_counter()
+def _measure_seconds(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Add the wall time of the block to that of a stage in `seconds`."""
+    start_time = time.perf_counter()
     yield
-    seconds[part] += time.perf_counter() - start
+    seconds[stage] += time.perf_counter() - start_time

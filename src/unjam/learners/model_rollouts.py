@@ -1,4 +1,4 @@
-"""What Algorithm 1 does between environment episodes: fit a model to them, and roll the policy out in it."""
+"""Model rollouts of Algorithm 1: a world model is fitted to environment episodes, and the policy drives in it."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -20,31 +20,34 @@ from unjam.worlds.episode import Task
 from unjam.worlds.record import Episode, Floats
 
 FIT_SEED, STARTS_SEED, NOISE_SEED, EXPLORATION_SEED = 2, 3, 4, 5
-"""purposes of the random numbers of an iteration, in their seeds"""
+"""last elements of seeds, which separate the random numbers of an iteration by purpose"""
 
 
 def full_policy(task: Task, policy: PolicySettings, network: Network) -> ResidualDriver:
     """Return the full policy on a task: its expert plus the residual of `network`."""
-    repeat = policy.action_repeat(task.scenario.control_step)
-    return ResidualDriver(task.expert, network, task.scenario.action_limit, policy.inputs, repeat)
+    action_repeat = policy.action_repeat(task.scenario.control_step)
+    return ResidualDriver(task.expert, network, task.scenario.action_limit, policy.inputs, action_repeat)
 
 
 class ModelRollouts:
-    """The world model of a task in a training: its fits, how long it is trusted, and the policy's experience in it."""
+    """The world model of a task in a training, its rollout length, and the experience of the policy in it."""
 
     def __init__(self, spec: AgentSpec, task_index: int = 0) -> None:
-        """Start with the base alone and without data; `InputError` if scenario or settings are not supported."""
-        self.spec, self.task, self._index = spec, spec.tasks[task_index], task_index
+        """Make an untrained model without data; raise `InputError` if scenario or settings are not supported."""
+        self.spec, self.task, self._task_index = spec, spec.tasks[task_index], task_index
         self.name = f"model-{task_index}" if task_index else "model"
-        kind = world_model_class(self.task.scenario, spec.model)
-        self.world_model = kind(spec.model, self.task, spec.policy.exploration_signs, self._seed(FIT_SEED))
+        """name of the model in checkpoints"""
+        model_class = world_model_class(self.task.scenario, spec.model)
+        self.world_model = model_class(spec.model, self.task, spec.policy.exploration_signs, self._seed(FIT_SEED))
         self.model_steps = 0
+        """control steps in the model so far"""
         self.k_star = 0
         """rollout length [control steps]; 0: the model must not be used"""
         self.facts: dict[str, Any] = {}
+        """results of the newest fit and rollouts, for the rows of progress"""
 
     def _seed(self, *key: int) -> Seed:
-        return (self.spec.seed, *key, *([self._index] if self._index else []))
+        return (self.spec.seed, *key, *([self._task_index] if self._task_index else []))
 
     def learn(self, episodes: Sequence[Episode], iteration: int) -> None:
         """Add environment episodes to D_a, fit the model to it, and set the rollout length of Eq. 15."""
@@ -62,7 +65,7 @@ class ModelRollouts:
         }
 
     def roll_out(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Experience | None:
-        """Return one of `parts` of the experience of `network` in the model; None if k* is too short."""
+        """Return part `part` of `parts` of the experience of `network` in the model; None if k* is too short."""
         model, driver = self.world_model, full_policy(self.task, self.spec.policy, network)
         control_steps = int(min(self.k_star, model.max_control_steps)) // driver.action_repeat * driver.action_repeat
         seed, *seeds = (self._seed(iteration, purpose, part) for purpose in (STARTS_SEED, NOISE_SEED, EXPLORATION_SEED))
@@ -77,49 +80,49 @@ class ModelRollouts:
             returns.append(batch.returns)
             crashed += batch.crashed
             facts = batch.facts
-            experience += self._experience(batch)
+            experience += self._batch_experience(batch)
         if part == 0:
             recorded = model.recorded_returns(plan)
             is_known = ~np.isnan(recorded)
             pair = (np.concatenate(returns)[is_known], recorded[is_known]) if is_known.any() else (None, None)
-            model_return, environment_return = (None if each is None else float(each.mean()) for each in pair)
+            model_return, environment_return = (None if values is None else float(values.mean()) for values in pair)
             self.facts |= {"return_model": model_return, "return_environment": environment_return}
             self.facts |= {"crash_share": float(np.mean(crashed)), **facts}
         return join_experience(experience) if experience else None
 
-    def _experience(self, batch: Rollouts) -> list[Experience]:
+    def _batch_experience(self, batch: Rollouts) -> list[Experience]:
         if batch.rows is not None:
-            inputs = self.spec.privileged_inputs(self._index, batch.rows.drawn_values.cpu().numpy())
+            inputs = self.spec.privileged_inputs(self._task_index, batch.rows.drawn_values.cpu().numpy())
             return [rollout_experience(batch.rows, inputs)]
         has_cavs = any(episode.trajectories for episode in batch.episodes)
-        return [task_experience(self.spec, self._index, batch.episodes)] if has_cavs else []
+        return [task_experience(self.spec, self._task_index, batch.episodes)] if has_cavs else []
 
     def bound(self, k: int, eps_pi: float, eps_m: float) -> float:
-        """Return the bound C for rollouts of `k` control steps."""
+        """Return the paper's bound C for rollouts of `k` control steps."""
         return return_bound(eps_pi, eps_m, k, self.step_discount, self.world_model.max_reward)
 
     @property
     def step_discount(self) -> float:
-        """Discount per control step."""
+        """Discount factor per control step."""
         return self.spec.gamma ** (1 / self.spec.policy.action_repeat(self.task.scenario.control_step))
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
-        """Return all that a run needs to resume, as JSON and tensors."""
+        """Return values for JSON and tensors, with which a run resumes."""
         values, tensors = self.world_model.state()
         return values | {"model_steps": self.model_steps}, tensors
 
     def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
-        """Resume from what `state` returned."""
+        """Resume from the values and tensors that `state` returned."""
         self.world_model.restore(values, tensors)
         self.model_steps = values["model_steps"]
 
 
 def rollout_experience(rollouts: RolloutBatch, critic_inputs: NDArray[np.floating]) -> Experience:
-    """Return rollouts of rows as experience, with `critic_inputs`, (n, m); the truncation at k* is no termination."""
+    """Return rollouts of rows as experience, with additional inputs of the critic, shape (n, m)."""
     lengths = rollouts.lengths.cpu().numpy()
     observations = rollouts.observations.cpu().numpy()
-    extra = np.broadcast_to(critic_inputs[:, None], (*observations.shape[:2], critic_inputs.shape[1]))
-    observations = np.concatenate([observations, extra], axis=2)
+    repeated_inputs = np.broadcast_to(critic_inputs[:, None], (*observations.shape[:2], critic_inputs.shape[1]))
+    observations = np.concatenate([observations, repeated_inputs], axis=2)
     is_valid = np.arange(observations.shape[1] - 1) < lengths[:, None]
     return Experience(
         observations=observations[:, :-1][is_valid].astype(np.float32),

@@ -1,4 +1,4 @@
-"""SAC and TD3, which learn from a replay buffer with a pair of critics, and their policies."""
+"""SAC and TD3, which learn from a replay buffer with two critics, and the residual policies for them."""
 
 import math
 from typing import Any
@@ -24,10 +24,10 @@ from unjam.learners.learner import Update
 from unjam.learners.settings import OffPolicySettings, PolicySettings, SACSettings, TD3Settings
 
 UNIFORM_STD = 0.85
-"""standard deviation of normal noise with a tanh that is uniform in [-1, 1] to one percent"""
+"""standard deviation of normal noise, the tanh of which is uniform in [-1, 1] to one percent"""
 REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones")
 REPLAY_POSITION = ("pos", "full")
-"""index of the next row, and whether the buffer is full"""
+"""attributes of a replay buffer: index of the next row, and whether the buffer is full"""
 
 
 def uniform_network(inputs: int, authority: float) -> Network:
@@ -36,10 +36,10 @@ def uniform_network(inputs: int, authority: float) -> Network:
 
 
 class ActorInputExtractor(BaseFeaturesExtractor):
-    """The inputs of the actor: the first columns of an observation; the others are for the critic alone."""
+    """Layer that takes the inputs of the actor, the first columns of an observation; the critic gets all columns."""
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Return the first columns, shape (n, inputs)."""
+        """Return the inputs of the actor, shape (n, inputs)."""
         return observations[:, : self.features_dim]
 
 
@@ -52,10 +52,11 @@ class NormalizedReLU(nn.Module):
 
 
 class OffPolicyResidualMixin(BasePolicy):
-    """Base class, before one of SB3's with a pair of critics, for a residual that starts with `zero_init` at zero."""
+    """Base class of SB3's policies with two critics for a residual, which is zero at the start with `zero_init`."""
 
     critic_kwargs: dict[str, Any]
     reward_offset: Tensor
+    """mean reward, which is subtracted from all rewards"""
 
     def __init__(self, *args: Any, settings: PolicySettings, inputs: int, action_limit: float, **kwargs: Any) -> None:
         self.settings, self.inputs, self.authority = settings, inputs, settings.authority * action_limit
@@ -64,33 +65,33 @@ class OffPolicyResidualMixin(BasePolicy):
         self.register_buffer("reward_offset", torch.zeros((), dtype=torch.float64))
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        """Return the actor, which takes the first `inputs` inputs."""
+        """Return the actor, which uses the first `inputs` columns of observations."""
         actor = super().make_actor(ActorInputExtractor(self.observation_space, self.inputs))  # pyright: ignore[reportAttributeAccessIssue]
         if self.settings.zero_init:
             sb3_learner.zero_layer([layer for layer in actor.mu.modules() if isinstance(layer, nn.Linear)][-1])
         return actor
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
-        """Return a pair of critics, which take all inputs and normalize their hidden layers."""
+        """Return both critics, which use all columns of observations and normalize their hidden layers."""
         self.critic_kwargs["activation_fn"] = NormalizedReLU
         return super().make_critic(features_extractor)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class SquashedResidualPolicy(OffPolicyResidualMixin, SACPolicy):
-    """SB3's policy of SAC for a residual with noise that starts with the standard deviation `exploration_std`."""
+    """SB3's policy of SAC for a residual with the initial standard deviation `exploration_std` of its noise."""
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
-        """Return the actor, which takes the first `inputs` inputs."""
+        """Return the actor, which uses the first `inputs` columns of observations."""
         actor = super().make_actor(features_extractor)
         nn.init.zeros_(actor.log_std.weight)
         nn.init.constant_(actor.log_std.bias, math.log(self.settings.exploration_std / self.settings.authority))
         return actor
 
     def network(self) -> Network:
-        """Return the policy as a NumPy network: the same residual to 1e-6, the same exploration noise."""
+        """Return the policy as a NumPy network with the same residual (to 1e-6) and the same exploration noise."""
         layers = sb3_learner.network_layers(nn.Sequential(self.actor.latent_pi, self.actor.mu, self.actor.log_std))  # pyright: ignore[reportArgumentType]
-        *hidden, (mean, mean_bias), (log_std, log_std_bias) = layers
-        output = np.hstack([mean, log_std]), np.hstack([mean_bias, log_std_bias])
+        *hidden, (mean_weight, mean_bias), (log_std_weight, log_std_bias) = layers
+        output = np.hstack([mean_weight, log_std_weight]), np.hstack([mean_bias, log_std_bias])
         return Network((*hidden, output), self.authority)
 
 
@@ -103,12 +104,12 @@ class DeterministicResidualPolicy(OffPolicyResidualMixin, TD3Policy):
         return self.settings.exploration_std * self.authority / self.settings.authority
 
     def network(self) -> Network:
-        """Return the policy as a NumPy network: the same residual to 1e-6, and the exploration noise."""
+        """Return the policy as a NumPy network with the same residual (to 1e-6) and exploration noise."""
         return Network(sb3_learner.network_layers(self.actor.mu), self.authority, self.exploration_std)
 
 
 class OffPolicyLearner(sb3_learner.SB3Learner):
-    """A learner that also learns from earlier iterations, which are in a replay buffer."""
+    """Base class of learners that also use the rows of earlier iterations, from a replay buffer."""
 
     def __init__(
         self, spec: AgentSpec, settings: OffPolicySettings, algorithm: type, policy: type[BasePolicy], **kwargs: Any
@@ -120,11 +121,11 @@ class OffPolicyLearner(sb3_learner.SB3Learner):
             learning_rate=settings.learning_rate,
             replay_buffer_class=sb3_learner.MixedReplayBuffer,
             buffer_size=settings.buffer_size,
-            learning_starts=0,  # see learn
+            learning_starts=0,  # `learn` waits for the steps of the settings
             batch_size=settings.batch_size,
             tau=settings.tau,
             gamma=settings.gamma,
-            replay_buffer_kwargs={"handle_timeout_termination": False},  # only collisions end rows
+            replay_buffer_kwargs={"handle_timeout_termination": False},  # truncated rows have no `dones`
             **kwargs,
         )
         self.settings = settings
@@ -136,33 +137,33 @@ class OffPolicyLearner(sb3_learner.SB3Learner):
         return list(self.sb3.policy.actor.parameters())
 
     def exploring_network(self, environment_steps: int) -> Network:
-        """Return the policy as a NumPy network; before the first update, the start policy of the settings."""
+        """Return the policy as a NumPy network, or the start policy of the settings before learning starts."""
         if not self.is_learning(environment_steps) and self.settings.start_policy == "uniform":
             return uniform_network(self.spec.inputs, self.sb3.policy.authority)
         return self.network()
 
     def is_learning(self, environment_steps: int) -> bool:
-        """Whether learning has started."""
+        """Return whether learning has started."""
         return environment_steps >= self.settings.learning_starts
 
     def set_value_scale(self, environment_rows: Experience) -> None:
-        """Shift rewards by the mean of these rows."""
+        """Set the mean reward of these rows as the offset of all rewards."""
         if self.spec.policy.normalize_value:
             self.sb3.policy.reward_offset.fill_(environment_rows.rewards.mean())
 
     def learn(self, update: Update) -> None:
-        """Add environment rows to the replay buffer, and update actor and critics with it and the model rows."""
+        """Add environment rows to the replay buffer, and update actor and critics with the buffer and model rows."""
         if update.environment_rows is not None:
-            # Includes those that were due before learning started: the policy is trained before it drives.
-            due = round(update.environment_steps * self.settings.gradient_steps_per_step)
-            self._due_gradient_steps = due - self.sb3._n_updates
+            # When learning starts, this includes the gradient steps for all environment steps before.
+            total_gradient_steps = round(update.environment_steps * self.settings.gradient_steps_per_step)
+            self._due_gradient_steps = total_gradient_steps - self.sb3._n_updates
             self.add_rows(self.buffer, update.environment_rows)
         if update.model_rows is not None:
             self.add_rows(self.buffer.new_model_buffer(len(update.model_rows.rewards)), update.model_rows)
             self.buffer.real_ratio = 0.0 if update.environment_rows is None else self.settings.real_ratio
         if self.is_learning(update.environment_steps):
-            steps = max(1, round(self._due_gradient_steps * update.share))
-            self.sb3.train(gradient_steps=steps, batch_size=self.settings.batch_size)
+            gradient_steps = max(1, round(self._due_gradient_steps * update.share))
+            self.sb3.train(gradient_steps=gradient_steps, batch_size=self.settings.batch_size)
         self.buffer.model_buffer = None
 
     def add_rows(self, buffer: ReplayBuffer, rows: Experience) -> None:
@@ -172,13 +173,13 @@ class OffPolicyLearner(sb3_learner.SB3Learner):
         sb3_learner.add_to_replay_buffer(buffer, rows, policy.authority, rewards * self.settings.reward_scale)
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
-        """Return all that it needs to resume, including the replay buffer."""
+        """Return values and tensors with which a learner resumes, including the replay buffer."""
         values, tensors = super().state()
         values |= {name: getattr(self.buffer, name) for name in REPLAY_POSITION}
         return values, tensors | self._shared_tensors()
 
     def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
-        """Resume from what `state` of a learner with the same configuration returned."""
+        """Resume from the values and tensors that `state` returned with the same configuration."""
         super().restore(values, tensors)
         self.buffer.pos, self.buffer.full = range(self.buffer.buffer_size)[values["pos"]], bool(values["full"])
         for name, tensor in self._shared_tensors().items():
@@ -186,9 +187,9 @@ class OffPolicyLearner(sb3_learner.SB3Learner):
             tensor.detach().copy_(tensors[name])
 
     def _shared_tensors(self) -> Tensors:
-        """Return the state outside SB3's parameters, as tensors that share the learner's memory."""
-        filled = self.buffer.size()
-        return {f"replay/{name}": torch.from_numpy(getattr(self.buffer, name)[:filled]) for name in REPLAY_ARRAYS}
+        """Return the state that is not in SB3's parameters, as tensors that share memory with the learner."""
+        row_count = self.buffer.size()
+        return {f"replay/{name}": torch.from_numpy(getattr(self.buffer, name)[:row_count]) for name in REPLAY_ARRAYS}
 
 
 class SAC(OffPolicyLearner):
@@ -201,13 +202,13 @@ class SAC(OffPolicyLearner):
 
     @torch.no_grad()
     def residual_distribution(self, observations: Tensor) -> Normal:
-        """Return mean and standard deviation of the residual before the tanh."""
+        """Return the distribution of the residual before the tanh, shape (n,)."""
         mean, log_std, _ = self.sb3.actor.get_action_dist_params(observations)
         return Normal(mean.squeeze(1), log_std.squeeze(1).exp())
 
     def _shared_tensors(self) -> Tensors:
-        learned = {} if self.sb3.log_ent_coef is None else {"log_ent_coef": self.sb3.log_ent_coef}
-        return super()._shared_tensors() | learned
+        temperature = {} if self.sb3.log_ent_coef is None else {"log_ent_coef": self.sb3.log_ent_coef}
+        return super()._shared_tensors() | temperature
 
 
 class TD3(OffPolicyLearner):
@@ -220,7 +221,7 @@ class TD3(OffPolicyLearner):
 
     @torch.no_grad()
     def residual_distribution(self, observations: Tensor) -> Normal:
-        """Return the residual and the standard deviation of its exploration noise [m/s2]."""
+        """Return the distribution of the residual with its exploration noise [m/s2], shape (n,)."""
         policy = self.sb3.policy
         mean = policy.authority * policy.actor(observations).squeeze(1)
         return Normal(mean, torch.full_like(mean, policy.exploration_std))

@@ -1,4 +1,4 @@
-"""Learners of Stable-Baselines3: its algorithms with a `train()` that learns from whole episodes, and their buffers."""
+"""Base class of learners that run the `train()` of Stable-Baselines3 (SB3) on whole episodes, and their buffers."""
 
 from typing import Any
 
@@ -23,23 +23,26 @@ from unjam.learners.learner import Learner
 from unjam.physics.arrays import Floats
 
 ADAM_STATE = {"step", "exp_avg", "exp_avg_sq"}
-"""what Adam stores for each parameter"""
+"""names of the values that Adam stores for each parameter"""
 
 
 class SB3Learner(Learner):
-    """An algorithm of SB3 for residuals; subclasses make it and fill its buffer."""
+    """A learner with an algorithm of SB3 for residuals; subclasses name the algorithm and fill its buffer."""
 
     gamma: float
     sb3: Any
     """SB3's algorithm: its `train()` needs a filled buffer, a logger, and the spaces of an environment"""
 
-    def __init__(self, spec: AgentSpec, algorithm: type[BaseAlgorithm], policy: type[BasePolicy], **extra: Any) -> None:
-        env = gymnasium.Env[np.ndarray, np.ndarray]()  # SB3 reads its spaces; it is never stepped
+    def __init__(
+        self, spec: AgentSpec, algorithm: type[BaseAlgorithm], policy: type[BasePolicy], **arguments: Any
+    ) -> None:
+        """Make the algorithm with `arguments`."""
+        env = gymnasium.Env[np.ndarray, np.ndarray]()  # SB3 only reads the spaces of this environment
         env.observation_space, env.action_space = policy_spaces(spec.inputs, spec.critic_inputs, spec.authority)
-        self.spec, self.gamma = spec, extra["gamma"]
+        self.spec, self.gamma = spec, arguments["gamma"]
         policy_kwargs = {"settings": spec.policy, "inputs": spec.inputs, "action_limit": spec.action_limit}
-        extra["policy_kwargs"] = policy_kwargs | extra.get("policy_kwargs", {})
-        self.sb3 = algorithm(policy=policy, env=env, seed=spec.seed, device="cpu", **extra)
+        arguments["policy_kwargs"] = policy_kwargs | arguments.get("policy_kwargs", {})
+        self.sb3 = algorithm(policy=policy, env=env, seed=spec.seed, device="cpu", **arguments)
         self.sb3.set_logger(Logger(None, []))
 
     def network(self) -> Network:
@@ -47,7 +50,7 @@ class SB3Learner(Learner):
         return self.sb3.policy.network()
 
     def log(self) -> dict[str, float]:
-        """Return what SB3 logs about its updates."""
+        """Return the numbers that SB3 logs about its updates, by name."""
         return {key.partition("/")[2]: float(value) for key, value in self.sb3.logger.name_to_value.items()}
 
     def check_parameters(self, iteration: int) -> None:
@@ -61,7 +64,7 @@ class SB3Learner(Learner):
                 )
 
     def state(self) -> tuple[dict[str, Any], Tensors]:
-        """Return values and tensors to resume exactly; there is no random state, since each update is seeded."""
+        """Return values and tensors to resume exactly, without a random state, because each update is seeded."""
         tensors: Tensors = {}
         for part, state in self.sb3.get_parameters().items():
             if "param_groups" in state:  # an optimizer
@@ -72,13 +75,13 @@ class SB3Learner(Learner):
         return {"updates": self.sb3._n_updates}, tensors
 
     def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
-        """Resume from what `state` of a learner with the same configuration returned."""
-        parts = {part: self._restored_state(part, each, tensors) for part, each in self.sb3.get_parameters().items()}
-        self.sb3.set_parameters(parts)
+        """Resume from the values and tensors that `state` returned with the same configuration."""
+        initial = self.sb3.get_parameters()
+        self.sb3.set_parameters({part: self._stored_state(part, state, tensors) for part, state in initial.items()})
         self.sb3._n_updates = values["updates"]
 
-    def _restored_state(self, part: str, initial_state: dict[str, Any], tensors: Tensors) -> dict[str, Any]:
-        """Return the stored state of a part of the learner in torch's form; `initial_state` is that of a new one."""
+    def _stored_state(self, part: str, initial_state: dict[str, Any], tensors: Tensors) -> dict[str, Any]:
+        """Return the stored state of a network or optimizer for `set_parameters`, given its state in a new learner."""
         stored = tensors_with_prefix(f"{part}/", tensors)
         if "param_groups" not in initial_state:
             return stored
@@ -95,21 +98,21 @@ class SB3Learner(Learner):
 
 
 def check_shape(name: str, tensor: torch.Tensor, expected: torch.Size) -> None:
-    """Raise `ValueError` if a stored tensor has another shape than expected: torch would repeat it, or crash."""
+    """Raise `ValueError` if a stored tensor has another shape than expected, which torch might broadcast silently."""
     if tensor.shape != expected:
         raise ValueError(f"{name} has the shape {tuple(tensor.shape)}, expected {tuple(expected)}")
 
 
 def policy_spaces(inputs: int, critic_inputs: int, authority: float) -> tuple[spaces.Box, spaces.Box]:
-    """Return observation and action space; `authority` [m/s2] bounds the mean, and noise may exceed it."""
+    """Return observation and action space; `authority` [m/s2] bounds the mean, but not the noise."""
     actions = spaces.Box(-authority, authority, (1,), np.float32)
     return spaces.Box(-np.inf, np.inf, (inputs + critic_inputs,), np.float32), actions
 
 
 def network_layers(module: nn.Module) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Return weight and bias of each linear layer as a `Network` takes them: float64 copies, inputs first."""
-    linear = [(layer.weight, layer.bias) for layer in module.modules() if isinstance(layer, nn.Linear)]
-    arrays = [[tensor.detach().cpu().numpy().astype(np.float64) for tensor in pair] for pair in linear]
+    """Return weight and bias of each linear layer as float64 copies, in the order and shape of `Network.layers`."""
+    tensors = [(layer.weight, layer.bias) for layer in module.modules() if isinstance(layer, nn.Linear)]
+    arrays = [[tensor.detach().cpu().numpy().astype(np.float64) for tensor in pair] for pair in tensors]
     return tuple((weight.T.copy(), bias) for weight, bias in arrays)
 
 
@@ -121,7 +124,10 @@ def zero_layer(layer: nn.Linear) -> None:
 
 @torch.no_grad()
 def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: Experience) -> None:
-    """Fill `buffer` with rows and their advantages, in one batch; truncated trajectories get gamma V of their end."""
+    """Replace the content of `buffer` by rows and their advantages.
+
+    At the end of a truncated trajectory, the discounted value of the last observation is added to the last reward.
+    """
     actions, observations = rows.actions[:, None], torch.as_tensor(rows.observations)
     values, log_probs, _ = policy.evaluate_actions(observations, torch.as_tensor(actions))
     last_values = policy.predict_values(torch.as_tensor(rows.last_observations)).numpy().ravel()
@@ -141,48 +147,49 @@ def fill_rollout_buffer(buffer: RolloutBuffer, policy: ActorCriticPolicy, rows: 
 
 
 def add_to_replay_buffer(buffer: ReplayBuffer, rows: Experience, authority: float, rewards: Floats) -> None:
-    """Add rows to the buffer, actions as shares of the `authority` [m/s2]; only collisions set `dones`."""
-    done = np.zeros(len(rewards), np.float32)
-    done[rows.last_rows] = rows.terminated
+    """Add rows with these rewards to the buffer, with actions as shares of the `authority` [m/s2]."""
+    dones = np.zeros(len(rewards), np.float32)
+    dones[rows.last_rows] = rows.terminated
     indices = (buffer.pos + np.arange(len(rewards))) % buffer.buffer_size
     buffer.observations[indices, 0] = rows.observations
     buffer.next_observations[indices, 0] = rows.next_observations
     buffer.actions[indices, 0, 0] = rows.actions / np.float32(authority)
     buffer.rewards[indices, 0] = rewards
-    buffer.dones[indices, 0] = done
+    buffer.dones[indices, 0] = dones
     end = buffer.pos + len(rewards)
     buffer.full = buffer.full or end >= buffer.buffer_size
     buffer.pos = end % buffer.buffer_size
 
 
 class MixedReplayBuffer(ReplayBuffer):
-    """SB3's replay buffer of environment rows; while it has model rows too, batches are mixed."""
+    """SB3's replay buffer for environment rows; while it has a buffer of model rows, batches are mixed."""
 
     model_buffer: ReplayBuffer | None = None
     real_ratio = 1.0
     """share of environment rows in a batch"""
 
     def new_model_buffer(self, rows: int) -> ReplayBuffer:
-        """Return an empty buffer for a number of model rows, which replaces the previous one."""
+        """Replace the buffer of model rows by an empty one for a number of rows, and return it."""
         arguments = self.observation_space, self.action_space, self.device
         self.model_buffer = ReplayBuffer(rows, *arguments, handle_timeout_termination=False)
         return self.model_buffer
 
     def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
-        """Return a random batch."""
+        """Return a random batch, with the share `real_ratio` of environment rows if there are model rows."""
         if self.model_buffer is None:
             return super().sample(batch_size, env)
         environment_count = round(self.real_ratio * batch_size)
-        parts = [super().sample(environment_count)] if environment_count else []
+        batches = [super().sample(environment_count)] if environment_count else []
         if environment_count < batch_size:
-            parts.append(self.model_buffer.sample(batch_size - environment_count))
-        return ReplayBufferSamples(*(torch.cat(part) for part in zip(*(each[:5] for each in parts), strict=True)))
+            batches.append(self.model_buffer.sample(batch_size - environment_count))
+        columns = zip(*(batch[:5] for batch in batches), strict=True)  # without `discounts`, which are None
+        return ReplayBufferSamples(*map(torch.cat, columns))
 
 
 def shift_rewards(rows: Experience, offset: float, gamma: float) -> Floats:
     """Return the rewards minus `offset`, shape (rows,), so that all values decrease by offset / (1 - gamma).
 
-    At a collision, which no reward follows, the last reward decreases by the missing part.
+    No reward follows a terminated trajectory: its last reward is also reduced by the offsets of the missing rewards.
     """
     rewards = rows.rewards - offset
     rewards[rows.last_rows] -= np.where(rows.terminated, offset * gamma / (1.0 - gamma), 0.0)

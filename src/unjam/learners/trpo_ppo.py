@@ -1,4 +1,4 @@
-"""TRPO and PPO, which learn from the rows of the newest policy alone, and their policy."""
+"""TRPO and PPO, which learn only from rows of the current policy, and the residual policy for them."""
 
 import math
 from typing import Any, cast
@@ -22,7 +22,7 @@ from unjam.learners.settings import PolicySettings, PPOSettings, TRPOSettings
 
 
 class BoundedTanh(nn.Module):
-    """`authority * tanh(x)`: bounds the mean of the residual (paper, section 3.3.2)."""
+    """Layer `authority * tanh(x)`, which bounds the mean of the residual (paper, section 3.3.2)."""
 
     def __init__(self, authority: float) -> None:
         super().__init__()
@@ -34,12 +34,13 @@ class BoundedTanh(nn.Module):
 
 
 class ScaledValue(nn.Module):
-    """A value head in units of the returns: `mean + std * linear(x)`, with fixed mean and std."""
+    """A value head `mean + std * linear(x)` with the fixed mean and standard deviation of the returns."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
         self.linear = nn.Linear(inputs, 1)
         self.scale: Tensor
+        """mean and standard deviation"""
         self.register_buffer("scale", torch.tensor([0.0, 1.0]))
 
     def forward(self, features: Tensor) -> Tensor:
@@ -48,31 +49,31 @@ class ScaledValue(nn.Module):
 
 
 class ActorCriticExtractor(nn.Module):
-    """Hidden layers of both networks; SB3 gives both the inputs of the actor, then those of the critic alone."""
+    """Hidden layers of actor and critic; the actor uses the first `inputs` columns of observations, the critic all."""
 
     def __init__(self, inputs: int, critic_inputs: int, hidden: tuple[int, ...]) -> None:
         super().__init__()
         self.inputs = inputs
         self.policy_net = nn.Sequential(*create_mlp(inputs, -1, list(hidden)))  # -1: no output layer
-        # TRPO recognizes the critic by `value` in its name.
+        # TRPO recognizes the parameters of the critic by `value` in their names.
         self.value_net = nn.Sequential(*create_mlp(inputs + critic_inputs, -1, list(hidden)))
         self.latent_dim_pi = self.latent_dim_vf = hidden[-1]
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the last hidden layers of actor and critic."""
+        """Return the outputs of the last hidden layers of actor and critic."""
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: Tensor) -> Tensor:
-        """Return the actor's last hidden layer."""
+        """Return the output of the actor's last hidden layer."""
         return self.policy_net(features[:, : self.inputs])
 
     def forward_critic(self, features: Tensor) -> Tensor:
-        """Return the critic's last hidden layer."""
+        """Return the output of the critic's last hidden layer."""
         return self.value_net(features)
 
 
 class ResidualPolicy(ActorCriticPolicy):
-    """SB3's actor-critic policy with a bounded mean that starts, with `zero_init`, at zero: as the expert."""
+    """SB3's actor-critic policy for a residual with a bounded mean, which is zero at the start with `zero_init`."""
 
     def __init__(self, *args: Any, settings: PolicySettings, inputs: int, action_limit: float, **kwargs: Any) -> None:
         self.settings, self.inputs, self.authority = settings, inputs, settings.authority * action_limit
@@ -85,50 +86,50 @@ class ResidualPolicy(ActorCriticPolicy):
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
-        last = nn.Linear(self.mlp_extractor.latent_dim_pi, 1)
+        last_layer = nn.Linear(self.mlp_extractor.latent_dim_pi, 1)
         if self.settings.zero_init:
-            zero_layer(last)
-        self.action_net = nn.Sequential(last, BoundedTanh(self.authority))
+            zero_layer(last_layer)
+        self.action_net = nn.Sequential(last_layer, BoundedTanh(self.authority))
         self.value_net = ScaledValue(self.mlp_extractor.latent_dim_vf)  # pyright: ignore[reportAttributeAccessIssue]
         nn.init.orthogonal_(self.value_net.linear.weight)
         nn.init.zeros_(self.value_net.linear.bias)
         if self.settings.episode_noise or not self.settings.learn_exploration_std:
             log_std = self.log_std.detach()
             if self.settings.episode_noise:
-                log_std = torch.cat([log_std, log_std[:1]])  # the bias
+                log_std = torch.cat([log_std, log_std[:1]])  # one more for the bias
             del self.log_std
             self.register_buffer("log_std", log_std)
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # pyright: ignore[reportCallIssue]
 
     def _get_action_dist_from_latent(self, latent_pi: Tensor) -> Distribution:
-        """Return SB3's distribution; per-episode noise perturbs the bias, too, or dead units would not explore."""
+        """Return SB3's distribution; per-episode noise also perturbs the bias, so that dead units explore."""
         if not self.settings.episode_noise:
             return super()._get_action_dist_from_latent(latent_pi)
         mean = self.action_net(latent_pi)
         return self.action_dist.proba_distribution(mean, self.log_std, append_ones(latent_pi))  # pyright: ignore[reportCallIssue]
 
     def set_learning_rates(self, actor: float, critic: float) -> None:
-        """Give actor and critic separate learning rates, in a new optimizer."""
-        named = list(self.named_parameters())
+        """Make a new optimizer with separate learning rates of actor and critic."""
+        parameters = list(self.named_parameters())
         groups = [
-            {"params": [parameter for name, parameter in named if ("value" in name) is is_critic], "lr": rate}
+            {"params": [parameter for name, parameter in parameters if ("value" in name) is is_critic], "lr": rate}
             for is_critic, rate in ((False, actor), (True, critic))
         ]
         self.optimizer = Adam(groups, eps=1e-5, fused=True)  # fused: see `unjam.kernels`
 
     def scale_value(self, mean: float, std: float) -> None:
-        """Set the scale of the value head."""
+        """Set mean and standard deviation of the value head."""
         self.value_net.scale.copy_(torch.tensor([mean, std]))  # pyright: ignore[reportCallIssue]
 
     def network(self) -> Network:
-        """Return the policy as a NumPy network: the same residual to 1e-6, and the same exploration noise."""
+        """Return the policy as a NumPy network with the same residual (to 1e-6) and the same exploration noise."""
         layers = network_layers(nn.Sequential(self.mlp_extractor.policy_net, self.action_net))  # pyright: ignore[reportArgumentType]
         std = float(torch.exp(self.log_std.detach()).flatten()[0].item())
         return Network(layers, self.authority, std, self.settings.episode_noise)
 
 
 class OnPolicyLearner(SB3Learner):
-    """A learner that learns from the rows of the current policy alone."""
+    """Base class of learners that learn only from rows of the current policy."""
 
     def set_value_scale(self, environment_rows: Experience) -> None:
         """Scale the value head by the returns of these rows."""
@@ -142,7 +143,7 @@ class OnPolicyLearner(SB3Learner):
 
     @torch.no_grad()
     def residual_distribution(self, observations: Tensor) -> Normal:
-        """Return mean and standard deviation of the residual."""
+        """Return the distribution of the residual [m/s2], shape (n,)."""
         normal = cast(Normal, self.sb3.policy.get_distribution(observations).distribution)
         return Normal(normal.mean.squeeze(1), normal.stddev.squeeze(1))
 
@@ -165,7 +166,7 @@ class TRPO(OnPolicyLearner):
             spec,
             sb3_contrib.TRPO,
             ResidualPolicy,
-            # SB3 drops its own eps when it gets optimizer arguments. Fused: see `unjam.kernels`.
+            # With optimizer arguments, SB3 does not add its default eps. Fused: see `unjam.kernels`.
             policy_kwargs={"optimizer_kwargs": {"eps": 1e-5, "weight_decay": decay, "fused": True}},
             learning_rate=settings.critic_learning_rate,
             n_steps=settings.critic_batch_size,  # the buffer is resized to the episodes
@@ -191,20 +192,20 @@ class PPO(OnPolicyLearner):
             gamma=settings.gamma,
             gae_lambda=settings.gae_lambda,
             clip_range=settings.clip_range,
-            # SB3 clips the gradients of actor and critic together, and the critic's, in units of returns, are larger.
+            # SB3 clips the gradients of actor and critic together, although those of the critic are much larger.
             max_grad_norm=math.inf,
         )
         self._minibatches = settings.minibatches
         self.sb3.policy.set_learning_rates(settings.actor_learning_rate, settings.critic_learning_rate)
 
     def fill_buffer(self, rows: Experience) -> None:
-        """Fill the rollout buffer with rows, and set the size of minibatches."""
+        """Fill the rollout buffer with rows, and set the batch size."""
         super().fill_buffer(rows)
         self.sb3.batch_size = math.ceil(len(rows.rewards) / self._minibatches)
 
 
 class SeparateRatesPPO(stable_baselines3.PPO):
-    """SB3's PPO with the separate learning rates of the policy's optimizer."""
+    """SB3's PPO for an optimizer with separate learning rates of actor and critic."""
 
     def _update_learning_rate(self, optimizers: Any) -> None:
-        """Do nothing: SB3 would set one rate for actor and critic."""
+        """Do nothing, because SB3 would set the same rate for actor and critic."""

@@ -42,10 +42,10 @@ ACC_DIFFERENCES = "difference_to_acc", "flow_difference_to_acc"
 MISSING = Estimate(nan, nan, nan, 0)
 
 
-def count_answered_seeds(folder: Path, rates: Sequence[float], drivers: dict[str, Any]) -> int:
-    """Return the number of test seeds of the answer to a question in a folder; 0 without it.
+def count_assessed_seeds(folder: Path, rates: Sequence[float], drivers: dict[str, Any]) -> int:
+    """Return the number of test seeds of the assessment in a folder; 0 if it has other rates, drivers or no document.
 
-    The question is the penetration rates and `drivers`, recipes by name.
+    `drivers` has their recipes by name.
     """
     with suppress(InputError, *INVALID_DATA_ERRORS):
         earlier = parse_json((folder / ASSESSMENT_FILE).read_bytes())
@@ -54,14 +54,17 @@ def count_answered_seeds(folder: Path, rates: Sequence[float], drivers: dict[str
     return 0
 
 
-def keep_earlier_answer(folder: Path, rates: Sequence[float], drivers: dict[str, Any], seeds: int) -> Path | None:
-    """Rename page and document of another question, or with more than these test seeds; return the new path of one."""
-    if not (folder / ASSESSMENT_FILE).is_file() or 0 < count_answered_seeds(folder, rates, drivers) <= seeds:
+def archive_assessment(folder: Path, rates: Sequence[float], drivers: dict[str, Any], seeds: int) -> Path | None:
+    """Rename page and document of an assessment with other rates, drivers or more test seeds, and return a new path.
+
+    Return None if the next assessment may replace them.
+    """
+    if not (folder / ASSESSMENT_FILE).is_file() or 0 < count_assessed_seeds(folder, rates, drivers) <= seeds:
         return None
     with open_folder(folder) as opened:
         stems = (f"{Path(ASSESSMENT_FILE).stem}-{number}" for number in count(1))
         stem = next(name for name in stems if not opened.mode(f"{name}.json") and not opened.mode(f"{name}.html"))
-        # The document is last: as long as it is there, the next call knows that there is an answer.
+        # The document is renamed last: the next call recognizes an assessment by it.
         renamed = {
             name: f"{stem}{Path(name).suffix}" for name in filter(opened.mode, (ASSESSMENT_PAGE, ASSESSMENT_FILE))
         }

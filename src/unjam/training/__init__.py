@@ -1,1 +1,1 @@
-"""How we train and compare: configurations, runs, evaluations."""
+"""Training, tuning, calibration, evaluation and assessment of drivers, with their configurations and folders."""

@@ -1,6 +1,6 @@
-"""Assessment of CAVs on a user's network: controllers at several penetration rates, compared with two baselines.
+"""Assessment of CAVs on a user's network, with several controllers and penetration rates.
 
-These are human drivers alone, and ACC vehicles without a controller.
+They are compared with two baselines: human-only traffic, and ACC vehicles without a controller.
 """
 
 import json
@@ -32,8 +32,8 @@ from unjam.measures.statistics import metric_estimate
 from unjam.reports.assessment import (
     ASSESSMENT_FILE,
     ASSESSMENT_PAGE,
-    count_answered_seeds,
-    keep_earlier_answer,
+    archive_assessment,
+    count_assessed_seeds,
     write_assessment,
 )
 from unjam.scenarios import scenario_recipe
@@ -65,14 +65,14 @@ from unjam.worlds.worker_pool import WorkerPool
 
 StageCallback = Callable[[str, int], None]
 """called with the name of a stage that begins, and its maximum number of control steps"""
-SPEEDS_AHEAD = {"lane_speeds", "road_speeds", "congestion"}
-"""fields of a `LocalState` with messages about the traffic ahead"""
-FEWEST_SEEDS = {"tuning": 1, "test": MIN_TEST_SEEDS}
-"""seeds that are simulated however little time there is"""
+FIELDS_AHEAD = {"lane_speeds", "road_speeds", "congestion"}
+"""fields of a `LocalState` with roadside information about the traffic ahead"""
+MIN_SEEDS = {"tuning": 1, "test": MIN_TEST_SEEDS}
+"""seeds of each kind that are simulated even if the time is up"""
 MIN_BASELINE_EPISODES = 20
-"""episodes of the baseline to which early ends are related before the last one: two of them are too many"""
+"""minimum denominator of the share of baseline episodes that end early, until the last episode has run"""
 SELECTION_FOLDER = "selection"
-"""folder within the results with the rows of the selection seeds"""
+"""folder within the results for the rows of the selection seeds"""
 BASELINE_METRICS = ("travel_time", "outflow_veh_per_h", "fuel_ml_per_km", HARD_BRAKING_METRIC, "collisions")
 
 
@@ -81,11 +81,12 @@ class Assessment:
     """The result of an assessment."""
 
     controller_results: list[ControllerResult]
-    """results of the controller that was selected for each penetration rate; empty if all were rejected"""
+    """result of the selected controller for each penetration rate, without rates at which all were rejected"""
     acc_results: list[AccResult]
     document: dict[str, Any]
     """the content of `assessment.json`: everything except the rows"""
     page: Path
+    """the HTML page"""
 
 
 def assess(
@@ -98,21 +99,21 @@ def assess(
 ) -> Assessment:
     """Run an assessment, and write rows, `assessment.json` and the page into a folder.
 
-    Finished episodes are in a log: in the same folder an assessment of the same road and files resumes, or continues
-    with other controllers, penetration rates and budgets. After each round of test seeds the folder has the answer so
-    far. Without `minutes`, the result does not depend on the number of workers. `progress` is called with the control
-    steps of an episode, `on_stage` when a batch of episodes begins, and `on_message` with a line about its result.
-    Raise `InputError` if the folder has something else, or no driver can drive on this road.
+    Finished episodes are logged in the folder: an assessment of the same road and files resumes there, or continues
+    with other controllers, penetration rates and budgets. After each round of test seeds, the folder has the answer so
+    far. Without `minutes`, the result does not depend on the number of workers. `progress` is called with an episode
+    and its control steps so far, `on_stage` when a batch of episodes begins, and `on_message` with lines about results.
+    Raise `InputError` if the folder has other contents, or no driver can drive on this road.
     """
     log = EpisodeLog(folder, request.network)
     if log.episodes:
-        known = f"{format_count(len(log.episodes), 'episode')} of earlier calls in {folder}"
+        logged = f"{format_count(len(log.episodes), 'episode')} of earlier calls in {folder}"
         on_message(
-            f"{known}: not simulated again for the same controllers, except those of pictures; data that their code "
+            f"{logged}: not simulated again for the same controllers, except those of pictures; data that their code "
             "reads is not compared"
         )
     watch = watch_files([request.network])
-    budget, baseline = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
+    budget, baseline_rows = EpisodeBudget(request.episodes - 1, request.minutes, workers.count), OptionRows()
     new_episodes = set[tuple[Option, EpisodeSeed]]()
 
     def evaluate_options(options: Sequence[Option], seeds: Sequence[EpisodeSeed], **settings: Any) -> Evaluation:
@@ -126,40 +127,41 @@ def assess(
         return evaluate_on_roads(setups, seeds, workers, progress=report_progress, watch=watch, **settings)
 
     def run_options(kind: str, options: Sequence[Option], seeds: Sequence[EpisodeSeed]) -> dict[Option, OptionRows]:
-        """Return rows of the seeds, or of the first of them if the time ends."""
+        """Return the rows of all seeds, or only of the first seeds if the time is up."""
         hashes = {option: log.setup_hash(*request.make_setup(option)) for option in options}
         missing = [(option, seed) for option in options for seed in seeds if (hashes[option], seed) not in log.episodes]
         if missing:
-            first, last = (choose(seed[-1] for _, seed in missing) + 1 for choose in (min, max))
-            numbers = f"seeds {first} to {last}" if first < last else f"seed {first}"
-            names = format_count(len({option for option, _ in missing}), "option")
-            on_stage(f"simulating {kind} {numbers} of {names}", request.network.horizon * len(missing))
-        done, hash_by_label = list[EpisodeSeed](), {option.label: sha256 for option, sha256 in hashes.items()}
+            seed_numbers = {seed[-1] + 1 for _, seed in missing}
+            first, last = min(seed_numbers), max(seed_numbers)
+            seed_text = f"seeds {first} to {last}" if first < last else f"seed {first}"
+            option_text = format_count(len({option for option, _ in missing}), "option")
+            on_stage(f"simulating {kind} {seed_text} of {option_text}", request.network.horizon * len(missing))
+        finished_seeds, hash_by_label = list[EpisodeSeed](), {option.label: hashes[option] for option in options}
 
-        def store(seeds: Sequence[EpisodeSeed], episode: DriverAndEpisode, row: dict[str, Any]) -> None:
+        def log_row(seeds: Sequence[EpisodeSeed], episode: DriverAndEpisode, row: dict[str, Any]) -> None:
             label, index = episode
             log.add(hash_by_label[label], seeds[index], row)
 
-        # With a limit of time only some seeds at once: an answer needs all options on the same seeds.
+        # With limited time, each batch has only some seeds, because all options need results on the same seeds.
         count = seeds_at_once(len(options), workers.count) if request.minutes else len(seeds)
-        for part in (seeds[first : first + count] for first in range(0, len(seeds), count)):
-            absent = {(option, seed) for option, seed in missing if seed in part}
-            if part[0][-1] >= FEWEST_SEEDS[kind] and absent and not budget.has_time_for(len(absent)):
+        for batch in (seeds[first : first + count] for first in range(0, len(seeds), count)):
+            to_run = {(option, seed) for option, seed in missing if seed in batch}
+            if batch[0][-1] >= MIN_SEEDS[kind] and to_run and not budget.has_time_for(len(to_run)):
                 break
-            known = {
+            logged = {
                 (option.label, index)
                 for option in options
-                for index, seed in enumerate(part)
-                if (option, seed) not in absent
+                for index, seed in enumerate(batch)
+                if (option, seed) not in to_run
             }
-            evaluate_options(options, part, skipped=known, on_row=partial(store, part), with_plots=False)
-            budget.spend(len(options) * len(part), len(absent))
-            new_episodes.update(absent)
-            done += part
-        rows = {option: [log.episodes[hashes[option], seed] for seed in done] for option in options}
+            evaluate_options(options, batch, skipped=logged, on_row=partial(log_row, batch), with_plots=False)
+            budget.spend(len(options) * len(batch), len(to_run))
+            new_episodes.update(to_run)
+            finished_seeds += batch
+        rows = {option: [log.episodes[hashes[option], seed] for seed in finished_seeds] for option in options}
         human_rows = rows[HUMAN_BASELINE]
-        baseline.extend(human_rows)
-        check_baseline(baseline, MIN_BASELINE_EPISODES)
+        baseline_rows.extend(human_rows)
+        check_baseline(baseline_rows, MIN_BASELINE_EPISODES)
         # If a low penetration rate selects no vehicle for a seed, the traffic is the human baseline.
         return {
             option: [
@@ -169,25 +171,25 @@ def assess(
             for option in options
         }
 
-    def drive_for_pictures(stage: str, option: Option) -> Evaluation:
+    def run_plot_episode(stage: str, option: Option) -> Evaluation:
         on_stage(f"simulating {stage}", request.network.horizon)
         budget.spend(1)
         return evaluate_options([option], held_out_seeds(1))
 
-    first = drive_for_pictures("the human baseline, seed 1 of 1", HUMAN_BASELINE)
-    raise_failure(first.rows[HUMAN_BASELINE.label])
-    setups = {log.setup_hash(*request.make_setup(option)) for option in request.compared_options}
-    stored_episodes = sum(setup in setups for setup, _ in log.episodes)
+    baseline = run_plot_episode("the human baseline, seed 1 of 1", HUMAN_BASELINE)
+    raise_failure(baseline.rows[HUMAN_BASELINE.label])
+    setup_hashes = {log.setup_hash(*request.make_setup(option)) for option in request.compared_options}
+    stored_episodes = sum(setup_hash in setup_hashes for setup_hash, _ in log.episodes)
     for line in budget_lines(request, budget, stored_episodes):
         on_message(line)
     selection = select_controllers(request.options, partial(run_options, "tuning"), budget, on_message)
     selection_episodes = budget.used_episodes - 1
 
-    def write_answer(findings: AssessmentFindings, pictures: dict[str, Episode], is_complete: bool) -> Assessment:
+    def write_answer(findings: AssessmentFindings, plot_episodes: dict[str, Episode], is_complete: bool) -> Assessment:
         metadata = {"scenario": Path(request.file).name, "reward": request.network.reward, "manifest": manifest()}
         selection_rows = {option.label: rows for option, rows in selection.rows.items()}
         test_rows = {option.label: rows for option, rows in findings.rows.items()}
-        check_baseline(baseline, 0 if is_complete else MIN_BASELINE_EPISODES)
+        check_baseline(baseline_rows, 0 if is_complete else MIN_BASELINE_EPISODES)
         all_rows = {label: [*selection_rows.get(label, ()), *rows] for label, rows in test_rows.items()}
         document = {
             **metadata,
@@ -196,18 +198,18 @@ def assess(
             "notes": [*episode_notes(all_rows), *request.network.notes, *sensing_notes(request)],
         }
         save_evaluation(folder / SELECTION_FOLDER, Evaluation(selection_rows, {}), metadata)
-        save_evaluation(folder, Evaluation(test_rows, pictures), metadata)
-        seeds = len(findings.rows[HUMAN_BASELINE])
-        if kept_page := keep_earlier_answer(folder, request.penetration_rates, document["drivers"], seeds):
-            on_message(f"the earlier answer is now in {kept_page}")
+        save_evaluation(folder, Evaluation(test_rows, plot_episodes), metadata)
+        seed_count = len(findings.rows[HUMAN_BASELINE])
+        if archived_page := archive_assessment(folder, request.penetration_rates, document["drivers"], seed_count):
+            on_message(f"the earlier answer is now in {archived_page}")
         atomic_write(folder / ASSESSMENT_FILE, to_json(document, indent=1))
         page = write_assessment(folder, folder / ASSESSMENT_PAGE)
         return Assessment(findings.controller_results, findings.acc_results, json.loads(to_json(document)), page)
 
     def write_interim_answer(findings: AssessmentFindings) -> None:
-        known = count_answered_seeds(folder, request.penetration_rates, _driver_recipes(request))
-        if new_episodes and len(findings.rows[HUMAN_BASELINE]) > known:
-            on_message(f"the answer so far is in {write_answer(findings, first.plot_episodes, False).page}")
+        assessed_seeds = count_assessed_seeds(folder, request.penetration_rates, _driver_recipes(request))
+        if new_episodes and len(findings.rows[HUMAN_BASELINE]) > assessed_seeds:
+            on_message(f"the answer so far is in {write_answer(findings, baseline.plot_episodes, False).page}")
 
     findings = compare_on_test_seeds(
         selection.finalists,
@@ -221,12 +223,12 @@ def assess(
     )
     best = plotted_result(findings.controller_results)
     plotted = Option(best.penetration_rate, best.driver) if best else Option(request.penetration_rates[-1], ACC_DRIVER)
-    pictures = first.plot_episodes | drive_for_pictures("the pictures", plotted).plot_episodes
-    return write_answer(findings, pictures, True)
+    plot_episodes = baseline.plot_episodes | run_plot_episode("the pictures", plotted).plot_episodes
+    return write_answer(findings, plot_episodes, True)
 
 
 def budget_lines(request: AssessmentRequest, budget: EpisodeBudget, stored_episodes: int = 0) -> list[str]:
-    """Return how long a verdict and the whole budget take, and a smaller question, one line each."""
+    """Return lines about the duration of a verdict, the duration of the whole budget, and a smaller question."""
 
     def seconds(episodes: int) -> float:
         return budget.estimate_seconds(max(0, episodes - stored_episodes))
@@ -235,62 +237,63 @@ def budget_lines(request: AssessmentRequest, budget: EpisodeBudget, stored_episo
         stored = f", {min(stored_episodes, episodes):,} of them stored" if stored_episodes else ""
         return f"{format_count(episodes, 'episode')}{stored}, about {format_duration(seconds(episodes))}"
 
-    needed, limit = request.verdict_episodes, f" or {request.minutes:g} min" if request.minutes else ""
-    lines = [f"a verdict needs at least {MIN_VERDICT_SEEDS} test seeds: {duration(needed)}"]
-    too_small = ", which is too small for a verdict" if request.episodes < needed else ""
+    for_verdict, limit = request.verdict_episodes, f" or {request.minutes:g} min" if request.minutes else ""
+    lines = [f"a verdict needs at least {MIN_VERDICT_SEEDS} test seeds: {duration(for_verdict)}"]
+    too_small = ", which is too small for a verdict" if request.episodes < for_verdict else ""
     lines.append(f"the budget is at most {duration(request.episodes)}{limit}{too_small}")
-    fewest = min_episodes(len(request.penetration_rates), len(request.drivers), request.has_acc_properties)
-    if request.minutes and seconds(fewest) > 60.0 * request.minutes:
+    for_answer = min_episodes(len(request.penetration_rates), len(request.drivers), request.has_acc_properties)
+    if request.minutes and seconds(for_answer) > 60.0 * request.minutes:
         lines.append(
-            f"an answer takes longer than {request.minutes:g} min: about {format_duration(seconds(fewest))}, "
+            f"an answer takes longer than {request.minutes:g} min: about {format_duration(seconds(for_answer))}, "
             "as each option is simulated at least once"
         )
-    elif request.minutes and seconds(needed) > 60.0 * request.minutes:
+    elif request.minutes and seconds(for_verdict) > 60.0 * request.minutes:
         lines.append(f"{request.minutes:g} min are too short for a verdict")
-    small = request.smallest_question
+    small_request = request.smallest_request
     if len(request.options) > 1:
-        (option,) = small.options
+        (option,) = small_request.options
         question = f"--penetration-rates {option.penetration_rate:g} -d {shlex.quote(option.driver)}"
-        fewer = small.verdict_episodes  # which of the stored episodes are of this question is not counted
-        text = f"{format_count(fewer, 'episode')}, less those stored" if stored_episodes else duration(fewer)
+        episodes = small_request.verdict_episodes  # stored episodes of this question are not counted
+        text = f"{format_count(episodes, 'episode')}, less those stored" if stored_episodes else duration(episodes)
         lines.append(f"a smaller question, {question}, needs at least {text}")
     return lines
 
 
 def missing_budget(request: AssessmentRequest, findings: AssessmentFindings, budget: EpisodeBudget) -> dict[str, Any]:
-    """Return the budget with which the open questions would probably be answered.
+    """Return the budget that would probably be enough for a verdict on all undecided controllers.
 
-    All penetration rates stay, and only controllers are left out: they were selected on other seeds. The estimate from
-    fewer seeds than a verdict needs is rough, so that the smallest budget of a verdict is returned, too.
+    It is for all penetration rates, but only for undecided controllers. With fewer seeds than a verdict needs, the
+    estimate is rough: then the entries `min_*` are the smallest budget of any verdict.
     """
-    undecided = [each for each in findings.controller_results if each.verdict == UNDECIDED]
-    needed = [each.difference_to_acc.count + each.missing_seeds for each in undecided]
-    seeds = max([MIN_VERDICT_SEEDS, *(ceil(each) for each in needed if isfinite(each))])
-    drivers = list(dict.fromkeys(each.driver for each in undecided))
+    undecided = [result for result in findings.controller_results if result.verdict == UNDECIDED]
+    required_seeds = [result.difference_to_acc.count + result.missing_seeds for result in undecided]
+    seeds = max([MIN_VERDICT_SEEDS, *map(ceil, filter(isfinite, required_seeds))])
+    drivers = list(dict.fromkeys(result.driver for result in undecided))
     counts = len(request.penetration_rates), len(drivers), request.has_acc_properties
-    is_rough = any(each.difference_to_acc.count < MIN_VERDICT_SEEDS for each in undecided)
+    is_rough = any(result.difference_to_acc.count < MIN_VERDICT_SEEDS for result in undecided)
     min_seeds = MIN_VERDICT_SEEDS if is_rough else seeds
-    fewest, episodes = (verdict_episodes(*counts, n, len(undecided)) + PLOT_EPISODE_COUNT for n in (min_seeds, seeds))
+    least, episodes = (verdict_episodes(*counts, n, len(undecided)) + PLOT_EPISODE_COUNT for n in (min_seeds, seeds))
     return {
         "test_seeds": seeds,
         "min_test_seeds": min_seeds,
         "episodes": episodes,
-        "min_episodes": fewest,
+        "min_episodes": least,
         "seconds": budget.estimate_seconds(episodes),
-        "min_seconds": budget.estimate_seconds(fewest),
+        "min_seconds": budget.estimate_seconds(least),
         "drivers": drivers,
     }
 
 
 def sensing_notes(request: AssessmentRequest) -> list[str]:
-    """Return what the controllers are assumed to know of the traffic ahead, if any of them reads it."""
-    readers = [
-        name for name, driver in request.drivers.items() if SPEEDS_AHEAD & set(driver.requirements().measured_fields)
+    """Return a note on the assumed roadside information if a controller uses it, else an empty list."""
+    users = [
+        name for name, driver in request.drivers.items() if FIELDS_AHEAD & set(driver.requirements().measured_fields)
     ]
-    if not readers:
+    if not users:
         return []
-    known = request.network.roadside.description
-    return [f"{', '.join(readers)}: assumed to know {known}; roadside.latency, smoothing_time and loss_rate change it"]
+    information = request.network.roadside.description
+    settings = "roadside.latency, smoothing_time and loss_rate"
+    return [f"{', '.join(users)}: assumed to know {information}; {settings} change it"]
 
 
 def _driver_recipes(request: AssessmentRequest) -> dict[str, Any]:
@@ -318,8 +321,8 @@ def _assessment_document(
         missing = missing_budget(request, findings, budget)
         seeds, episodes = (_range_text(missing[f"min_{name}"], missing[name]) for name in ("test_seeds", "episodes"))
         duration = f"at most about {format_duration(missing['seconds'])}"
-        more = f"a verdict needs {seeds} test seeds ({episodes} episodes, {duration})"
-        answer = answer._replace(sentence=f"{answer.sentence.removesuffix('.')}; {more}.")
+        needs = f"a verdict needs {seeds} test seeds ({episodes} episodes, {duration})"
+        answer = answer._replace(sentence=f"{answer.sentence.removesuffix('.')}; {needs}.")
     candidates = [
         {
             **option._asdict(),
@@ -337,11 +340,11 @@ def _assessment_document(
         "missing_budget": missing,
         "recommended": best and {"penetration_rate": best.penetration_rate, "driver": best.driver},
         "controller_results": [
-            {**asdict(each), "reasons": each.reasons, "verdict": each.verdict, "summary": each.summary}
-            for each in findings.controller_results
+            {**asdict(result), "reasons": result.reasons, "verdict": result.verdict, "summary": result.summary}
+            for result in findings.controller_results
         ],
         "acc_results": [
-            {**asdict(each), "driver": ACC_DRIVER, "summary": each.summary} for each in findings.acc_results
+            {**asdict(result), "driver": ACC_DRIVER, "summary": result.summary} for result in findings.acc_results
         ],
         "candidates": candidates,
         "baseline": {name: asdict(metric_estimate(baseline_rows, name)) for name in BASELINE_METRICS},

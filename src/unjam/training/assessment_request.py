@@ -1,4 +1,4 @@
-"""The question of an assessment: road, controllers, penetration rates and budget, all of them checked."""
+"""The request of an assessment: road, controllers, penetration rates and budget."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,35 +26,38 @@ DEFAULT_CONTROLLERS = (DEFAULT_DRIVER, "follower-stopper", "pi")
 ACC_PROPERTIES = ("acceleration", "deceleration", "keep_right", "speed_gain")
 """settings of the CAVs' ACC that replace a property of the vehicle"""
 PLOT_EPISODE_COUNT = 2
+"""episodes for pictures: of the human baseline, and of one controller"""
 ZERO_PENETRATION_RATE = 1e-12
-"""penetration rate of human-only traffic: zero is not allowed on user networks"""
+"""penetration rate of human-only traffic, because user networks do not allow zero"""
 CAV_SELECTION_OPTIONS = "penetration_rate", "cav_types", "cavs"
 """options of a road that the penetration rates replace"""
 
 
 @dataclass(frozen=True)
 class AssessmentRequest:
-    """The settings of an assessment, all of them checked."""
+    """The checked settings of an assessment."""
 
     file: str
     network: UserNetwork
-    """user network with human drivers alone"""
+    """user network with human-only traffic"""
     drivers: dict[str, Driver]
+    """controllers by name"""
     penetration_rates: tuple[float, ...]
     episodes: int
+    """budget of episodes"""
     minutes: float | None
-    """time budget; beyond the fewest seeds of an answer, none begins that probably does not fit into it"""
+    """time budget [min]; it does not limit the minimum number of seeds of an answer"""
     precision: float
     """target half-width of the CI of travel time, as a share of the baseline's travel time"""
 
     @property
     def options(self) -> list[Option]:
-        """All penetration rates with all controllers."""
+        """Each controller at each penetration rate."""
         return [Option(rate, driver) for rate in self.penetration_rates for driver in self.drivers]
 
     @property
     def compared_options(self) -> list[Option]:
-        """All that may be simulated: the human baseline, ACC vehicles and the controllers."""
+        """The human baseline, ACC vehicles and each controller at each penetration rate."""
         return [HUMAN_BASELINE, *(Option(rate, ACC_DRIVER) for rate in self.penetration_rates), *self.options]
 
     @property
@@ -64,19 +67,19 @@ class AssessmentRequest:
 
     @property
     def verdict_episodes(self) -> int:
-        """Number of episodes of the smallest verdict."""
+        """Smallest number of episodes for a verdict."""
         counts = len(self.penetration_rates), len(self.drivers), self.has_acc_properties
         return verdict_episodes(*counts) + PLOT_EPISODE_COUNT
 
     @property
-    def smallest_question(self) -> "AssessmentRequest":
-        """The same request with its median penetration rate and first controller only."""
+    def smallest_request(self) -> "AssessmentRequest":
+        """The request for only the median penetration rate and the first controller."""
         rate = self.penetration_rates[len(self.penetration_rates) // 2]
         drivers = dict(list(self.drivers.items())[:1])
         return replace(self, penetration_rates=(rate,), drivers=drivers)
 
     def make_setup(self, option: Option) -> tuple[Scenario, Driver]:
-        """Return the road with this penetration rate, and the driver of the CAVs."""
+        """Return the road with the penetration rate of an option, and the driver of the CAVs."""
         if option == HUMAN_BASELINE:
             return self.network, make_driver(HUMAN_BASELINE.driver, self.network.control_step)
         road = replace(self.network, penetration_rate=option.penetration_rate)
@@ -101,7 +104,7 @@ def make_request(
     if not file.endswith(".sumocfg"):
         raise invalid_value("scenario", file, "your own .sumocfg file")
     for name in [name for name in options or {} if name in CAV_SELECTION_OPTIONS]:
-        raise InputError(f"{name}: it is not allowed here: --penetration-rates says how many vehicles are CAVs")
+        raise InputError(f"{name}: it is not allowed here, because --penetration-rates sets the share of CAVs")
     for rate in penetration_rates:
         if not 0 <= rate <= 1:
             raise invalid_value("penetration_rates", rate, "shares from 0 to 1, such as 0.05 for 5 %")

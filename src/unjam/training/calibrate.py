@@ -1,11 +1,12 @@
-"""Calibration of the human drivers and the demand of a user's network, so that detectors measure what they did.
+"""Calibration of the human drivers and the demand of a user's network to detector measurements.
 
-It varies factors on the values in the network's own files, so that differences between vehicle types remain.
+The calibration varies factors on the values in the network's files, so that differences between vehicle types remain.
 """
 
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import chain
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any
@@ -37,9 +38,9 @@ from unjam.worlds.sumo.simulation import InductionLoop
 
 CALIBRATED_NETWORK_FILE, CALIBRATION_FILE = "calibrated.sumocfg", "calibration.json"
 CALIBRATION_FINALISTS = 3
-"""trials that run again on twice as many other seeds, because the best of many trials is partly lucky"""
+"""number of best trials that run again on twice as many other seeds, because the best trial is partly lucky"""
 CALIBRATION_TEST_SEEDS = 10
-"""seeds on which the best and the original factors are evaluated"""
+"""number of seeds on which the best and the original factors are evaluated"""
 FLOW_FACTOR = "flow"
 FACTOR_RANGES: SearchSpace = {
     "tau": FloatDistribution(0.5, 2.0, log=True),
@@ -49,12 +50,12 @@ FACTOR_RANGES: SearchSpace = {
     "speedFactor": FloatDistribution(0.8, 1.25, log=True),
     FLOW_FACTOR: FloatDistribution(0.67, 1.5, log=True),
 }
-"""factors on the attributes of passenger vehicle types, and on flows"""
+"""ranges of the factors on attributes of passenger vehicle types and on flows"""
 SUMO_TYPE_DEFAULTS = {"tau": 1.0, "accel": 2.6, "decel": 4.5, "minGap": 2.5, "speedFactor": 1.0}
 SPEED_PERCENTILE, MAX_SPEED_LIMIT_RATIO = 95, 1.6
-"""percentile of the measured speeds relative to the speed limits, and its maximum: speeds in mph would have 2.2"""
+"""a percentile of measured speed divided by speed limit, and its maximum; speeds in mph would give 2.2"""
 NORMAL_DISTRIBUTION = re.compile(r"(normc?)\(([^()]*)\)")
-"""a speed factor that is drawn for each vehicle"""
+"""distribution in an attribute, such as a speed factor, from which SUMO draws a value for each vehicle"""
 
 CalibrationFactors = dict[str, float]
 """factors by the names of `FACTOR_RANGES`"""
@@ -62,7 +63,7 @@ CalibrationFactors = dict[str, float]
 
 @dataclass(frozen=True)
 class Corridor:
-    """A network and its detector measurements, both checked."""
+    """A checked network with its checked detector measurements."""
 
     files: SumoFiles
     detectors: Path
@@ -71,12 +72,15 @@ class Corridor:
     end: float
     """end of the calibrated time [s]"""
     measurements: tuple[Measurement, ...]
-    """intervals between `begin` and `end`"""
+    """measurements in intervals between `begin` and `end`"""
     excluded_count: int
+    """number of other measurements"""
     loops: tuple[InductionLoop, ...]
-    loop_numbers: tuple[tuple[int, ...], ...]
+    """simulated loops, one per lane of a detector"""
+    loop_indices: tuple[tuple[int, ...], ...]
+    """indices of the loops of each measurement"""
 
-    def scenario(self, file: Path) -> UserNetwork:
+    def load_scenario(self, file: Path) -> UserNetwork:
         """Return the human-only traffic of a variant of the network, until the last measurement."""
         options = {"penetration_rate": ZERO_PENETRATION_RATE, "cav_types": (), "begin": self.begin, "end": self.end}
         return load_user_network(str(file), options)
@@ -95,40 +99,43 @@ class Corridor:
 
 
 def load_corridor(file: str, detectors: Path, begin: float | None = None, end: float | None = None) -> Corridor:
-    """Return a network, a .sumocfg file, and its detector measurements, a CSV file, from `begin` to `end` [s].
+    """Read a network from a .sumocfg file, and its detector measurements from `begin` to `end` [s] from a CSV file.
 
-    None: times of the configuration, or of the last interval. Raise `InputError` if an argument is wrong, a detector is
-    not on the network, or nothing can be varied.
+    Without `begin` and `end`, use the times in the .sumocfg file, or the end of the last interval. Raise `InputError`
+    if an argument is wrong, a detector is not on the network, or the network has no passenger cars.
     """
     if not file.endswith(".sumocfg"):
         raise invalid_value("scenario", file, "your own .sumocfg file")
-    kind, rows = read_detectors(detectors)
+    kind, all_measurements = read_detectors(detectors)
     # The penetration rate is so small that no vehicle is a CAV.
     times = {name: time for name, time in (("begin", begin), ("end", end)) if time is not None}
-    checked = load_user_network(file, {"penetration_rate": ZERO_PENETRATION_RATE, "cav_classes": ROAD_CLASSES, **times})
-    files = read_sumo_files(Path(checked.file))
+    network = load_user_network(file, {"penetration_rate": ZERO_PENETRATION_RATE, "cav_classes": ROAD_CLASSES, **times})
+    files = read_sumo_files(Path(network.file))
     first = files.begin if begin is None else begin
     last = next((limit for limit in (end, files.end) if limit is not None), inf)
-    used = [row for row in rows if row.begin >= first and row.end <= last]
-    if not used:
+    measurements = tuple(each for each in all_measurements if each.begin >= first and each.end <= last)
+    if not measurements:
         raise InputError(f"{detectors.name}: no interval lies between {first:g} s and {last:g} s")
     if not passenger_types(files):
-        known = ", ".join(sorted(files.used_types))
-        raise InputError(f"{files.path.name}: no vehicle type is a passenger car; its types are {known}")
-    row_loops = [_detector_loops(files.network, kind, row) for row in used]
-    _check_speed_unit(files.network, kind, used, detectors.name)
-    numbers = {loop: number for number, loop in enumerate(dict.fromkeys(loop for each in row_loops for loop in each))}
-    loop_numbers = tuple(tuple(numbers[loop] for loop in each) for each in row_loops)
-    end_time = max(row.end for row in used)
-    excluded = len(rows) - len(used)
-    return Corridor(files, detectors, first, end_time, tuple(used), excluded, tuple(numbers), loop_numbers)
+        type_names = ", ".join(sorted(files.used_types))
+        raise InputError(f"{files.path.name}: no vehicle type is a passenger car; its types are {type_names}")
+    loops_by_measurement = [_detector_loops(files.network, kind, measurement) for measurement in measurements]
+    _check_speed_unit(files.network, kind, measurements, detectors.name)
+    loops = tuple(dict.fromkeys(chain(*loops_by_measurement)))
+    loop_indices = tuple(tuple(map(loops.index, detector_loops)) for detector_loops in loops_by_measurement)
+    end_time = max(measurement.end for measurement in measurements)
+    excluded_count = len(all_measurements) - len(measurements)
+    return Corridor(files, detectors, first, end_time, measurements, excluded_count, loops, loop_indices)
 
 
-def _check_speed_unit(network: Path, kind: str, rows: Sequence[Measurement], file: str) -> None:
+def _edge_id(kind: str, measurement: Measurement) -> str:
+    return measurement.place if kind == "edge" else measurement.place.rpartition("_")[0]
+
+
+def _check_speed_unit(network: Path, kind: str, measurements: Sequence[Measurement], file: str) -> None:
     """Raise `InputError` if measured speeds are so far above the speed limits that they have another unit."""
     limits = network_geometry(network).speed_limits
-    edges = [row.place if kind == "edge" else row.place.rpartition("_")[0] for row in rows]
-    ratios = [row.speed / limits[edge] for row, edge in zip(rows, edges, strict=True) if isfinite(row.speed)]
+    ratios = [each.speed / limits[_edge_id(kind, each)] for each in measurements if isfinite(each.speed)]
     ratio = float(np.percentile(ratios, SPEED_PERCENTILE)) if ratios else 0.0
     if ratio > MAX_SPEED_LIMIT_RATIO:
         raise InputError(
@@ -137,43 +144,44 @@ def _check_speed_unit(network: Path, kind: str, rows: Sequence[Measurement], fil
         )
 
 
-def _detector_loops(network: Path, kind: str, row: Measurement) -> list[InductionLoop]:
-    """Return the loops of a detector; raise `InputError` if the network has no such place."""
-    _, lengths, counts, _ = network_geometry(network)
-    edge = row.place if kind == "edge" else row.place.rpartition("_")[0]
-    all_lanes = [f"{edge}_{number}" for number in range(counts.get(edge, 0))]
-    lanes = all_lanes if kind == "edge" else [lane for lane in all_lanes if lane == row.place]
+def _detector_loops(network: Path, kind: str, measurement: Measurement) -> list[InductionLoop]:
+    """Return the loops of a detector, one per lane; raise `InputError` if the network has no such edge or lane."""
+    _, lengths, lane_counts, _ = network_geometry(network)
+    edge, place, position = _edge_id(kind, measurement), measurement.place, measurement.position
+    all_lanes = [f"{edge}_{index}" for index in range(lane_counts.get(edge, 0))]
+    lanes = all_lanes if kind == "edge" else [lane for lane in all_lanes if lane == place]
     if not lanes:
-        raise invalid_value(kind, row.place, f"one of {network.name}{spelling_hint(row.place, all_lanes or counts)}")
-    if row.position > lengths[edge]:
-        raise invalid_value(f"{kind} {row.place}: position", row.position, f"<= {lengths[edge]:g} m, its length")
-    return [InductionLoop(lane, row.position) for lane in lanes]
+        raise invalid_value(kind, place, f"one of {network.name}{spelling_hint(place, all_lanes or lane_counts)}")
+    if position > lengths[edge]:
+        raise invalid_value(f"{kind} {place}: position", position, f"<= {lengths[edge]:g} m, its length")
+    return [InductionLoop(lane, position) for lane in lanes]
 
 
 def scale_vehicle_types(files: SumoFiles, factors: CalibrationFactors) -> dict[str, dict[str, str]]:
-    """Return the changed attributes of all passenger types multiplied by `factors`, by id.
+    """Return the attributes of passenger types that `factors` change, multiplied by them, by id of the type.
 
-    Reaction times stay at least as long as the simulation step, or vehicles would collide. Raise `InputError` if an
-    attribute is not a number.
+    The time gap `tau` stays at least as long as the simulation step, or vehicles would collide. Raise `InputError` if
+    an attribute is not a number.
     """
-    scaled: dict[str, dict[str, str]] = {}
-    for name in passenger_types(files):
-        attributes = {**{key: str(value) for key, value in SUMO_TYPE_DEFAULTS.items()}, **files.types.get(name, {})}
-        changes = {
-            key: _scale_attribute(f"vType {name}: {key}", attributes[key], factor, files.step if key == "tau" else 0.0)
+    scaled_types, minimums = dict[str, dict[str, str]](), {"tau": files.step}
+    for type_id in passenger_types(files):
+        attributes = {**{key: str(value) for key, value in SUMO_TYPE_DEFAULTS.items()}, **files.types.get(type_id, {})}
+        scaled = {
+            key: _scale_attribute(f"vType {type_id}: {key}", attributes[key], factor, minimums.get(key, 0.0))
             for key, factor in factors.items()
             if key != FLOW_FACTOR and factor != 1
         }
-        if changes:
-            scaled[name] = changes
-    return scaled
+        if scaled:
+            scaled_types[type_id] = scaled
+    return scaled_types
 
 
 def _scale_attribute(field: str, text: str, factor: float, minimum: float) -> str:
-    drawn = NORMAL_DISTRIBUTION.fullmatch(text.replace(" ", ""))
+    distribution = NORMAL_DISTRIBUTION.fullmatch(text.replace(" ", ""))
     try:
-        if drawn:  # mean, deviation and bounds: this multiplies the value of each vehicle
-            return f"{drawn[1]}({','.join(f'{float(part) * factor:.6g}' for part in drawn[2].split(','))})"
+        if distribution:  # a factor on mean, deviation and bounds is a factor on the value of each vehicle
+            arguments = ",".join(f"{float(argument) * factor:.6g}" for argument in distribution[2].split(","))
+            return f"{distribution[1]}({arguments})"
         value = float(text)
     except ValueError:
         raise invalid_value(field, text, "a number, or norm(...) or normc(...) of numbers") from None
@@ -181,25 +189,29 @@ def _scale_attribute(field: str, text: str, factor: float, minimum: float) -> st
 
 
 def parse_factor_space(texts: list[str]) -> SearchSpace:
-    """Return a search space from `tau=0.5..2` or `tau=0.5..2:log`, without any `FACTOR_RANGES`; or `InputError`."""
+    """Return a search space from texts such as `tau=0.5..2` or `tau=0.5..2:log`, or `FACTOR_RANGES` without texts.
+
+    Raise `InputError` for other texts.
+    """
     space: SearchSpace = {}
-    for name, values in (parse_search_space(texts) if texts else FACTOR_RANGES).items():
+    for name, distribution in (parse_search_space(texts) if texts else FACTOR_RANGES).items():
         if name not in FACTOR_RANGES:
             raise unknown_name("vary", name, FACTOR_RANGES)
-        if isinstance(values, CategoricalDistribution) or not values.low > 0:
-            raise invalid_value(f"vary {name}", boundary_values(values), "a range of factors > 0, as 0.5..2")
-        space[name] = float_range(values)
+        if isinstance(distribution, CategoricalDistribution) or not distribution.low > 0:
+            raise invalid_value(f"vary {name}", boundary_values(distribution), "a range of factors > 0, as 0.5..2")
+        space[name] = float_range(distribution)
     return space
 
 
 @dataclass(frozen=True)
 class CalibrationTrial:
-    """A trial of factors."""
+    """Factors and their score."""
 
     factors: CalibrationFactors
     score: float | None
-    """mean over the seeds; None if SUMO failed"""
+    """mean of `Agreement.score` over the seeds, to minimize; None if SUMO failed"""
     failure: str
+    """reason of SUMO's failure, or an empty text"""
 
 
 @dataclass(frozen=True)
@@ -207,20 +219,26 @@ class CalibrationResult:
     """Result of a calibration."""
 
     factors: CalibrationFactors
+    """best factors"""
     vehicle_types: dict[str, dict[str, str]]
     """changed attributes of vehicle types, by id"""
     original: list[Agreement]
+    """agreement of the original network on each test seed"""
     calibrated: list[Agreement]
+    """agreement of the calibrated network on each test seed"""
     trials: list[CalibrationTrial]
     file: Path
+    """the calibrated network"""
 
     def estimates(self) -> dict[str, dict[str, Estimate]]:
         """Return the mean of each measure with its CI: original, calibrated, and the paired difference."""
         estimates = {}
         for name in asdict(self.original[0]):
-            both = self.original, self.calibrated
-            before, after = (np.array([getattr(each, name) for each in rows]) for rows in both)
-            columns = {"original": before, "calibrated": after, "difference": after - before}
+            original, calibrated = (
+                np.array([getattr(agreement, name) for agreement in agreements])
+                for agreements in (self.original, self.calibrated)
+            )
+            columns = {"original": original, "calibrated": calibrated, "difference": calibrated - original}
             bounds = (0.0, 1.0 if name == "geh_below_5" else inf)
             estimates[name] = {
                 column: estimate(values.tolist(), bounds=UNBOUNDED if column == "difference" else bounds)
@@ -239,12 +257,12 @@ def calibrate(
     seed: int = 0,
     on_message: Callable[[str], None] = lambda line: None,
 ) -> CalibrationResult:
-    """Search factors on vehicle types and flows, and write the best as a network and `calibration.json`.
+    """Search factors on vehicle types and flows, and write the calibrated network and `calibration.json`.
 
     The trials are stored in the folder: an interrupted calibration resumes with the same result, also with more trials.
-    The first trial has factors of one, or the nearest values in the space; `seed` is that of the proposals. The result
-    does not depend on the number of processes. Raise `UnjamError` if SUMO cannot simulate the original network, or if
-    its process was lost repeatedly.
+    The first trial has factors of one, or the nearest values in the space; `seed` is the seed of the proposals. The
+    result does not depend on the number of processes. Raise `UnjamError` if SUMO cannot simulate the original network,
+    or if its process was lost repeatedly.
     """
     original, watch = dict.fromkeys(space, 1.0), FileWatch(lambda: (corridor.detectors, *corridor.files.sources))
     log = TrialLog(folder, corridor.metadata() | {"space": repr(space), "seeds": seeds_per_trial, "seed": seed})
@@ -252,19 +270,19 @@ def calibrate(
 
     def simulate(factors: CalibrationFactors, seeds: Sequence[tuple[int, ...]]) -> list[Agreement]:
         with PrivateFolder() as private:
-            scenario = corridor.scenario(_write_network(corridor, factors, Path(private) / CALIBRATED_NETWORK_FILE))
-            runs = simulator.run(scenario, seeds, corridor.loops)
+            file = _write_scaled_network(corridor, factors, Path(private) / CALIBRATED_NETWORK_FILE)
+            runs = simulator.run(corridor.load_scenario(file), seeds, corridor.loops)
         watch.check()
-        flows_and_speeds = (aggregate_passages(measurements, corridor.loop_numbers, passages) for passages in runs)
-        return [compute_agreement(measurements, *each) for each in flows_and_speeds]
+        flows_and_speeds = (aggregate_passages(measurements, corridor.loop_indices, passages) for passages in runs)
+        return [compute_agreement(measurements, flows, speeds) for flows, speeds in flows_and_speeds]
 
     def score_factors(factors: CalibrationFactors, first: int, count: int) -> CalibrationTrial:
         text = to_json(factors)
         if (first, text) not in log.verdicts:
             try:
-                rows = simulate(factors, tuning_seeds(count, first))
-                log.add(first, text, (float(np.mean([row.score for row in rows])), ""))
-            except LostWorkerError:  # says nothing about these factors
+                agreements = simulate(factors, tuning_seeds(count, first))
+                log.add(first, text, (float(np.mean([agreement.score for agreement in agreements])), ""))
+            except LostWorkerError:  # not caused by these factors
                 raise
             except EpisodeError as error:
                 if factors == original:
@@ -274,24 +292,28 @@ def calibrate(
 
     results: list[CalibrationTrial] = []
     study = create_study(sampler=TPESampler(seed=seed, multivariate=True))
-    limits = {name: boundary_values(values) for name, values in space.items()}
+    limits = {name: boundary_values(distribution) for name, distribution in space.items()}
     study.enqueue_trial({name: min(max(1.0, low), high) for name, (low, high) in limits.items()})
     original_trial = score_factors(original, 0, seeds_per_trial)
-    for number in range(trials):
-        asked = study.ask(dict(space))
-        factors = {name: float(f"{value:.4g}") for name, value in asked.params.items()}
+    for number in range(1, trials + 1):
+        proposal = study.ask(dict(space))
+        factors = {name: float(f"{value:.4g}") for name, value in proposal.params.items()}
         results.append(trial := score_factors(factors, 0, seeds_per_trial))
-        study.tell(asked, trial.score, state=TrialState.FAIL if trial.score is None else None)
+        study.tell(proposal, trial.score, state=TrialState.FAIL if trial.score is None else None)
         text = trial.failure if trial.score is None else f"{trial.score:.4g}"
-        on_message(f"{number + 1} of {trials}: {_factor_text(trial.factors)}: {text}")
-    ranked = sorted((each for each in results if each.score is not None), key=_ranking_score)[:CALIBRATION_FINALISTS]
-    again = [*ranked, original_trial]
-    finalists = [score_factors(each.factors, seeds_per_trial, 2 * seeds_per_trial) for each in again]
+        on_message(f"{number} of {trials}: {_factor_text(trial.factors)}: {text}")
+    ranked = sorted((trial for trial in results if trial.score is not None), key=_ranking_score)
+    finalists = [
+        score_factors(trial.factors, seeds_per_trial, 2 * seeds_per_trial)
+        for trial in (*ranked[:CALIBRATION_FINALISTS], original_trial)
+    ]
     best = min(finalists, key=_ranking_score).factors
     on_message(f"evaluating on {CALIBRATION_TEST_SEEDS} test seeds: {_factor_text(best)}")
-    before, after = (simulate(factors, held_out_seeds(CALIBRATION_TEST_SEEDS)) for factors in (original, best))
-    types, file = scale_vehicle_types(corridor.files, best), folder / CALIBRATED_NETWORK_FILE
-    result = CalibrationResult(best, types, before, after, results, _write_network(corridor, best, file))
+    test_seeds = held_out_seeds(CALIBRATION_TEST_SEEDS)
+    original_rows, calibrated_rows = (simulate(factors, test_seeds) for factors in (original, best))
+    types = scale_vehicle_types(corridor.files, best)
+    file = _write_scaled_network(corridor, best, folder / CALIBRATED_NETWORK_FILE)
+    result = CalibrationResult(best, types, original_rows, calibrated_rows, results, file)
     document = {
         **corridor.metadata(),
         "seed": seed,
@@ -309,7 +331,7 @@ def calibration_document(result: CalibrationResult) -> dict[str, Any]:
         "factors": result.factors,
         "vehicle_types": result.vehicle_types,
         "agreement": {
-            name: {column: asdict(each) for column, each in columns.items()}
+            name: {column: asdict(column_estimate) for column, column_estimate in columns.items()}
             for name, columns in result.estimates().items()
         },
         "rows": {"original": list(map(asdict, result.original)), "calibrated": list(map(asdict, result.calibrated))},
@@ -325,6 +347,6 @@ def _factor_text(factors: Mapping[str, float]) -> str:
     return ", ".join(f"{name} x {value:g}" for name, value in factors.items())
 
 
-def _write_network(corridor: Corridor, factors: CalibrationFactors, file: Path) -> Path:
+def _write_scaled_network(corridor: Corridor, factors: CalibrationFactors, file: Path) -> Path:
     types = scale_vehicle_types(corridor.files, factors)
     return write_variant(corridor.files, types, factors.get(FLOW_FACTOR, 1.0), file)

@@ -47,7 +47,7 @@ from unjam.worlds.batch.support import statistically_unsupported_reason, unsuppo
 from unjam.worlds.episode import Task
 
 CONFIG_FILE, MANIFEST_FILE = "config.toml", "manifest.json"
-"""the configuration in the folder of a run or of a search, and the origin of a run"""
+"""files in a run folder: its configuration, which the folder of a search has too, and the origin of the run"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -55,25 +55,25 @@ class EvaluationSettings:
     """Validation and evaluation of a run, with the deterministic policy; their steps do not count as training."""
 
     validation_interval: NonNegativeInt = 5
-    """iterations between validations; 0: none, and the last policy becomes the controller"""
+    """iterations between validations; 0: no validations, and the last policy becomes the controller"""
     patience: NonNegativeInt = 0
-    """training ends after this number of validations without a new best; 0: it continues to `steps`"""
+    """training ends after this number of validations without a new best return; 0: it continues to `steps`"""
     convergence_window: NonNegativeInt = 0
-    """training ends if the mean return of this number of iterations, exploration included, is not better than that of
-    the same number before, checked once per window: the paper's rule; 0: it continues to `steps`"""
+    """training ends if the mean return of this number of iterations, with exploration, is not better than that of as
+    many iterations before them, checked once per window (the paper's rule); 0: it continues to `steps`"""
     validation_episodes: PositiveInt = 4
-    """episodes of a validation, with the same seeds each time; they select the controller"""
+    """episodes of a validation, with the same seeds in each validation; the controller is selected by their return"""
     episodes: PositiveInt = 20
     """episodes of the final evaluation, on test seeds"""
     baselines: tuple[str, ...] = ("human", "pi", "follower-stopper")
     """drivers that are evaluated in addition to the expert and the trained controller"""
 
     def should_stop_early(self, progress: Sequence[dict[str, Any]]) -> bool:
-        """Return whether a training with these rows of progress ends before its steps are done."""
+        """Return whether a training with these rows of progress ends before it has made all steps."""
         return self.is_out_of_patience(progress) or self.has_converged(progress)
 
     def has_converged(self, progress: Sequence[dict[str, Any]]) -> bool:
-        """Return whether the last `convergence_window` iterations were not better than those before."""
+        """Return whether the last `convergence_window` iterations were not better than as many iterations before."""
         window = self.convergence_window
         if not window or len(progress) % window or len(progress) < 2 * window:
             return False
@@ -81,30 +81,30 @@ class EvaluationSettings:
         return sum(returns[window:]) <= sum(returns[:window])
 
     def is_out_of_patience(self, progress: Sequence[dict[str, Any]]) -> bool:
-        """Return whether `patience` validations in a row had no new best return."""
+        """Return whether the last `patience` scheduled validations had no new best return."""
         interval = self.validation_interval
-        scheduled = [row for row in progress if interval and row["iteration"] % interval == 0]  # not that at the end
+        scheduled = [row for row in progress if interval and row["iteration"] % interval == 0]
         returns = [value for row in scheduled if (value := row.get("return_validation")) is not None]
         if not self.patience or not returns:
             return False
         best = max(range(len(returns)), key=returns.__getitem__)
-        since = len(returns) - 1 - best if returns[best] > progress[0]["return_expert"] else len(returns)
-        return since >= self.patience
+        count = len(returns) - 1 - best if returns[best] > progress[0]["return_expert"] else len(returns)
+        return count >= self.patience
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class TaskConfig:
-    """One of several roads of a training; missing and empty entries are those of the run."""
+    """One of several roads of a training; missing and empty entries have the values of the run."""
 
     scenario: str = ""
     scenario_options: Options = field(default_factory=dict)
-    """changes to the scenario's parameters, in addition to the run's"""
+    """changes to the scenario's parameters, in addition to those of the run"""
     expert: str = ""
     reward: str = ""
     weight: Positive = 1.0
     """share of the environment steps, relative to the weights of the other tasks"""
     name: Annotated[str, Field(pattern=r"^[\w-]*$")] = ""
-    """name of its folder; empty: the scenario's"""
+    """name of the folder of the task; empty: the name of the scenario"""
 
 
 @parameter_dataclass("", frozen=True, config=STRICT)
@@ -116,19 +116,20 @@ class RunConfig(AgentSettings):
     """changes to the scenario's parameters"""
     expert: str = "pi"
     """driver to which the residual is added: a name, `path.py:name`, a run folder, a .unjam file; `none`: the network
-    drives alone"""
+    drives without an expert"""
     reward: str = ""
-    """a name or `path.py:name`; empty: the scenario's own"""
+    """a name or `path.py:name`; empty: the reward of the scenario"""
     steps: PositiveInt = 960_000
     """environment steps of training"""
     seed: Annotated[int, Field(ge=0, lt=TRAINING_SEED_LIMIT)] = 0
     """seed of the whole run; larger numbers are reserved for validation, tuning and test seeds"""
     workers: PositiveInt = 2
+    """processes that run episodes; the result does not depend on their number"""
     backend: Annotated[str, AfterValidator(check_backend_name)] = "sumo"
     """the simulator: `sumo`, `batch`, or your own, `path.py:name`. `batch` runs all episodes of an iteration, or of a
     validation, at once, which is faster for large iterations. On rings it equals SUMO except for rounding; a single
-    figure eight or on-ramp equals SUMO in distribution. Other roads of a mixture run in SUMO, as does the final
-    evaluation"""
+    figure eight or on-ramp equals SUMO in distribution. The other roads of several tasks, and the final evaluation, run
+    in SUMO"""
     stratified: bool = True
     """whether the episodes of an iteration or validation cover the range of drawn values (the ring's length) evenly"""
     policy: PolicySettings = field(default_factory=PolicySettings)
@@ -136,17 +137,17 @@ class RunConfig(AgentSettings):
     """the learned model (the paper: virtual environment), in which the agent learns between environment episodes"""
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     tasks: tuple[TaskConfig, ...] = ()
-    """roads that are trained on together; empty: the one above"""
+    """roads of a training on several roads; empty: only `scenario`"""
     task_sampling: TaskSampling = "weights"
-    """how many episodes each of several roads has: by its `weight`; `regret`: from each validation to the next, half of
-    all steps go to roads on which the return is below the best return so far"""
+    """distribution of the steps among several roads: by their `weight`, or with `regret`: from each validation to the
+    next, half of all steps go to roads on which the return is below its best value so far"""
     preset: str = ""
-    """name of the preset that it started from, for the record"""
+    """name of the preset from which the configuration was made"""
 
     @model_validator(mode="before")
     @classmethod
     def _check_no_objects(cls, values: Any) -> Any:
-        _refuse_objects(values.kwargs if isinstance(values, ArgsKwargs) else values, "")
+        _check_no_objects_in(values.kwargs if isinstance(values, ArgsKwargs) else values, "")
         return values
 
     @model_validator(mode="after")
@@ -212,56 +213,56 @@ class RunConfig(AgentSettings):
         return configs
 
     def make_tasks(self) -> list[Task]:
-        """Return the tasks of the training; raise `InputError` if the inputs of the network differ between them."""
+        """Return the tasks of the training; raise `InputError` if they have different inputs of the network."""
         weights = [task.weight for task in self.tasks] or [1.0]
         tasks = [
             Task(road.make_scenario(), road.make_expert(), road.reward, weight, name)
             for (name, road), weight in zip(self.task_configs().items(), weights, strict=True)
         ]
-        first, *others = (observation_inputs(self.policy.inputs, task.expert) for task in tasks)
-        for task, inputs in zip(tasks[1:], others, strict=True):
-            if inputs != first:
+        inputs = [observation_inputs(self.policy.inputs, task.expert) for task in tasks]
+        for task, task_inputs in zip(tasks, inputs, strict=True):
+            if task_inputs != inputs[0]:
                 raise InputError(f"tasks: the network would have other inputs on {task.name} than on {tasks[0].name}")
         return tasks
 
     def make_scenario(self) -> Scenario:
-        """Return the scenario with its options."""
+        """Return the scenario with the configured options."""
         return make_scenario(self.scenario, self.scenario_options)
 
     def make_expert(self) -> Driver:
         """Return the driver to which the residual is added."""
         from unjam.controller import make_expert
 
-        step = self.make_scenario().control_step
-        expert = Constant() if self.expert == "none" else make_expert(self.expert, step)
-        return HistoryDriver(expert, step) if self.policy.history_features else expert
+        control_step = self.make_scenario().control_step
+        expert = Constant() if self.expert == "none" else make_expert(self.expert, control_step)
+        return HistoryDriver(expert, control_step) if self.policy.history_features else expert
 
 
 def planned_steps(config: RunConfig) -> int:
-    """Return the environment steps of a new training: whole iterations, unless episodes end early."""
+    """Return the environment steps of a new training in whole iterations if no episode ends early."""
     tasks = config.make_tasks()
     counts = count_episodes(tasks, config.learner.steps_per_iteration, weight_shares(tasks))
-    steps = sum(count * task.scenario.max_episode_steps for count, task in zip(counts, tasks, strict=True))
-    return ceil(config.steps / steps) * steps
+    iteration_steps = sum(count * task.scenario.max_episode_steps for count, task in zip(counts, tasks, strict=True))
+    return ceil(config.steps / iteration_steps) * iteration_steps
 
 
 def load_config(file: Path | str | None = None, preset: str = "", changes: dict[str, Any] | None = None) -> RunConfig:
     """Return a configuration: the defaults, changed by a preset, a TOML file and `changes`, in this order.
 
     Keys of `changes` may have dots: `trpo.gamma`. Raise `InputError` for an unknown key or preset, a value out of
-    range, an unreadable file, a file in a run folder that names untrusted Python code, and a function, a class or a
-    driver, because a training imports them in other processes, by `path.py:name`.
+    range, an unreadable file, untrusted Python code in a file in a run folder, and for Python objects as values:
+    a training imports functions, classes and drivers in other processes, by `path.py:name`.
     """
     file = None if file is None else Path(file)
     file_values = read_values(file) if file is not None else {}
-    if file is not None and _is_in_run_folder(file):  # other files are the user's own
+    if file is not None and _is_in_run_folder(file):  # the code in other files is the user's own
         check_trusted_values(f"config file {file}", file_values)
     user_values = without_toml_file(merge_changes(file_values, nest_keys(changes or {})))
     if isinstance(tasks := user_values.get("tasks"), list):
-        user_values["tasks"] = [_without_toml_file_of_task(each) for each in tasks]
+        user_values["tasks"] = [_expand_toml_file_of_task(task) for task in tasks]
     scenario_name = str(user_values.get("scenario", RunConfig.scenario))
     scenario = default_scenario(scenario_name)
-    for name in user_values.keys() - {each.name for each in fields(RunConfig)}:
+    for name in user_values.keys() - {setting.name for setting in fields(RunConfig)}:
         if hasattr(scenario, name):
             raise InputError(f"{name}: unknown name; did you mean 'scenario_options.{name}'?")
     values: dict[str, Any] = {}
@@ -273,42 +274,42 @@ def load_config(file: Path | str | None = None, preset: str = "", changes: dict[
     values = merge_changes({key: value for key, value in values.items() if key not in unused}, user_values)
     model = values.get("model", {})
     if scenario.actuation == "cruise" and isinstance(model, dict) and model.get("kind", "row") == "row":
-        # The row model cannot represent the ACC of a CAV: the default is to have no model.
+        # The row model cannot represent the ACC of a CAV: by default, there is no model.
         values = merge_changes({"model": {"model_ratio": 0.0}}, values)
     return build_dataclass(RunConfig, values, "")
 
 
 def read_values(file: Path) -> dict[str, Any]:
-    """Return the values of a configuration file, with names relative to the start of its run as absolute ones."""
-    values, start = read_toml(file), _start_folder(file.absolute().parent)
-    return values if start == Path.cwd() else absolute_names(values, start)
+    """Return the values of a configuration file, with absolute file names if its run was started in another folder."""
+    values, start_folder = read_toml(file), _start_folder(file.absolute().parent)
+    return values if start_folder == Path.cwd() else absolute_names(values, start_folder)
 
 
 def _start_folder(run: Path) -> Path:
-    """Return the working folder in which a run or the run of a task was started; the present one if unknown."""
+    """Return the working folder in which the run of a run folder or task folder was started, by default the present."""
     for folder in (run, run.parent):
         with suppress(OSError, ValueError, LookupError, TypeError):
             if (folder / MANIFEST_FILE).is_file():
-                start = parse_json((folder / MANIFEST_FILE).read_bytes())["start_folder"]
-                return Path(os.path.realpath(folder / start))
+                start_folder = parse_json((folder / MANIFEST_FILE).read_bytes())["start_folder"]
+                return Path(os.path.realpath(folder / start_folder))
     return Path.cwd()
 
 
-def _without_toml_file_of_task(values: Any) -> Any:
-    """Return a task with the content of its TOML file, and with the name of this file."""
-    if not isinstance(values, dict) or (changed := without_toml_file(values)) is values:
+def _expand_toml_file_of_task(values: Any) -> Any:
+    """Return the values of a task with the content of its scenario's TOML file, if it has one, and the file's name."""
+    if not isinstance(values, dict) or (expanded := without_toml_file(values)) is values:
         return values
-    return {"name": re.sub(r"[^\w-]", "-", Path(values["scenario"]).stem), **changed}
+    return {"name": re.sub(r"[^\w-]", "-", Path(values["scenario"]).stem), **expanded}
 
 
-def _refuse_objects(value: Any, name: str) -> None:
-    """Raise `InputError` if a value contains a function, a class or a driver of this process."""
+def _check_no_objects_in(value: Any, name: str) -> None:
+    """Raise `InputError` if a value contains a function, a class or a driver."""
     if isinstance(value, dict):
         for key, inner in value.items():
-            _refuse_objects(inner, f"{name}.{key}".strip("."))
+            _check_no_objects_in(inner, f"{name}.{key}".strip("."))
     elif isinstance(value, list | tuple):
         for inner in value:
-            _refuse_objects(inner, name)
+            _check_no_objects_in(inner, name)
     elif callable(value) or callable(getattr(value, "act", None)):
         reference = object_reference(value)
         hint = f"; did you mean {reference!r}?" if reference else ""
@@ -327,7 +328,7 @@ def _is_in_run_folder(file: Path) -> bool:
 
 
 def _check_preset_conflicts(preset: str, tasks: Sequence[dict[str, Any]], user_values: dict[str, Any]) -> None:
-    """Raise `InputError` if a value of the user is another one in every task of a preset."""
+    """Raise `InputError` if every task of a preset has another value for a setting of the user."""
     names = ("scenario", "reward", "scenario_options")
     for name, value in flatten_keys({key: value for key, value in user_values.items() if key in names}).items():
         if all(flatten_keys(task).get(name, "") not in ("", value) for task in tasks):
@@ -335,5 +336,5 @@ def _check_preset_conflicts(preset: str, tasks: Sequence[dict[str, Any]], user_v
 
 
 def to_toml(config: RunConfig) -> str:
-    """Return a configuration as TOML, every key written out."""
+    """Return a configuration as TOML with all keys."""
     return tomli_w.dumps(asdict(config))

@@ -1,4 +1,4 @@
-"""`unjam drive`: any drivers on any seeds, and the result as tables and figures in a notebook."""
+"""`unjam drive`: any drivers on any seeds, with the result as tables and figures, also in notebooks."""
 
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +21,7 @@ from unjam.measures.feasibility import feasibility_by_driver
 from unjam.measures.metric_table import choose_baseline, in_order
 from unjam.measures.metrics import METRICS
 from unjam.measures.notes import count_early_ends, episode_notes
-from unjam.measures.statistics import paired_difference
+from unjam.measures.statistics import Estimate, paired_difference
 from unjam.measures.verdict import metric_frame, short_table_metrics, verdicts
 from unjam.parameters import check_integer
 from unjam.reports.results import to_plot_episode
@@ -46,26 +46,26 @@ MISSING_ACC_NOTE = "limits the ACC of a CAV, but CAVs have none: --set actuation
 
 @dataclass(frozen=True)
 class DriveResult(Evaluation):
-    """Episodes of one or several drivers on the same traffic, and the files with them."""
+    """Episodes of one or several drivers in the same traffic, and the folder with their files."""
 
     scenario: str = ""
     backend: str = "sumo"
     folder: Path | None = None
     report: Path | None = None
     notes: list[str] = field(default_factory=list)
-    """caveats, as controllers on a road that they were not made for"""
+    """caveats, such as a controller on a road for which it was not made"""
     baseline: str = ""
-    """label of the driver that the others are compared with; empty: human drivers, or else the best expert"""
+    """label of the driver with which the others are compared; empty: human drivers, or else the best expert"""
     first_driver: str = ""
-    """label of the driver that was given first; empty: that of the first rows"""
+    """label of the first driver in the call; empty: the driver of the first rows"""
 
     @property
     def mean(self) -> dict[str, float]:
-        """Mean of every metric over the episodes of the driver that was given first."""
+        """Mean of every metric over the episodes of the first driver."""
         return self.means()[self.first_driver or next(iter(self.rows))]
 
     def table(self, brief: bool = False) -> "pd.DataFrame":
-        """Return a row per metric with the mean and both ends of the 95 % CI of each driver; `brief`: what matters.
+        """Return a row per metric, or with `brief` per important metric, with mean and 95 % CI limits of each driver.
 
         `result.table().loc["mean_speed", ("pi", "mean")]` is one number.
         """
@@ -73,12 +73,12 @@ class DriveResult(Evaluation):
 
         names = short_table_metrics(self.rows) if brief else tuple(METRICS)
         summaries = {label: self.summary(label) for label in self.rows}
-        numbers = {
-            (label, part): [getattr(summary[name], part) for name in names]
+        columns = {
+            (label, statistic): [getattr(summary[name], statistic) for name in names]
             for label, summary in summaries.items()
-            for part in ("mean", "low", "high")
+            for statistic in ("mean", "low", "high")
         }
-        frame = pd.DataFrame(numbers, index=pd.Index(names, name="metric"))
+        frame = pd.DataFrame(columns, index=pd.Index(names, name="metric"))
         return frame.rename_axis(columns=("driver", None))
 
     def episodes(self) -> "pd.DataFrame":
@@ -86,20 +86,20 @@ class DriveResult(Evaluation):
         return rows_to_frame(self.rows)
 
     def __str__(self) -> str:
-        """Return the verdicts and the table of the metrics that matter, for `print`."""
-        lines = (line for each in verdicts(self.rows, self.baseline) for line in each.lines)
+        """Return the verdicts and the table of the important metrics, for `print`."""
+        lines = (line for verdict in verdicts(self.rows, self.baseline) for line in verdict.lines)
         return "\n".join([*lines, metric_frame(self.rows).to_string(index=False)])
 
     def _repr_html_(self) -> str:
-        """Return the verdicts, the metrics that matter, and the trajectories of all vehicles, for notebooks."""
+        """Return the verdicts, the important metrics, and the trajectories of all vehicles, for notebooks."""
         from unjam.reports.figures import data_uri
 
-        lines = ("<br>".join(map(escape, each.lines)) for each in verdicts(self.rows, self.baseline))
-        table = "".join(f"<p>{text}</p>" for text in lines) + metric_frame(self.rows).to_html(index=False, border=0)
+        paragraphs = ("<br>".join(map(escape, verdict.lines)) for verdict in verdicts(self.rows, self.baseline))
+        page = "".join(f"<p>{text}</p>" for text in paragraphs) + metric_frame(self.rows).to_html(index=False, border=0)
         if not self.plot_episodes:
-            return table
+            return page
         attributes = 'style="max-width: 100%" alt="every vehicle over time, dark is slow"'
-        return f'{table}<img {attributes} src="{data_uri(self.plot())}">'
+        return f'{page}<img {attributes} src="{data_uri(self.plot())}">'
 
     def plot(self, kind: Literal["space-time", "time-series"] = "space-time") -> "Figure":
         """Return a figure of an episode of each driver: positions and speeds of all vehicles, or quantities over time.
@@ -114,29 +114,28 @@ class DriveResult(Evaluation):
             raise unknown_name("kind", kind, figures)
         if not self.plot_episodes:
             raise InputError("plot: all episodes failed; allowed: results with an episode")
-        return figures[kind]([to_plot_episode(label, each) for label, each in self.plot_episodes.items()])
+        return figures[kind]([to_plot_episode(label, episode) for label, episode in self.plot_episodes.items()])
 
     def document(self) -> dict[str, Any]:
-        """Return the result as `unjam drive --json` prints it, with a document for each driver, also for one."""
-        feasible, effects = feasibility_by_driver(self.rows), effects_by_driver(self.rows)
+        """Return the result as `unjam drive --json` prints it, with a list of documents, one for each driver."""
+        feasibility, effects = feasibility_by_driver(self.rows), effects_by_driver(self.rows)
         baseline, documents = choose_baseline(self.rows, self.baseline), list[dict[str, Any]]()
         for driver, rows in self.rows.items():
             summary, effect, differences = self.summary(driver), effects.get(driver), None
             if baseline and driver != baseline:
                 paired = {name: paired_difference(rows, self.rows[baseline], name) for name in METRICS}
-                differences = {name: [each.mean, each.low, each.high] for name, each in paired.items()}
-            effects_by_entry = {name: getattr(effect, name) for name in EFFECT_ENTRIES} if effect else {}
+                differences = {name: _mean_and_limits(difference) for name, difference in paired.items()}
+            effect_entries = {name: _mean_and_limits(getattr(effect, name)) for name in EFFECT_ENTRIES if effect}
             documents.append(
                 {
                     "scenario": self.scenario,
                     "backend": self.backend,
                     "driver": driver,
-                    "feasibility": feasible[driver],
+                    "feasibility": feasibility[driver],
                     "episodes": rows,
                     "mean": {name: summary[name].mean for name in METRICS},
                     "ci95": {name: [summary[name].low, summary[name].high] for name in METRICS},
-                    "effect": {name: [each.mean, each.low, each.high] for name, each in effects_by_entry.items()}
-                    or None,
+                    "effect": effect_entries or None,
                     "early_ends": count_early_ends(rows),
                     "notes": self.notes,
                     "folder": str(self.folder) if self.folder else None,
@@ -148,22 +147,26 @@ class DriveResult(Evaluation):
         return {"scenario": self.scenario, "drivers": documents}
 
 
+def _mean_and_limits(estimate: Estimate) -> list[float]:
+    return [estimate.mean, estimate.low, estimate.high]
+
+
 def _lacks_acc(driver: Driver, scenario: Scenario) -> bool:
-    """Return whether a driver uses the speeds ahead to limit the ACC of CAVs on a road where they have none."""
+    """Return whether a driver limits the ACC of CAVs by the speeds ahead, on a road where CAVs have no ACC."""
     road = scenario.interface
     uses_lane_speeds = "lane_speeds" in driver.requirements(road).input_fields and "lane_speeds" in road.provided_fields
     return uses_lane_speeds and scenario.actuation != "cruise"
 
 
 def _set_speed_notes(drivers: Mapping[str, Driver], scenario: Scenario) -> list[str]:
-    """Return a note for each driver with a set speed below recorded speeds: it saves fuel by falling behind."""
-    fastest = scenario.max_leader_speed
-    other = max(scenario.humans.desired_speed, ceil(fastest))
+    """Return a note for each driver with a set speed below recorded speeds, which saves fuel by falling behind."""
+    recorded_speed = scenario.max_leader_speed
+    suggested_speed = max(scenario.humans.desired_speed, ceil(recorded_speed))
     return [
-        f"{name}: its set speed of {speed:g} m/s is below the recorded {fastest:.1f} m/s: name another, as in "
-        f"{one.describe().partition(':')[0]}:set_speed={other:g}"
-        for name, one in drivers.items()
-        if isinstance(speed := getattr(one, "set_speed", None), int | float) and speed < fastest
+        f"{label}: its set speed of {set_speed:g} m/s is below the recorded {recorded_speed:.1f} m/s: name another, "
+        f"as in {driver.describe().partition(':')[0]}:set_speed={suggested_speed:g}"
+        for label, driver in drivers.items()
+        if isinstance(set_speed := getattr(driver, "set_speed", None), int | float) and set_speed < recorded_speed
     ]
 
 
@@ -184,29 +187,29 @@ def drive(
     """Run episodes and measure them.
 
     Args:
-        scenario: its name.
+        scenario: name of the scenario.
         driver: a name (`pi`), with parameters (`pi:window=30`), your own (`path.py:name`), a run folder, a `.unjam`
             file; a driver, a function of the state, an object with `act` and `initial_memory` or a class of such
-            objects, which run in this process; or a list of them, to be compared on the same traffic.
-        episodes: number for each driver; they have the seeds `seed`, `seed + 1`, ...
-        seed: of the first episode.
+            objects, which run in this process; or a list of them, to be compared in the same traffic.
+        episodes: number for each driver; their seeds are `seed`, `seed + 1`, ...
+        seed: seed of the first episode.
         scenario_options: changes to the scenario, e.g. `{"length": 230}` or `{"length": (220, 270)}`.
         reward: a name or `path.py:name`; a function of an `Outcome`, with which all episodes run in this process;
-            empty: the scenario's own.
-        workers: processes; all cores by default. The result does not depend on it.
+            empty: the reward of the scenario.
+        workers: number of processes, by default that of the cores; the result does not depend on it.
         out: folder for the results and a report.html; None: nothing is written.
         progress: called repeatedly with ((driver, episode), control steps so far).
         test_seeds: whether to use the test seeds instead of `seed` and the following ones.
         backend: the simulator: `sumo`, `batch`, `path.py:name`, or an object, with which all episodes run in this
             process.
-        baseline: label of the driver that the others are compared with; empty: human drivers, or else the best expert.
+        baseline: label of the driver with which the others are compared; empty: human drivers, or else the best expert.
 
     Raises:
-        InputError: an argument is wrong; nothing was started.
+        InputError: an argument is wrong; no episode was started.
     """
-    counts = ("episodes", episodes, 1), ("seed", seed, 0), ("workers", 1 if workers is None else workers, 1)
-    for name, number, minimum in counts:
-        check_integer(name, number, minimum)
+    integers = ("episodes", episodes, 1), ("seed", seed, 0), ("workers", 1 if workers is None else workers, 1)
+    for name, value, minimum in integers:
+        check_integer(name, value, minimum)
     if seed + episodes > TRAINING_SEED_LIMIT:
         raise invalid_value("seed", seed, f"<= {TRAINING_SEED_LIMIT - episodes}: larger ones are reserved")
     if test_seeds and seed:
@@ -218,11 +221,11 @@ def drive(
             drivers[entry] = make_driver(entry, road.control_step)
             check_controllers(entry, "drive")
         else:
-            made = as_driver(entry, road.control_step)
-            drivers[unique_label(made, drivers)] = made
-    hashes = controller_hashes({label: label for label in drivers})  # now: files may change while episodes run
-    for name, one in drivers.items():
-        check_can_drive(one, road, f"driver {name}")
+            user_driver = as_driver(entry, road.control_step)
+            drivers[unique_label(user_driver, drivers)] = user_driver
+    hashes = controller_hashes({label: label for label in drivers})  # before the episodes: files may change meanwhile
+    for label, labeled_driver in drivers.items():
+        check_can_drive(labeled_driver, road, f"driver {label}")
     if not drivers:
         raise invalid_value("driver", driver, driver_names())
     if baseline and baseline not in drivers:
@@ -238,21 +241,31 @@ def drive(
         notes = [
             *episode_notes(evaluation.rows),
             *controller_notes(scenario_recipe(road), drivers, evaluation.plot_episodes),
-            *(f"{name} {MISSING_ACC_NOTE}" for name, one in drivers.items() if _lacks_acc(one, road)),
+            *(f"{label} {MISSING_ACC_NOTE}" for label in drivers if _lacks_acc(drivers[label], road)),
             *_set_speed_notes(drivers, road),
             *backend_notes(backend, road),
             *road.notes,
         ]
         has_results = any(row["status"] != "failed" for rows in evaluation.rows.values() for row in rows)
         if folder is not None and has_results:
-            name = reward_label(reward or road.reward)
-            metadata = {"scenario": Path(scenario).name, "reward": name, "backend": backend_label(backend)}
+            metadata = {
+                "scenario": Path(scenario).name,
+                "reward": reward_label(reward or road.reward),
+                "backend": backend_label(backend),
+            }
             contents = {"manifest": manifest(), "controllers": hashes, "notes": notes, "baseline": baseline}
             save_evaluation(folder, evaluation, {**metadata, **contents})
             from unjam.reports.html import write_report_page  # imported late: it draws
 
             report = write_report_page([folder], folder / "report.html")
-    used_folder = folder if has_results else None
-    made_by = scenario, backend_label(backend)
-    details = used_folder, report, notes, baseline, next(iter(drivers))
-    return DriveResult(evaluation.rows, evaluation.plot_episodes, *made_by, *details)
+    return DriveResult(
+        evaluation.rows,
+        evaluation.plot_episodes,
+        scenario=scenario,
+        backend=backend_label(backend),
+        folder=folder if has_results else None,
+        report=report,
+        notes=notes,
+        baseline=baseline,
+        first_driver=next(iter(drivers)),
+    )

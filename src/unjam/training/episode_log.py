@@ -1,4 +1,4 @@
-"""Log of the episodes of an assessment, with which it resumes, or continues with more episodes."""
+"""Log of the episodes of an assessment, so that it can resume, or continue with more episodes."""
 
 from pathlib import Path
 from secrets import token_hex
@@ -23,20 +23,20 @@ EPISODES_FILE = "episodes.jsonl"
 
 
 class EpisodeLog(RowLog):
-    """Rows of metrics by scenario and driver, and by seed."""
+    """Rows of metrics by setup (scenario and driver) and seed."""
 
     def __init__(self, folder: Path, scenario: Scenario) -> None:
-        """Begin in a new folder, or resume with the same scenario, files and version; `InputError` for others."""
+        """Begin in a new folder, or resume with the same scenario, files and commit; raise `InputError` for others."""
         request = {"scenario": scenario_recipe(scenario), "files": file_hashes((), scenario)}
         super().__init__(folder, request | {"commit": manifest()["commit"]}, EPISODES_FILE)
-        self._call, self._lock = token_hex(16), Lock()
+        self._call_id, self._lock = token_hex(16), Lock()
         self.episodes: dict[tuple[str, tuple[int, ...]], dict[str, Any]] = {}
-        """rows by the hash of a setup and the seed"""
+        """rows by hash of the setup, and seed"""
         for entry in self.rows:
             try:
                 row = replace_null(entry["row"])
                 if not all(isinstance(row[name], int | float) for name in METRICS):
-                    raise TypeError("a metric is no number")
+                    raise TypeError("a metric is not a number")
                 self.episodes[entry["setup"], tuple(entry["seed"])] = row
             except INVALID_DATA_ERRORS:
                 raise InputError(f"out: {EPISODES_FILE} in {str(folder)!r} is damaged; allowed: a new folder") from None
@@ -44,18 +44,18 @@ class EpisodeLog(RowLog):
     def setup_hash(self, scenario: Scenario, driver: Driver) -> str:
         """Return the SHA-256 of a scenario, a driver and its weights.
 
-        The content of a driver that no other process can build is unknown: its hash differs in each call.
+        A driver that cannot be serialized has another hash in each call, because its content is unknown.
         """
-        is_known = is_serializable(driver)
-        recipe, arrays = driver_recipe(driver) if is_known else (f"{driver.describe()} {self._call} {id(driver)}", {})
+        unique_recipe = f"{driver.describe()} {self._call_id} {id(driver)}"
+        recipe, arrays = driver_recipe(driver) if is_serializable(driver) else (unique_recipe, {})
         return sha256_of(to_json([scenario_recipe(scenario), recipe]).encode() + save(arrays))
 
-    def add(self, setup: str, seed: tuple[int, ...], row: dict[str, Any]) -> None:
-        """Add the row of an episode, from any thread; it is on the disk when this returns.
+    def add(self, setup_hash: str, seed: tuple[int, ...], row: dict[str, Any]) -> None:
+        """Add the row of an episode and write it to the disk; any thread may call this.
 
-        A failed one is not: its cause may be mended in a later call.
+        The row of a failed episode is not written, because a later call may succeed.
         """
         with self._lock:
-            self.episodes[setup, seed] = row
+            self.episodes[setup_hash, seed] = row
             if row["status"] != "failed" or row["error"] == NoCavError.__name__:
-                self.append({"setup": setup, "seed": seed, "row": row})
+                self.append({"setup": setup_hash, "seed": seed, "row": row})

@@ -1,7 +1,4 @@
-"""Evaluation: several drivers on the same seeds, measured and saved for reports, or as tables.
-
-The controller of a run is compared with others on test seeds.
-"""
+"""Evaluation of several drivers on the same seeds, also of a run's controller on test seeds, saved for reports."""
 
 from collections.abc import Callable, Collection, Sequence
 from contextlib import nullcontext, suppress
@@ -48,19 +45,19 @@ if TYPE_CHECKING:  # imported late, so that commands start quickly
 TRAINED_LABEL = "trained"
 """label of the trained controller in tables and figures"""
 DriverAndEpisode = tuple[str, int]
-"""label of a driver, and index of its episode"""
+"""label of a driver, and index of an episode"""
 EvaluationProgress = Callable[[DriverAndEpisode, int], None]
-"""called repeatedly with the control steps of an episode so far"""
+"""called repeatedly with an episode and its control steps so far"""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Several drivers on the same episodes."""
+    """Results of several drivers on the same seeds."""
 
     rows: RowsByDriver = field(repr=False)
-    """by driver: a row of metrics per episode"""
+    """rows of metrics by driver, one per episode"""
     plot_episodes: dict[str, Episode] = field(default_factory=dict, repr=False)
-    """by driver: the episode for figures, the same seed for all"""
+    """episode for figures by driver, with the same seed for all drivers"""
 
     def summary(self, driver: str) -> dict[str, Estimate]:
         """Return the mean and 95 % CI of every metric for a driver."""
@@ -68,7 +65,7 @@ class Evaluation:
 
     def means(self) -> dict[str, dict[str, float]]:
         """Return the mean of each metric, by driver."""
-        return {label: {name: each.mean for name, each in self.summary(label).items()} for label in self.rows}
+        return {label: {name: estimate.mean for name, estimate in self.summary(label).items()} for label in self.rows}
 
 
 def rows_to_frame(rows_by_driver: RowsByDriver) -> "pd.DataFrame":
@@ -90,7 +87,7 @@ def evaluate(
     backend: BackendLike = "sumo",
     watch: FileWatch | None = None,
 ) -> Evaluation:
-    """Run every driver on every seed, and measure."""
+    """Run every driver on every seed, and measure the episodes."""
     setups = {label: (scenario, driver) for label, driver in drivers.items()}
     return evaluate_on_roads(setups, seeds, workers, reward, progress, backend=backend, watch=watch)
 
@@ -107,9 +104,10 @@ def evaluate_on_roads(
     skipped: Collection[DriverAndEpisode] = (),
     on_row: Callable[[DriverAndEpisode, dict[str, Any]], None] = lambda pair, row: None,
 ) -> Evaluation:
-    """Run every driver, each on its own road, on every seed, and measure; `with_plots` keeps an episode of each.
+    """Run every driver on its own road with every seed, and measure the episodes.
 
-    Episodes that are `skipped` do not run. `on_row` is called with each row when its episode ends, in several threads.
+    `with_plots` keeps the first episode of each driver. The episodes in `skipped` do not run. `on_row` is called with
+    each row when its episode has ended, from several threads.
     """
     settings: dict[str, Any] = {"reward": reward, "backend": backend}
     settings |= {"record_details": True, "stop_at_contact": False}
@@ -121,45 +119,49 @@ def evaluate_on_roads(
     watch = watch or watch_files((scenario for scenario, _ in drivers.values()), reward, backend)
     on_progress = progress or (lambda pair, steps: None)
 
-    def measure_task(pair: tuple[str, int], episode: Episode) -> tuple[dict[str, Any], Episode | None]:
+    def measure_episode(pair: DriverAndEpisode, episode: Episode) -> tuple[dict[str, Any], Episode | None]:
         watch.check()
         on_row(pair, row := measure(episode))
         return row, episode if with_plots and pair[1] == 0 and episode.has_run else None
 
     measured = workers.run_and_map(
         [tasks[pair] for pair in remote],
-        lambda index, episode: measure_task(remote[index], episode),
+        lambda index, episode: measure_episode(remote[index], episode),
         lambda index, steps: on_progress(remote[index], steps),
     )
     results = dict(zip(remote, measured, strict=True))
-    with open_backend(backend) if local else nullcontext(backend) as opened:
+    with open_backend(backend) if local else nullcontext(backend) as open_simulator:
         for pair in local:
-            task = replace(tasks[pair], backend=opened)
-            results[pair] = measure_task(pair, run_episode(**vars(task), on_progress=partial(on_progress, pair)))
+            task = replace(tasks[pair], backend=open_simulator)
+            results[pair] = measure_episode(pair, run_episode(**vars(task), on_progress=partial(on_progress, pair)))
     rows = {label: [results[pair][0] for pair in pairs if pair[0] == label] for label in drivers}
-    return Evaluation(rows, {label: each for (label, _), (_, each) in results.items() if each is not None})
+    return Evaluation(rows, {label: episode for (label, _), (_, episode) in results.items() if episode is not None})
 
 
-def raise_failures(result: Evaluation) -> None:
-    """Raise the first failure among the episodes of a result, if any."""
-    raise_failure([row for rows in result.rows.values() for row in rows])
+def raise_failures(evaluation: Evaluation) -> None:
+    """Raise the error of the first failed episode of an evaluation, if there is one."""
+    raise_failure([row for rows in evaluation.rows.values() for row in rows])
 
 
 def save_evaluation(folder: Path, evaluation: Evaluation, metadata: dict[str, Any]) -> None:
     """Write an evaluation into a folder, for reports.
 
-    `evaluation.json` has `metadata` and rows, `episodes.parquet` the rows as a table, and `plot_episodes.safetensors`
-    the episodes for figures. Where these replace others, a process that is killed may leave some of each: so the first
-    has the hash of the last.
+    `evaluation.json` has `metadata` and rows, `episodes.parquet` has the rows as a table, and
+    `plot_episodes.safetensors` has the episodes for figures. `evaluation.json` also has the hash of the episodes,
+    because a process that is killed may leave files of two evaluations.
     """
     make_folder(folder)
     remove_leftovers(folder)
-    rows = [{"driver": label, **row} for label, of_driver in evaluation.rows.items() for row in of_driver]
+    rows = [{"driver": label, **row} for label, driver_rows in evaluation.rows.items() for row in driver_rows]
     episodes = [to_plot_episode(label, episode) for label, episode in evaluation.plot_episodes.items()]
     arrays = {
-        f"{index}.{name}": array for index, each in enumerate(episodes) for name, array in pack_episode(each).items()
+        f"{index}.{name}": array
+        for index, episode in enumerate(episodes)
+        for name, array in pack_episode(episode).items()
     }
-    entries = [{"driver": each.driver, **{name: getattr(each, name) for name in EPISODE_ENTRIES}} for each in episodes]
+    entries = [
+        {"driver": episode.driver, **{name: getattr(episode, name) for name in EPISODE_ENTRIES}} for episode in episodes
+    ]
     packed = save(arrays)
     document = {**metadata, "rows": rows, "plot_episodes": entries, PLOT_EPISODES_HASH: sha256_of(packed)}
     atomic_write(folder / PLOT_EPISODES_FILE, packed)
@@ -168,21 +170,22 @@ def save_evaluation(folder: Path, evaluation: Evaluation, metadata: dict[str, An
 
 
 def drivers_to_compare(config: RunConfig, folder: Path) -> dict[str, Driver]:
-    """Return the drivers to compare, by label: the baselines, the run's expert, its trained controller."""
+    """Return the drivers to compare by label: the baselines, the expert of the run, and the trained controller."""
     scenario = config.make_scenario()
-    expert = {} if config.expert == "none" else {(made := config.make_expert()).describe(): made}
+    experts = [] if config.expert == "none" else [config.make_expert()]
+    expert_by_label = {expert.describe(): expert for expert in experts}
     drivers: dict[str, Driver] = {}
     for name in config.evaluation.baselines:
         driver = make_driver(name, scenario.control_step)
         if can_drive(driver, scenario):
-            # The description of a packaged driver has all tuned parameters: its name is shorter.
+            # The name of a packaged driver is shorter than its description, which has all tuned parameters.
             is_packaged = name.startswith(PACKAGED_PREFIX) and name != config.expert
-            drivers[name if is_packaged else unique_label(driver, {**expert, **drivers})] = driver
-    return in_order({**drivers, **expert, TRAINED_LABEL: make_driver(str(folder), scenario.control_step)})
+            drivers[name if is_packaged else unique_label(driver, {**expert_by_label, **drivers})] = driver
+    return in_order({**drivers, **expert_by_label, TRAINED_LABEL: make_driver(str(folder), scenario.control_step)})
 
 
 def evaluation_steps(config: RunConfig, folder: Path) -> int:
-    """Return the largest number of control steps of `evaluate_run`."""
+    """Return the maximum number of control steps in `evaluate_run`."""
     episodes = len(drivers_to_compare(config, folder)) * config.evaluation.episodes
     return episodes * config.make_scenario().max_episode_steps
 
@@ -196,12 +199,13 @@ def evaluate_run(
     notes: Sequence[str] = (),
     watch: FileWatch | None = None,
 ) -> Evaluation:
-    """Evaluate a run's controller and others on the same test seeds, and save the results in its folder or in `out`.
+    """Evaluate the controller of a run and the compared drivers on test seeds, and save the results.
 
-    `config.evaluation` may be another than that of the run. The `notes` are stored before all others.
+    They are saved in `out`, by default the folder of the run. `config.evaluation` may differ from that of the run.
+    The `notes` are stored before all others.
     """
     scenario, drivers = config.make_scenario(), drivers_to_compare(config, folder)
-    hashes = controller_hashes({TRAINED_LABEL: str(folder)})  # now: files may change while episodes run
+    hashes = controller_hashes({TRAINED_LABEL: str(folder)})  # before the episodes: files may change meanwhile
     weights = weights_id(folder / CONTROLLER_FILE)
     seeds = held_out_seeds(config.evaluation.episodes)
     evaluation = evaluate(scenario, drivers, seeds, workers, config.reward, progress, config.episode_backend, watch)
@@ -232,22 +236,23 @@ def evaluate_run(
 
 
 def duration_note(config: RunConfig) -> str:
-    """Return a text if episodes of a training last shorter or longer than the scenario's own; else an empty one."""
+    """Return a note if episodes of a training are shorter or longer than those of its scenario; else an empty text."""
     options = {name: value for name, value in config.scenario_options.items() if name != "horizon"}
-    with suppress(InputError):  # of a network that needs the horizon
+    with suppress(InputError):  # a user network may need the horizon
         scenarios = config.make_scenario(), replace(config, scenario_options=options).make_scenario()
-        seconds, usual = (each.max_episode_steps * each.control_step for each in scenarios)
-        return "" if seconds == usual else f"episodes of {seconds:g} s, where the scenario has {usual:g} s"
+        seconds, usual_seconds = (scenario.max_episode_steps * scenario.control_step for scenario in scenarios)
+        is_usual = seconds == usual_seconds
+        return "" if is_usual else f"episodes of {seconds:g} s, where the scenario has {usual_seconds:g} s"
     return ""
 
 
 def gain_over_expert(config: RunConfig, rows: RowsByDriver) -> Estimate | None:
-    """Return the paired difference of return between the trained controller and its expert; None without one."""
+    """Return the paired difference of return between the trained controller and its expert; None without expert."""
     if config.expert == "none":
         return None
     return paired_difference(rows[TRAINED_LABEL], rows[config.make_expert().describe()], "return")
 
 
 def controller_hashes(controllers: dict[str, str]) -> dict[str, str]:
-    """Return the hashes of the controller files by the label of the driver."""
-    return {label: sha256 for label, text in controllers.items() if (sha256 := controller_hash(text))}
+    """Return the hashes of the controller files that drivers have, by label; `controllers` has the names by label."""
+    return {label: sha256 for label, name in controllers.items() if (sha256 := controller_hash(name))}

@@ -1,7 +1,7 @@
-"""Trainings in subprocesses: many command lines at once, on this machine or on a Ray cluster; or a single training.
+"""Trainings in subprocesses: many command lines at once, on this machine or on a Ray cluster, or a single training.
 
-The single one, `python -m unjam.training.executors`, is for programs that imported NumPy before unjam: `unjam.kernels`.
-It reads one message and writes several. After each row of progress it reads whether to continue.
+A single training, `python -m unjam.training.executors`, is for programs that imported NumPy before unjam (see
+`unjam.kernels`). It reads a request and writes messages. After each row of progress it reads whether to continue.
 """
 
 import os
@@ -42,7 +42,7 @@ MessageCallback = Callable[[str], None]
 IterationCallback = Callable[[dict[str, Any]], object]
 """called with each row of progress; it returns False to end the training"""
 MAX_ATTEMPTS = 3
-"""starts of a command line that is killed by a signal or loses its machine"""
+"""maximum number of starts of a command line, if signals kill it or its machine is lost"""
 
 
 class CommandLine(NamedTuple):
@@ -53,15 +53,16 @@ class CommandLine(NamedTuple):
     resume_marker: Path | None = None
     """file that exists if the command was started before"""
     resume_arguments: Sequence[str] = ()
+    """arguments if the command was started before"""
 
     def argv(self) -> list[str]:
-        """Return the whole command line, which depends on whether it was started before."""
+        """Return the executable with the arguments for a first start or for resumption."""
         was_started = self.resume_marker is not None and self.resume_marker.is_file()
         return python_command("-m", "unjam", *(self.resume_arguments if was_started else self.arguments))
 
 
 def training_command(config: "RunConfig", folder: Path, config_file: Path, log: Path) -> CommandLine:
-    """Return the command line that starts or resumes a training; its configuration is written to `config_file`."""
+    """Write a configuration to `config_file`, and return the command line that starts or resumes its training."""
     from unjam.training.config import CONFIG_FILE, to_toml
 
     folder, config_file, log = (path.absolute() for path in (folder, config_file, log))  # another machine runs it
@@ -77,7 +78,7 @@ def training_command(config: "RunConfig", folder: Path, config_file: Path, log: 
 
 
 class LocalExecutor:
-    """Runs command lines on this machine, in a folder that exists or the working folder, and can stop all of them."""
+    """Runs command lines on this machine, in an existing folder or by default the working folder."""
 
     def __init__(self, folder: str | None = None) -> None:
         self._folder = folder
@@ -86,11 +87,11 @@ class LocalExecutor:
         self._is_stopped = False
 
     def run(self, command: CommandLine) -> int:
-        """Run a command line, again if a signal kills it; return its exit code."""
+        """Run a command line, and again if a signal kills it; return its exit code."""
         make_folder(command.log.parent)
         for _ in range(MAX_ATTEMPTS - 1):
-            if (code := self._run_once(command)) >= 0 or self._is_stopped:
-                return code
+            if (exit_code := self._run_once(command)) >= 0 or self._is_stopped:
+                return exit_code
         return self._run_once(command)
 
     def _run_once(self, command: CommandLine) -> int:
@@ -103,13 +104,13 @@ class LocalExecutor:
             ) as process:
                 with self._lock:
                     self._running.add(process)
-                code = process.wait()
+                exit_code = process.wait()
                 with self._lock:
                     self._running.discard(process)
-        return code
+        return exit_code
 
     def stop(self) -> None:
-        """Ask all running processes to end; a training then writes its checkpoint."""
+        """Terminate all running processes; a training writes its checkpoint before it ends."""
         self._is_stopped = True
         with self._lock:
             for process in self._running:
@@ -118,36 +119,36 @@ class LocalExecutor:
 
 @contextmanager
 def open_executor(executor: Executor, workers: int) -> Iterator[Callable[[CommandLine], Future[int]]]:
-    """Yield a function that starts a command line, `workers` at once, and returns the future of its exit code.
+    """Yield a function that starts a command line and returns the future of its exit code; `workers` run at once.
 
     The machines of a Ray cluster must share the folders. An exception in the block ends all command lines.
     """
-    local = LocalExecutor()
-    opened = _open_ray(workers) if executor == "ray" else nullcontext(local.run)
-    with ThreadPoolExecutor(workers) as threads, opened as run:
+    local_executor = LocalExecutor()
+    run_context = _open_ray(workers) if executor == "ray" else nullcontext(local_executor.run)
+    with ThreadPoolExecutor(workers) as threads, run_context as run:
         try:
             yield lambda command: threads.submit(run, command)
         except BaseException:
             threads.shutdown(wait=False, cancel_futures=True)
-            local.stop()
+            local_executor.stop()
             raise
 
 
 def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, on_message: MessageCallback) -> None:
-    """Run command lines, given by name, `workers` at once; `on_message` is called when one has ended.
+    """Run the `commands`, given by name, `workers` at once; `on_message` is called when a command line has ended.
 
-    Raise `UnjamError` at the end if one failed, and `MissingPartError` if Ray is not installed.
+    Raise `UnjamError` at the end if a command line failed, and `MissingPartError` if Ray is not installed.
     """
     if not commands:
         return
-    failed, started = [], time.monotonic()
+    failed, start_time = [], time.monotonic()
     with open_executor(executor, workers) as start:
         names = {start(command): name for name, command in commands.items()}
-        for done, future in enumerate(as_completed(names), start=1):
-            name, code = names[future], future.result()
-            minutes = (time.monotonic() - started) / 60.0
-            on_message(f"{done} of {len(names)}, {minutes:.0f} min: {name}{' failed' if code else ''}")
-            if code != 0:
+        for done_count, future in enumerate(as_completed(names), start=1):
+            name, exit_code = names[future], future.result()
+            minutes = (time.monotonic() - start_time) / 60.0
+            on_message(f"{done_count} of {len(names)}, {minutes:.0f} min: {name}{' failed' if exit_code else ''}")
+            if exit_code != 0:
                 failed.append(name)
     if failed:
         names_text = ", ".join(failed)
@@ -156,10 +157,10 @@ def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, 
 
 @contextmanager
 def _open_ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
-    """Yield a function that runs a command line on the existing Ray cluster, or on one of this machine."""
+    """Yield a function that runs a command line on the existing Ray cluster, or else on a new one of this machine."""
     ray, folder = import_optional("ray"), os.getcwd()
     # Ray's processes import modules from the folder in which it was started.
-    with _ray_errors(), isolated_start(child_import_path()), outside_working_folder():
+    with _convert_ray_errors(), isolated_start(child_import_path()), outside_working_folder():
         try:
             ray.init(address="auto", log_to_driver=False)
         except ConnectionError:
@@ -167,7 +168,7 @@ def _open_ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
     remote = ray.remote(num_cpus=1, max_retries=MAX_ATTEMPTS - 1)(_run_on_node)
 
     def run(command: CommandLine) -> int:
-        with _ray_errors():
+        with _convert_ray_errors():
             return ray.get(remote.remote(command, folder, bind_to_parent({})[PROTECTED_FOLDERS_VARIABLE]))
 
     try:
@@ -177,8 +178,8 @@ def _open_ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
 
 
 @contextmanager
-def _ray_errors() -> Iterator[None]:
-    """Raise errors of Ray as `UnjamError`, and errors of a process of the cluster with their own class."""
+def _convert_ray_errors() -> Iterator[None]:
+    """Raise errors of Ray as `UnjamError`, and those that a process of the cluster raised with their own class."""
     try:
         yield
     except Exception as error:
@@ -186,7 +187,7 @@ def _ray_errors() -> Iterator[None]:
 
 
 def _run_on_node(command: CommandLine, folder: str, protected_folders: str) -> int:
-    """Run a command line in a process of the cluster, with the folders of the starting machine."""
+    """Run a command line in a process of the cluster, if possible in the given working folder."""
     os.environ[PROTECTED_FOLDERS_VARIABLE] = protected_folders
     return LocalExecutor(folder if os.path.isdir(folder) else None).run(command)
 
@@ -211,7 +212,7 @@ def train_in_subprocess(
             match message:
                 case {"row": row}:
                     continues = on_iteration is None or on_iteration(row) is not False
-                    with suppress(BrokenPipeError):  # it was killed: its exit code is reported below
+                    with suppress(BrokenPipeError):  # of a killed process; the exit code is reported below
                         write_message(child.stdin, {"continues": continues})
                 case {"evaluated": [driver, episode], "steps": steps} if progress is not None:
                     progress((driver, episode), steps)
@@ -221,7 +222,7 @@ def train_in_subprocess(
                     return rows
         raise UnjamError(f"training: its process ended with code {child.wait()}")
     finally:
-        child.terminate()  # no effect if it has ended
+        child.terminate()  # has no effect on a process that has ended
         child.wait()
 
 
@@ -232,11 +233,11 @@ def _next_message(pipe: IO[bytes]) -> dict[str, Any] | None:
 
 
 def train_from_stdin() -> None:
-    """Train by the request on standard input, in the subprocess of `train_in_subprocess`."""
+    """Run the training that the parent requests on standard input; the parent is in `train_in_subprocess`."""
     send = partial(write_message, open_answer_pipe())
     request, _ = read_message(sys.stdin.buffer)
-    # User code may need the import path of the parent; at the end it hides no installed package.
-    sys.path.extend(each for each in request["path"] if each not in sys.path)
+    # User code may need the import path of the parent. At the end, it does not hide installed packages.
+    sys.path.extend(path for path in request["path"] if path not in sys.path)
     values, folder, resume = request["arguments"]
 
     def report_iteration(row: dict[str, Any]) -> bool:

@@ -1,4 +1,4 @@
-"""Controller files: those in run folders, and the export of controllers."""
+"""Controller files in run folders, and the export of controllers."""
 
 import logging
 import os
@@ -57,20 +57,20 @@ ControllerKind = Literal["best", "latest"]
 
 
 class ControllerStore:
-    """The contents of the controllers in a run's folders: the `best` of scheduled validations, and the `latest`."""
+    """Controller files of a run, one per task folder: the `best` of scheduled validations, and the `latest`."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
-        """Prepare one controller for each folder."""
+        """Take the folders of the tasks; the contents of their controllers follow."""
         self._folders = folders
         self._contents: dict[ControllerKind, list[bytes]] = {}
 
     def save(self, contents: list[bytes], is_best: bool) -> None:
-        """Write a controller into each folder."""
+        """Write these contents into the controller files of the folders."""
         self._contents |= {"latest": contents, **({"best": contents} if is_best else {})}
-        self._write("latest")
+        self._write_latest()
 
     def tensors(self) -> "Tensors":
-        """Return all contents for a checkpoint."""
+        """Return the contents of all controllers for a checkpoint."""
         import torch  # not needed to export a driver
 
         return {
@@ -80,16 +80,16 @@ class ControllerStore:
         }
 
     def restore(self, tensors: "Tensors", is_finished: bool) -> None:
-        """Take the contents from a checkpoint's `tensors` and write them: `latest` if the training has ended."""
+        """Remove the contents from a checkpoint's `tensors` and write them: `latest` if finished, else `best`."""
         for kind in CONTROLLER_KINDS if "best/0" in tensors else ():
             stored = [tensors.pop(f"{kind}/{index}") for index in range(len(self._folders))]
-            self._contents[kind] = [each.numpy().tobytes() for each in stored]
+            self._contents[kind] = [tensor.numpy().tobytes() for tensor in stored]
         if not is_finished and "best" in self._contents:
             self._contents["latest"] = self._contents["best"]
-        self._write("latest")
+        self._write_latest()
 
-    def _write(self, kind: ControllerKind) -> None:
-        for folder, content in zip(self._folders, self._contents.get(kind, ()), strict=False):
+    def _write_latest(self) -> None:
+        for folder, content in zip(self._folders, self._contents.get("latest", ()), strict=False):
             make_folder(folder)
             atomic_write(folder / CONTROLLER_FILE, content)
 
@@ -100,13 +100,15 @@ class ExportResult:
 
     file: Path
     graph: Path | None
-    """the ONNX graph with its description as metadata; without it, the graph is also in the controller's file"""
+    """file of the ONNX graph with a description as metadata; the controller's file has the graph without it"""
     model: Path | None
+    """file of the Stable-Baselines3 model"""
     driver: str
+    """description of the driver"""
     sample_steps: int
-    """length of the recorded sample"""
+    """length of the recorded sample [control steps]"""
     car: str
-    """the actuator that its safety filter knows; empty without a filter"""
+    """actuator that the safety filter expects; empty without a filter"""
 
 
 @expecting_code()
@@ -118,22 +120,22 @@ def export_controller(
     stable_baselines3: bool = False,
     settings: dict[str, Any] | None = None,
 ) -> ExportResult:
-    """Write a controller into a self-contained file `.unjam`, and optionally an ONNX graph and a model of others.
+    """Write a controller into a self-contained `.unjam` file, and optionally an ONNX graph and a model of its residual.
 
-    One test episode is run for its recorded sample. The controller includes the road's safety filter, if there is one.
+    A test episode is run for the recorded sample. The controller includes the safety filter of the road, if it has one.
 
     Args:
         source: a run folder, or any driver as in `unjam.drive`.
-        out: the file, ending in `.unjam`; the graph has the same name with `.onnx`.
-        onnx: whether to write the graph of the whole controller.
-        scenario: the scenario for time step and bounds of a driver; a run and a controller's file have their own.
+        out: the file, which ends in `.unjam`.
+        onnx: whether to write the graph of the whole controller into a file with the same name and `.onnx`.
+        scenario: scenario for time step and limits of a driver; runs and controller files have their own scenario.
         stable_baselines3: whether to write the residual as a model of Stable-Baselines3, with the same name and `.zip`.
-        settings: changes to the scenario, such as `{"actuator.delay": 0.5}`; a controller with a safety filter gets
-            that of the changed scenario, or of the one named, in its place.
+        settings: changes to the scenario, such as `{"actuator.delay": 0.5}`. With `settings` or `scenario`, the safety
+            filter of a controller is replaced by that of the scenario.
 
     Raises:
-        InputError: there is no such controller, or it is Python code; with `onnx` it has no graph; with
-            `stable_baselines3` it is no residual.
+        InputError: there is no such controller, it is Python code, it has no graph (`onnx`), or it is no residual
+            (`stable_baselines3`).
         MissingPartError: a package for graphs, or Stable-Baselines3, is needed and not installed.
     """
     source, out = Path(source), Path(out)
@@ -142,12 +144,15 @@ def export_controller(
     check_parent_folder(out)
     if _is_signed(out):
         raise InputError(f"out: {str(out)!r} is a signed controller; allowed: another file")
-    siblings = [
-        out.with_suffix(suffix) for suffix, is_asked in ((".onnx", onnx), (".zip", stable_baselines3)) if is_asked
-    ]
+    suffixes = [*([".onnx"] if onnx else []), *([".zip"] if stable_baselines3 else [])]
     is_new = not out.exists()
-    if others := [str(file) for file in siblings if os.path.lexists(file) and (is_new or not _is_exported(file))]:
-        raise InputError(f"out: {', '.join(others)} exists and belongs to no {out.name}; allowed: another name")
+    foreign_files = [
+        str(file)
+        for file in map(out.with_suffix, suffixes)
+        if os.path.lexists(file) and (is_new or not _is_exported(file))
+    ]
+    if foreign_files:
+        raise InputError(f"out: {', '.join(foreign_files)} exists and belongs to no {out.name}; allowed: another name")
     read_origin = _read_run_origin if source.is_dir() else _read_driver_origin
     road, driver, metadata = read_origin(str(source), scenario, settings or {})
     code = user_code_recipes(driver_recipe(driver)[0])
@@ -166,7 +171,7 @@ def export_controller(
         from unjam.controller.onnx_graph import onnx_graph  # imported late: torch.onnx is slow to import
 
         missing = [name for name in driver.requirements().input_fields if getattr(states, name) is None]
-        if missing:  # the graph has all inputs of the driver
+        if missing:  # the graph needs samples of all inputs of the driver
             reason = f"{road.title} does not provide {', '.join(missing)}; allowed: --scenario of a road that does"
             raise InputError(f"onnx: {driver.describe()} is not allowed: {reason}")
         graph = {GRAPH_PART: onnx_graph(driver, limit)}
@@ -175,7 +180,7 @@ def export_controller(
         unverified = Path(private, out.name)
         atomic_write(unverified, content)
         verify_controller_file(unverified)
-    atomic_write(out, content)  # an earlier file stays until then
+    atomic_write(out, content)  # only now, so that an unverified controller replaces no file
     graph_file = out.with_suffix(".onnx") if graph else None
     if graph_file is not None:
         from unjam.controller.onnx_graph import describe_graph
@@ -197,21 +202,20 @@ def _is_exported(file: Path) -> bool:
     return False
 
 
-def read_in_car(source: str, settings: dict[str, Any], scenario: str = "") -> Controller:
-    """Return a controller as `export_controller` writes it, with the filter for a car and a sample; no file stays."""
+def read_exported_controller(source: str, settings: dict[str, Any], scenario: str = "") -> Controller:
+    """Return the controller that `export_controller` would write, with sample and safety filter; no file remains."""
     with PrivateFolder() as private:
-        return read_controller(
-            export_controller(source, Path(private, f"in-car{SUFFIX}"), False, scenario, False, settings).file
-        )
+        file = Path(private, f"in-car{SUFFIX}")
+        return read_controller(export_controller(source, file, scenario=scenario, settings=settings).file)
 
 
-def has_usual_car(road: Scenario) -> bool:
-    """Return whether CAVs of a road have the actuator that such roads have by default; true on open roads."""
+def has_default_actuator(road: Scenario) -> bool:
+    """Return whether the CAVs of a road have the default actuator of its scenario class; true on open roads."""
     return not road.is_closed or road.actuator == type(road)().actuator
 
 
 def measure_test_episode(controller: Controller) -> dict[str, Any]:
-    """Return the metrics of a controller in the first test episode of its own road and car."""
+    """Return the metrics of a controller in the first test episode on the road of its manifest."""
     road = scenario_from_recipe(controller.manifest["scenario"])
     with WorkerPool(1) as workers:
         (episode,) = workers.run([EpisodeTask(road, controller.driver, held_out_seeds(1)[0], record_details=True)])
@@ -226,16 +230,16 @@ def driver_with_filter(driver: Driver, road: Scenario) -> FilteredDriver:
     return FilteredDriver(driver, max_acceleration, road.safety, road.control_step, road.actuator)
 
 
-def without_filter(driver: Driver) -> Driver:
-    """Return a driver without the safety filter of its own file, if it has one."""
+def remove_filter(driver: Driver) -> Driver:
+    """Return the driver in a `FilteredDriver`, and other drivers unchanged."""
     return driver.driver if isinstance(driver, FilteredDriver) else driver
 
 
 def _residual_model(driver: Driver, metadata: dict[str, Any]) -> bytes:
-    """Return the residual of a controller as a model of the algorithm that trained it; SAC if that is unknown."""
+    """Return the residual of a controller as a model of the algorithm that trained it, by default SAC."""
     from unjam.adapters.stable_baselines3_export import ALGORITHMS, stable_baselines3_bytes
 
-    driver = without_filter(driver)
+    driver = remove_filter(driver)
     if not isinstance(driver, ResidualDriver):
         raise invalid_value("stable_baselines3", driver.describe(), "a residual, such as a training run")
     agent = metadata.get("run", {}).get("agent")
@@ -268,27 +272,27 @@ def _read_run_origin(run: str, scenario: str, settings: dict[str, Any]) -> tuple
 def _read_driver_origin(
     driver_name: str, scenario: str, settings: dict[str, Any]
 ) -> tuple[Scenario, Driver, dict[str, Any]]:
-    """Return the road, driver and origin of a driver; a controller's file keeps its own, with changed settings."""
+    """Return road, driver and manifest entries of a driver; those of a controller's file are kept, except settings."""
     file = None if scenario else controller_path(driver_name)
     if file is not None:
         controller = read_controller(file)
         metadata = {name: controller.manifest[name] for name in PROVENANCE_ENTRIES if name in controller.manifest}
-        road, driver = _read_scenario(file, metadata.get("scenario")), controller.driver
-        if driver_name.startswith(PACKAGED_PREFIX) and not has_usual_car(road):
+        road, driver = _read_manifest_scenario(file, metadata.get("scenario")), controller.driver
+        if driver_name.startswith(PACKAGED_PREFIX) and not has_default_actuator(road):
             settings = {"actuator": asdict(type(road)().actuator), **settings}
         if not settings:
             return road, driver, metadata
         road = make_scenario(road, settings)
         metadata["scenario"] = scenario_recipe(road)
-        return road, without_filter(driver), metadata
+        return road, remove_filter(driver), metadata
     road = make_scenario(example_scenario(scenario or "ring"), settings)
-    driver = without_filter(make_driver(driver_name, road.control_step))
+    driver = remove_filter(make_driver(driver_name, road.control_step))
     expert = driver.expert if isinstance(driver, ResidualDriver) else driver
     return road, driver, controller_origin(road, expert)
 
 
-def _read_scenario(file: Path, recipe: dict[str, Any] | None) -> Scenario:
-    """Return the scenario that a controller's file names; its Python file runs only if its code is trusted."""
+def _read_manifest_scenario(file: Path, recipe: dict[str, Any] | None) -> Scenario:
+    """Return the scenario in the manifest of a controller's file, by default the ring; user code must be trusted."""
     if recipe is None:
         return example_scenario("ring")
     if code := recipe.get(CODE_ENTRY):
@@ -297,25 +301,23 @@ def _read_scenario(file: Path, recipe: dict[str, Any] | None) -> Scenario:
 
 
 def _test_metrics(folder: Path) -> dict[str, Any] | None:
-    """Return the test metrics of a run's controller and expert; None before the evaluation of this controller."""
+    """Return the test metrics of the controller and the expert of a run; None if this controller is not evaluated."""
     if not (folder / EVALUATION_FILE).is_file():
         return None
     evaluation, rows_by_driver = read_evaluation(folder)
     if is_outdated(folder, evaluation):
-        _LOG.warning(
-            "export: the metrics in %s are of an earlier controller: left out; unjam evaluate measures", folder
-        )
+        _LOG.warning("export: metrics in %s are of an earlier controller, left out; unjam evaluate measures", folder)
         return None
     metrics: dict[str, Any] = {"reward": evaluation["reward"]}
     for label in (TRAINED_LABEL, evaluation["expert"]):
         if rows := rows_by_driver.get(label):
-            estimates = {name: each.__dict__ for name, each in summarize(rows).items() if each.count}
+            estimates = {name: estimate.__dict__ for name, estimate in summarize(rows).items() if estimate.count}
             metrics[label] = {"episodes": len(rows), **estimates}
     return metrics
 
 
 def _sample_states(scenario: Scenario, driver: Driver, backend: str) -> LocalState:
-    """Return the local states of the CAV with the longest trip in a test episode, arrays of shape (T,)."""
+    """Return the local states of the CAV with the longest trip in a test episode, with arrays of shape (T,)."""
     with WorkerPool(1) as workers:
         (episode,) = workers.run([EpisodeTask(scenario, driver, held_out_seeds(1)[0], backend=backend)])
     raise_failure([measure(episode)] if not episode.has_run else [])

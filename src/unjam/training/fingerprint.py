@@ -1,4 +1,4 @@
-"""The fingerprint of a training: its settings, and hashes of its code, networks and packages."""
+"""The fingerprint of a training: settings, hashes of experts and user files, and versions of packages."""
 
 import json
 import logging
@@ -22,21 +22,20 @@ from unjam.training.config import RunConfig
 
 _LOG = logging.getLogger(__name__)
 
-
 ABSENT = "absent"
-"""what stands for the value of a setting that is not there"""
+"""placeholder for the value of a missing setting"""
 
 
 def fingerprint(config: RunConfig) -> dict[str, Any]:
-    """Return everything that the result of a training depends on, as JSON.
+    """Return everything on which the result of a training depends, as JSON.
 
-    These are all settings but steps and workers, hashes of experts and user files, packages and kernels.
+    This is all settings except steps and workers, hashes of experts and user files, packages and kernels.
     """
     files = file_hashes(code_names(config))
-    for each, task in zip(config.task_configs().values(), config.make_tasks(), strict=True):
+    for task_config, task in zip(config.task_configs().values(), config.make_tasks(), strict=True):
         recipe, arrays = driver_recipe(task.expert)
         weights = b"".join(arrays[name].tobytes() for name in sorted(arrays))
-        files[f"expert {each.expert}"] = sha256_of(json.dumps(recipe, sort_keys=True).encode() + weights)
+        files[f"expert {task_config.expert}"] = sha256_of(json.dumps(recipe, sort_keys=True).encode() + weights)
         files |= file_hashes((), task.scenario)
     settings = flatten_keys(asdict(replace(config, steps=1, workers=1)))
     entries = {"settings": settings, "files": files, "packages": package_versions(), "kernels": kernel_info()}
@@ -44,60 +43,60 @@ def fingerprint(config: RunConfig) -> dict[str, Any]:
 
 
 def check_fingerprint(stored: dict[str, Any], current: dict[str, Any]) -> None:
-    """Raise `InputError` if a setting, the expert or a user file has changed; warn of other packages and kernels."""
+    """Raise `InputError` if a setting, an expert or a user file has changed; warn of other packages and kernels."""
     check_settings(stored, current, "resume")
     check_file_hashes(stored, current, "resume")
-    for part in ("packages", "kernels"):
-        if stored[part] != current[part]:
-            _LOG.warning("resume: other %s than in the checkpoint: the result may differ", part)
+    for table in ("packages", "kernels"):
+        if stored[table] != current[table]:
+            _LOG.warning("resume: other %s than in the checkpoint: the result may differ", table)
 
 
 def check_settings(
     stored: dict[str, Any], current: dict[str, Any], command: str, ignored_prefixes: tuple[str, ...] = ()
 ) -> None:
     """Raise `InputError` if a setting was changed, added or removed, unless it begins with an ignored prefix."""
-    _check_form(stored, command)
+    _check_tables(stored, command)
     for name in {**current["settings"], **stored["settings"]}:
-        before, value = (each["settings"].get(name, ABSENT) for each in (stored, current))
-        if not name.startswith(ignored_prefixes) and _without_folders(before) != _without_folders(value):
-            raise invalid_value(f"{command}: {name}", value, f"{before!r}, as in the checkpoint")
+        stored_value, value = (entries["settings"].get(name, ABSENT) for entries in (stored, current))
+        if not name.startswith(ignored_prefixes) and _remove_folders(stored_value) != _remove_folders(value):
+            raise invalid_value(f"{command}: {name}", value, f"{stored_value!r}, as in the checkpoint")
 
 
 def code_names(config: RunConfig) -> list[str]:
-    """Return the names of agent, backend, features, rewards and roads, which can be files of the user."""
+    """Return the names of agent, backend, features, scenarios and rewards, some of which can be files of the user."""
     names = [name for task in config.task_configs().values() for name in (task.scenario, task.reward)]
     return [config.agent, config.backend, *config.policy.inputs, *names]
 
 
 def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: str) -> None:
-    """Raise `InputError` if the expert or a file of the user has changed."""
-    _check_form(stored, command)
-    before, now = (
-        {(_without_folders(name.removeprefix("expert ")), sha256): name for name, sha256 in each["files"].items()}
-        for each in (stored, current)
+    """Raise `InputError` if an expert or a file of the user has changed."""
+    _check_tables(stored, command)
+    old_names, new_names = (
+        {(_remove_folders(name.removeprefix("expert ")), sha256): name for name, sha256 in entries["files"].items()}
+        for entries in (stored, current)
     )
-    # Files of equal names in several folders are compared in the order of their tasks: the folders can have moved.
-    changed = before.keys() ^ now.keys() or {one for one, other in zip(before, now, strict=True) if one != other}
-    if changed:
-        name = {**now, **before}[min(changed)]
+    # Files with equal names in several folders are compared in the order of their tasks, as folders may have moved.
+    reordered = (old for old, new in zip(old_names, new_names, strict=True) if old != new)
+    if changed := old_names.keys() ^ new_names.keys() or {*reordered}:
+        name = {**new_names, **old_names}[min(changed)]
         raise InputError(f"{command}: {name} has changed since the checkpoint; allowed: as it was then")
 
 
-def _check_form(stored: Any, command: str) -> None:
-    """Raise `InputError` unless a stored fingerprint has the tables of one."""
+def _check_tables(stored: Any, command: str) -> None:
+    """Raise `InputError` if a stored value lacks the tables of a fingerprint."""
     tables = ("settings", "files", "packages", "kernels")
     has_tables = isinstance(stored, dict) and all(isinstance(stored.get(name), dict) for name in tables)
-    if not has_tables or not all(isinstance(each, str) for each in stored["files"].values()):
+    if not has_tables or not all(isinstance(sha256, str) for sha256 in stored["files"].values()):
         raise InputError(f"{command}: the checkpoint has no fingerprint of a run; allowed: a checkpoint of unjam")
 
 
-def _without_folders(value: Any) -> str:
-    """Return a JSON value as a text without the folders of files, which depend on the working folder."""
+def _remove_folders(value: Any) -> str:
+    """Return a JSON value as text without the folders of files, which depend on the working folder."""
     return re.sub(r'(?<![^+"])[^+"]*/', "", json.dumps(value))
 
 
 def file_hashes(names: Iterable[str], *scenarios: Scenario) -> dict[str, str]:
-    """Return hashes of the code that `names` refer to and of the files of scenarios, by path."""
+    """Return hashes of user code among the `names`, and of the user files of scenarios, by path."""
     paths, hashes = list[Path](), code_hashes(names)
     for scenario in scenarios:
         paths += scenario.user_files

@@ -1,4 +1,4 @@
-"""The learned model of a run as a world for users: n rows, each a CAV with its leader and follower, in steps."""
+"""The learned model of a run, with which users simulate n rows, each a CAV with its leader and follower."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,40 +25,40 @@ DEVICE = "cpu"
 
 
 class ModelState(NamedTuple):
-    """State of n rows of a learned model, from which they continue in the same way; tensors in single precision."""
+    """Complete state of n rows of a learned model, in tensors of single precision."""
 
     observed: LocalState
-    """what the CAVs observe, shape (n,)"""
+    """observations of the CAVs, shape (n,)"""
     actuators: ActuatorState
     """accelerations and pending commands of the CAVs [m/s2], shape (n,)"""
     drawn_values: Tensor
-    """scaled values that their episodes drew, shape (n, m)"""
+    """scaled drawn values of the recorded episodes, shape (n, m)"""
     is_running: Tensor
     """1 before a collision, else 0, shape (n,)"""
     generator_state: Tensor
-    """of the model's random numbers"""
+    """state of the generator of the model's random numbers"""
 
 
 class ModelTrajectories(NamedTuple):
-    """What n rows did in H control steps of a learned model; tensors."""
+    """Trajectories of n rows over H control steps of a learned model, as tensors."""
 
     states: LocalState
     """shape (n, H + 1)"""
     rewards: Tensor
     """zero after a collision, shape (n, H)"""
     crashed: Tensor
-    """whether there was a collision, shape (n,)"""
+    """whether the CAV collided, shape (n,)"""
 
 
 class LearnedModel:
     """The learned model of a run, from `unjam.load_world_model`; it starts with one row.
 
-    In each step, a random network of the ensemble corrects the base for each row, and noise as large as the model's
-    errors is added, as in training. Steps are differentiable in the accelerations and in the state.
+    As in training, a random network of the ensemble corrects the base model for each row in each step, and noise as
+    large as the model's errors is added. Steps are differentiable in the accelerations and in the state.
     """
 
     def __init__(self, trained: TrainedModel) -> None:
-        """Take the model in a checkpoint."""
+        """Take the model from a checkpoint."""
         self._trained, model = trained, trained.rollouts.world_model
         assert isinstance(model, RowWorldModel)
         self.world_model = model
@@ -68,19 +68,22 @@ class LearnedModel:
         self.reset(1)
 
     def reset(self, rows: int, seed: int = 0, episode_starts_only: bool = False) -> LocalState:
-        """Set random recorded states, or first ones, and random numbers; raise `InputError` without rows."""
+        """Start from random recorded states, or random first states of episodes, and return the observations.
+
+        `seed` determines these states and the model's noise. Raise `InputError` if `rows` is below 1.
+        """
         data, rows = self.world_model.data, check_integer("rows", rows, 1)
         return self.reset_at(draw_starts(data, rows, 1, (seed, 0), episode_starts_only=episode_starts_only), seed)
 
     def reset_at(self, start_indices: StartIndices, seed: int = 0) -> LocalState:
-        """Set the recorded states of (recording, control step), shape (n, 2), as `reset` does with random ones."""
+        """Start from the recorded states with the indices (recording, control step), shape (n, 2), as `reset` does."""
         data = self.world_model.data
-        drawn = np.stack([data.recordings[index].drawn_values for index in start_indices[:, 0]])
+        drawn_values = np.stack([data.recordings[index].drawn_values for index in start_indices[:, 0]])
         observed = data.states_at(start_indices).map(lambda values: to_device(values, DEVICE))
         generator_state = torch_generator((seed,), DEVICE).get_state()
-        running = torch.ones_like(observed.speed)
+        is_running = torch.ones_like(observed.speed)
         actuators = data.actuator_states_at(start_indices).map(lambda values: to_device(values, DEVICE))
-        self.set_state(ModelState(observed, actuators, to_device(drawn, DEVICE), running, generator_state))
+        self.set_state(ModelState(observed, actuators, to_device(drawn_values, DEVICE), is_running, generator_state))
         return observed
 
     def state(self) -> ModelState:
@@ -88,28 +91,29 @@ class LearnedModel:
         return self._state._replace(generator_state=self._generator.get_state())
 
     def set_state(self, state: ModelState) -> None:
-        """Continue from a state; raise `InputError` if its parts do not fit together."""
-        rows, size = len(state.observed.speed), len(self.world_model.scenario.drawn_ranges)
-        for name, values, shape in (
-            *((name, each, (rows,)) for name, each in state.observed._asdict().items() if each is not None),
-            *(("actuators", each, (rows,)) for each in (state.actuators.acceleration, *state.actuators.pending)),
-            ("drawn_values", state.drawn_values, (rows, size)),
+        """Continue from a state; raise `InputError` if it has tensors of different sizes, or NaN."""
+        rows, drawn_size = len(state.observed.speed), len(self.world_model.scenario.drawn_ranges)
+        actuator_tensors = state.actuators.acceleration, *state.actuators.pending
+        for name, tensor, shape in (
+            *((name, tensor, (rows,)) for name, tensor in state.observed._asdict().items() if tensor is not None),
+            *(("actuators", tensor, (rows,)) for tensor in actuator_tensors),
+            ("drawn_values", state.drawn_values, (rows, drawn_size)),
             ("is_running", state.is_running, (rows,)),
         ):
-            if tuple(values.shape) != shape:
-                raise invalid_value(f"state: shape of {name}", tuple(values.shape), str(shape))
-            if bool(values.isnan().any()):
+            if tuple(tensor.shape) != shape:
+                raise invalid_value(f"state: shape of {name}", tuple(tensor.shape), str(shape))
+            if bool(tensor.isnan().any()):
                 raise invalid_value(f"state: {name}", "nan", "numbers")
         self._generator.set_state(state.generator_state)
         self._state = state
 
     def step(self, acceleration: Any) -> ModelTransition:
-        """Make one control step under `acceleration` [m/s2], shape (n,), within the limits and the safety filter.
+        """Make one control step with `acceleration` [m/s2], shape (n,), within the limits and the safety filter.
 
-        After its collision a row still moves, with the reward zero; `crashed` says whether it had one so far.
+        After a collision, a row still moves, but its reward is zero; `crashed` is true from the collision on.
         """
-        observed, actuators, drawn, is_running, _ = self._state
-        if not isinstance(acceleration, Tensor):  # the program can have set another default type
+        observed, actuators, drawn_values, is_running, _ = self._state
+        if not isinstance(acceleration, Tensor):  # torch's default type would depend on the program
             acceleration = np.asarray(acceleration, np.float64)
         acceleration = torch.as_tensor(acceleration, device=DEVICE)
         if tuple(acceleration.shape) != tuple(observed.speed.shape):
@@ -117,7 +121,8 @@ class LearnedModel:
         if not bool((is_finite := acceleration.isfinite()).all()):
             raise invalid_value("acceleration", float(acceleration[~is_finite][0]), "finite numbers")
         limits = self.world_model.scenario.acceleration_limits
-        transition = self._dynamics.step(observed, limits.clip(acceleration.to(observed.speed)), drawn, actuators)
+        command = limits.clip(acceleration.to(observed.speed))
+        transition = self._dynamics.step(observed, command, drawn_values, actuators)
         still_running = is_running * ~transition.crashed
         self._state = self._state._replace(
             observed=transition.state, actuators=transition.actuators, is_running=still_running
@@ -126,19 +131,20 @@ class LearnedModel:
 
     @torch.no_grad()
     def roll_out(self, driver: DriverLike, control_steps: int) -> ModelTrajectories:
-        """Let a driver drive all rows from the present state on; it remembers nothing of the time before.
+        """Let a driver with its initial memory drive all rows from the present state on.
 
-        Raise `InputError` if it needs what rows do not have, or returns a value that is not finite, or without steps.
+        Raise `InputError` if the driver needs fields that rows do not have, or returns a value that is not finite, or
+        if `control_steps` is below 1.
         """
         check_integer("control_steps", control_steps, 1)
         scenario, rows = self.world_model.scenario, len(self._state.observed.speed)
-        made = as_driver(driver, scenario.control_step)
-        check_can_drive(made, scenario)
-        made = tensor_driver(made, DEVICE)
-        memory = tensor_memory(made, made.initial_memory(rows), DEVICE)
+        array_driver = as_driver(driver, scenario.control_step)
+        check_can_drive(array_driver, scenario)
+        torch_driver = tensor_driver(array_driver, DEVICE)
+        memory = tensor_memory(torch_driver, torch_driver.initial_memory(rows), DEVICE)
         states, rewards = [self._state.observed], []
         for _ in range(control_steps):
-            acceleration, memory = made.act(states[-1], memory)
+            acceleration, memory = torch_driver.act(states[-1], memory)
             transition = self.step(acceleration)
             states.append(transition.state)
             rewards.append(transition.reward)
@@ -147,9 +153,10 @@ class LearnedModel:
 
     @torch_defaults()
     def error_report(self) -> dict[str, Any]:
-        """Return how well the model agrees with episodes of which no network learned: the facts of `unjam model`.
+        """Return the errors of the model on holdout episodes, which no network was fitted to, as `unjam model` does.
 
-        RMSE of a step (`one_step`, `by_state`) and of replays by time (`replay`); the `bound` by length, or None.
+        `one_step` and `by_state` have the RMSE of single steps, `replay` the RMSE of replays over time, and `bound` the
+        bound by rollout length, or None.
         """
         return trained_model_facts(self._trained)
 
@@ -158,7 +165,7 @@ class LearnedModel:
 def load_world_model(run: Path | str) -> LearnedModel:
     """Return the learned model in the newest checkpoint of a run folder.
 
-    Raise `InputError` if it is damaged, or has no checkpoint or no model of rows, as with several tasks.
+    Raise `InputError` if the folder is damaged, or has no checkpoint or no row model, as with several tasks.
     """
     if not isinstance(run, Path | str):
         raise invalid_value("run", run, "a run folder")

@@ -1,4 +1,4 @@
-"""Facts about the learned model of a run, measured on holdout episodes; the run folder has them as `model.json`."""
+"""Errors and the bound of the learned model of a run, measured on holdout episodes, for the run's `model.json`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,15 +27,16 @@ from unjam.worlds.record import Episode, Floats
 from unjam.worlds.worker_pool import EpisodeTask
 
 MAX_REPLAY_STEPS = 500
-"""control steps over which model and environment are compared, if the trips are long enough"""
+"""maximum length of a replay [control steps]"""
 MAX_ERROR_ROWS = 20_000
-"""control steps for the one-step errors, at most"""
+"""maximum number of rows for the one-step errors"""
 MAX_REPLAYS = 200
 EXAMPLE_COUNT = 3
-"""replays that are shown one by one"""
+"""number of replays that are plotted individually"""
 MAX_REPLAY_TIMES = 100
+"""maximum number of times at which errors of replays are stored"""
 BINS_PER_FIELD = 10
-"""bins with equal numbers of control steps, by gap and by speed"""
+"""number of bins with equally many control steps, for each of `BINNED_FIELDS`"""
 BINNED_FIELDS = ("leader_gap", "speed")
 ROLLOUT_LENGTHS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """lengths for which the bound is computed [control steps]"""
@@ -43,7 +44,7 @@ EXAMPLE_FIELDS = ("leader_gap", "leader_speed")
 
 
 def update_model_facts(folder: Path, config: RunConfig) -> dict[str, Any]:
-    """Return facts about the model of a run, measured again if out of date; `InputError` if it has none."""
+    """Return facts about the model of a run, measured again if out of date; raise `InputError` without a model."""
     _check_has_facts(folder, config)
     facts, progress = read_model_facts(folder), read_progress(folder)
     if facts is None or not progress or facts.get("iteration") != progress[-1]["iteration"]:
@@ -59,7 +60,7 @@ def _check_has_facts(folder: Path, config: RunConfig) -> None:
 
 
 def no_facts_reason(folder: Path, config: RunConfig) -> str:
-    """Return why there are no facts about the model of a run; empty if there are."""
+    """Return the reason why there are no facts about the model of a run, or an empty text."""
     if config.tasks:
         return "has several tasks; allowed: a run of one road"
     if config.model.model_ratio == 0:
@@ -75,7 +76,7 @@ def write_model_facts(folder: Path, config: RunConfig) -> None:
 
 
 def measure_model(folder: Path, config: RunConfig) -> dict[str, Any]:
-    """Return the facts about the model in a run's newest checkpoint, to four digits; else raise `InputError`."""
+    """Return the facts about the model in a run's newest checkpoint, to four digits; raise `InputError` without it."""
     return trained_model_facts(read_trained_model(folder, config))
 
 
@@ -110,14 +111,14 @@ def trained_model_facts(trained: TrainedModel) -> dict[str, Any]:
     if settings.kind == "road":
         run = partial(_run_episode, config.backend)
         return _round_values(facts | cast(WholeRoadModel[Any], rollouts.world_model).waves(run))
-    return _round_values(facts | _row_facts(rollouts, config, progress_row))
+    return _round_values(facts | _row_model_facts(rollouts, config, progress_row))
 
 
 def _run_episode(backend: str, task: EpisodeTask) -> Episode:
     return run_episode(task.scenario, task.driver, task.seed, backend=backend)
 
 
-def _row_facts(rollouts: ModelRollouts, config: RunConfig, progress_row: dict[str, Any]) -> dict[str, Any]:
+def _row_model_facts(rollouts: ModelRollouts, config: RunConfig, progress_row: dict[str, Any]) -> dict[str, Any]:
     model, generator = rollouts.world_model, np.random.default_rng(config.seed)
     scenario, transitions = model.scenario, model.data.transitions(config.model.holdout)
     holdout = transitions.select(generator.permutation(np.flatnonzero(transitions.is_holdout))[:MAX_ERROR_ROWS])
@@ -126,7 +127,7 @@ def _row_facts(rollouts: ModelRollouts, config: RunConfig, progress_row: dict[st
         "control_step": scenario.control_step,
         "k_star": progress_row["k_star"],
         "validation_steps": int(transitions.is_holdout.sum()),
-        "one_step": {name: each._asdict() for name, each in errors.rmse_by_target().items()},
+        "one_step": {name: rmse._asdict() for name, rmse in errors.rmse_by_target().items()},
         "by_state": {name: _errors_by_bin(getattr(holdout.states, name), errors) for name in BINNED_FIELDS},
         "replay": _replay_facts(model, generator),
         "bound": _bound_facts(rollouts, progress_row),
@@ -136,44 +137,44 @@ def _row_facts(rollouts: ModelRollouts, config: RunConfig, progress_row: dict[st
 def _errors_by_bin(values: Floats, errors: OneStepErrors) -> dict[str, Any]:
     """Return the one-step errors by `values`, shape (R,), in bins with equal numbers of rows."""
     edges = np.unique(np.quantile(values, np.linspace(0, 1, BINS_PER_FIELD + 1)))
-    numbers = np.searchsorted(edges[1:-1], values, side="right")
-    bins = [numbers == number for number in np.unique(numbers)]
+    bin_indices = np.searchsorted(edges[1:-1], values, side="right")
+    bin_masks = [bin_indices == index for index in np.unique(bin_indices)]
 
-    def errors_of(kind: Floats) -> dict[str, list[float]]:
-        """Return the error in each bin by target; errors have the shape (..., R, targets)."""
+    def rmse_by_target(row_errors: Floats) -> dict[str, list[float]]:
+        """Return the RMSE in each bin by target; `row_errors` has the shape (..., R, targets)."""
         return {
-            name: [root_mean_square(kind[..., rows, column]) for rows in bins]
+            name: [root_mean_square(row_errors[..., mask, column]) for mask in bin_masks]
             for column, name in enumerate(TARGET_NAMES)
         }
 
     return {
-        "values": [values[rows].mean() for rows in bins],
-        "control_steps": [int(rows.sum()) for rows in bins],
-        "base": errors_of(errors.base),
-        "model": errors_of(errors.model),
+        "values": [values[mask].mean() for mask in bin_masks],
+        "control_steps": [int(mask.sum()) for mask in bin_masks],
+        "base": rmse_by_target(errors.base),
+        "model": rmse_by_target(errors.model),
     }
 
 
 def replay_length(trip_lengths: Sequence[int]) -> int:
-    """Return the length of a replay: half of the median trip, so that at least half of the trips suffice."""
+    """Return the length of replays: half of the median trip, so that at least half of the trips are long enough."""
     return min(MAX_REPLAY_STEPS, max(1, int(np.median(trip_lengths)) // 2))
 
 
 def _replay_facts(world_model: WorldModel[RowModel, Any], generator: np.random.Generator) -> dict[str, Any]:
-    """Return the errors of replays of recorded accelerations in the model without noise, and some examples."""
+    """Return the errors of replays, in which the model without noise gets recorded accelerations, and examples."""
     data, model, scenario = world_model.data, world_model.ensemble, world_model.scenario
     masks = data.holdout_masks(world_model.settings.holdout)
     steps = replay_length([int(mask.sum()) for mask in masks if mask.any()])
     starts = data.start_indices(steps)
     starts = starts[[masks[recording][index] for recording, index in starts]]
     starts = starts[np.sort(generator.permutation(len(starts))[:MAX_REPLAYS])]
-    single = replace(world_model.settings, members=1, error_estimator="unexplained_variance")
-    base_model = RowModel(single, len(scenario.drawn_ranges), (0,))
+    base_settings = replace(world_model.settings, members=1, error_estimator="unexplained_variance")
+    models = model, RowModel(base_settings, len(scenario.drawn_ranges), (0,))  # an unfitted model is the base
     times = np.unique(np.linspace(0, steps - 1, MAX_REPLAY_TIMES).round().astype(int))
-    errors, base_errors = (open_loop_errors(each, data, starts, steps, scenario) for each in (model, base_model))
+    errors, base_errors = (open_loop_errors(replayed, data, starts, steps, scenario) for replayed in models)
     examples = starts[generator.permutation(len(starts))[:EXAMPLE_COUNT]]
     recorded = recorded_states(data, examples, steps)
-    members, base = (replay_accelerations(each, data, examples, steps, scenario) for each in (model, base_model))
+    members, base = (replay_accelerations(replayed, data, examples, steps, scenario) for replayed in models)
     return {
         "times": (times + 1) * scenario.control_step,
         "starts": len(starts),
@@ -205,7 +206,7 @@ def _replay_facts(world_model: WorldModel[RowModel, Any], generator: np.random.G
 
 
 def _bound_facts(rollouts: ModelRollouts, progress_row: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the bound C by rollout length for the newest row of progress; None without eps_m or eps_pi."""
+    """Return the paper's bound C by rollout length for the newest row of progress; None without eps_m or eps_pi."""
     eps_m = progress_row["model"]["eps_m_by_estimator"].get("transitions")
     eps_pi = progress_row["learner"].get("eps_pi_max")
     if eps_m is None or eps_pi is None:
@@ -222,7 +223,7 @@ def _bound_facts(rollouts: ModelRollouts, progress_row: dict[str, Any]) -> dict[
 
 
 def _round_values(value: Any) -> Any:
-    """Return plain lists and numbers with four digits."""
+    """Return a JSON value with lists instead of arrays, and numbers with four digits."""
     if isinstance(value, dict):
         return {key: _round_values(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):

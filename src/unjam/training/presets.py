@@ -17,7 +17,7 @@ from unjam.scenarios.scenario import Scenario
 BRAKING_COST = 0.0075
 """weight of the reward's acceleration term on loops, where the speed term is 1 at the speed limit"""
 ON_RAMP_TASK_WEIGHT = 0.3333
-"""weight of an on-ramp task: an episode has as many CAVs as twenty on rings, and takes as long"""
+"""weight of an on-ramp task: an episode has as many CAVs and takes as long as twenty episodes on rings"""
 
 
 @cache
@@ -27,17 +27,17 @@ def _packaged_presets() -> dict[str, dict[str, Any]]:
 
 @cache
 def all_presets() -> dict[str, dict[str, Any]]:
-    """Return packaged presets and those of other packages by name; the entry `on` has values for some scenarios."""
+    """Return the presets of unjam and of other packages by name; their entry `on` has values for single scenarios."""
     return reduce(operator.or_, load_plugins("unjam.presets").values(), _packaged_presets())
 
 
 def preset_values(preset: str, scenario: str) -> dict[str, Any]:
-    """Return what a preset changes on a scenario; raise `InputError` if there is no such preset."""
+    """Return the values of a preset for a scenario; raise `InputError` if there is no such preset."""
     presets = _packaged_presets() if preset in _packaged_presets() else all_presets()
     if preset not in presets:
         raise unknown_name("preset", preset, presets)
     by_scenario = presets[preset].get("on", {})
-    values = _resolve(by_scenario.get(scenario, presets[preset]))
+    values = _merge_like(by_scenario.get(scenario, presets[preset]))
     if not values:
         raise invalid_value("scenario", scenario, f"with the preset {preset}: {', '.join(by_scenario)}")
     if group := values.pop("road_group", ""):
@@ -45,16 +45,16 @@ def preset_values(preset: str, scenario: str) -> dict[str, Any]:
     return values
 
 
-def _resolve(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of a preset merged with those of the preset that it is `like`."""
-    own = {key: value for key, value in values.items() if key not in ("on", "like")}
+def _merge_like(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of the preset that the entry `like` names, changed by the other values."""
+    changes = {key: value for key, value in values.items() if key not in ("on", "like")}
     if "like" not in values:
-        return own
-    return merge_changes(_resolve(reduce(operator.getitem, values["like"].split("."), _packaged_presets())), own)
+        return changes
+    return merge_changes(_merge_like(reduce(operator.getitem, values["like"].split("."), _packaged_presets())), changes)
 
 
 def _family_task(name: str, scenario: Scenario) -> dict[str, Any]:
-    """Return a road of the family as a task; on loops the reward is relative to the speed limit."""
+    """Return a road of the family as a task; on loops, the speed in the reward is relative to the speed limit."""
     task = {"scenario": FAMILY[name].scenario, "scenario_options": FAMILY[name].options, "reward": "", "name": name}
     if not scenario.is_closed:
         return {**task, "weight": ON_RAMP_TASK_WEIGHT}

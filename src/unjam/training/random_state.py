@@ -1,4 +1,4 @@
-"""The random state and the defaults of torch that a training has to itself in the process of a program."""
+"""Random state and torch defaults of a training, separated from those of the program that runs the training."""
 
 import random
 import threading
@@ -15,9 +15,10 @@ _training_lock = threading.Lock()
 
 @contextmanager
 def torch_defaults() -> Iterator[None]:
-    """Give torch its own defaults in the block: single precision, the CPU, gradients, no automatic precision."""
+    """Set the defaults of torch in the block: single precision, the CPU, gradients, no automatic precision."""
     dtype, cpu = torch.get_default_dtype(), torch.device("cpu")
-    on_cpu = nullcontext() if torch.get_default_device() == cpu else cpu  # which makes each operation slower
+    # `cpu` as a context makes each operation slower.
+    on_cpu = nullcontext() if torch.get_default_device() == cpu else cpu
     with torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False), on_cpu:
         torch.set_default_dtype(torch.float32)
         try:
@@ -28,9 +29,9 @@ def torch_defaults() -> Iterator[None]:
 
 @contextmanager
 def exclusive_random_state() -> Iterator[None]:
-    """Lend the global generators of Python, NumPy and torch to the block, with one thread for torch's operations.
+    """Restore the global generators of Python, NumPy and torch after the block, and the number of torch's threads.
 
-    It has `torch_defaults`, too. All is restored at the end. Raise `UnjamError` if another thread is in such a block.
+    In the block, torch has `torch_defaults` and one thread. Raise `UnjamError` if another thread is in such a block.
     """
     if not _training_lock.acquire(blocking=False):
         raise UnjamError("train: another training runs in this process; allowed: one, or a process for each")

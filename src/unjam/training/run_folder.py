@@ -1,4 +1,4 @@
-"""The folder of a run: its creation, resumption and checkpoints.
+"""Run folders: creation, resumption and checkpoints.
 
 A checkpoint is written after each iteration, and named by iteration and hash; the newest two are kept. torch is only
 imported for checkpoints, so that errors are reported quickly.
@@ -53,12 +53,12 @@ CHECKPOINT_FORMAT = 7
 """format of run folders and their checkpoints; other formats are refused"""
 MAX_CHECKPOINTS = 2
 CONTROLLER_KINDS = "best", "latest"
-"""controllers in a checkpoint: that of the best scheduled validation, and that of the folder"""
+"""controllers in a checkpoint: that of the best scheduled validation, and that in the folder"""
 PROGRESS_FILE = "progress.jsonl"
 CHECKPOINT_NAME = re.compile(r"\d{6,}-[0-9a-f]{64}\.safetensors")
 """file name of a checkpoint: iteration and hash of the content"""
 ROW_MODEL_FIELDS = {"distance_to_crossing", "penetration_rate"}
-"""optional inputs that the row model continues"""
+"""optional inputs that the row model can predict"""
 
 
 class CheckpointValues(NamedTuple):
@@ -74,7 +74,7 @@ class CheckpointValues(NamedTuple):
 
 
 def check_config(config: RunConfig) -> None:
-    """Raise `InputError` if an expert, an input, a reward, the backend, a baseline or the model is not possible."""
+    """Raise `InputError` if an expert, input, reward, backend, baseline or model does not work on its road."""
     for task in config.task_configs().values():
         scenario = task.make_scenario()
         check_policy_inputs(task.policy.inputs, scenario, "policy.inputs")
@@ -82,8 +82,8 @@ def check_config(config: RunConfig) -> None:
         expert = task.make_expert()
         check_can_drive(expert, scenario)
         driver_recipe(expert)  # workers build it
-        if task.backend == "batch" or config.model.model_ratio > 0:  # which drive many roads at once
-            _check_rows(expert, scenario)
+        if task.backend == "batch" or config.model.model_ratio > 0:  # both drive many roads at once
+            _check_row_independence(expert, scenario)
         observation_size(task.policy.inputs, expert)
         make_reward(task.reward or scenario.reward)
         with open_backend(task.episode_backend) as backend:
@@ -96,18 +96,18 @@ def check_config(config: RunConfig) -> None:
         if config.model.model_ratio > 0 and config.model.kind == "row":
             _check_row_model(task, scenario, expert)
         elif config.model.model_ratio > 0:
-            from unjam.models.registry import world_model_class  # which needs torch
+            from unjam.models.registry import world_model_class  # imported late: needs torch
 
             world_model_class(scenario, config.model).check(scenario, config.model)
     config.make_tasks()
     if is_file_reference(config.agent):
-        from unjam.learners.agent import check_agent  # its file may import torch
+        from unjam.learners.agent import check_agent  # imported late: needs torch
 
         check_agent(config.agent)
 
 
-def _check_rows(expert: Driver, scenario: Scenario) -> None:
-    """Raise `InputError` if the CAVs that an expert drives influence each other."""
+def _check_row_independence(expert: Driver, scenario: Scenario) -> None:
+    """Raise `InputError` if the command of an expert for a CAV depends on other CAVs."""
     state, memory = probe_state(scenario.provided_fields), expert.initial_memory(PROBE_ROWS)
 
     def accelerations(rows: slice) -> Any:
@@ -117,7 +117,7 @@ def _check_rows(expert: Driver, scenario: Scenario) -> None:
 
 
 def _check_row_model(config: RunConfig, scenario: Scenario, expert: Driver) -> None:
-    """Raise `InputError` if the row model cannot continue an input, or the actuation of the scenario."""
+    """Raise `InputError` if the row model cannot predict an input, or does not support the actuation of CAVs."""
     features = merge_requirements(*(feature(name).requirements for name in config.policy.inputs))
     inputs = expert.requirements(scenario.interface).measured_fields | features.required_fields
     missing = sorted(inputs & set(scenario.provided_fields) - ROW_MODEL_FIELDS)
@@ -130,7 +130,7 @@ def _check_row_model(config: RunConfig, scenario: Scenario, expert: Driver) -> N
 
 
 def make_new_folder(folder: Path, alternative: str = "") -> None:
-    """Make a folder, or raise `InputError` if it has more than leftovers; the message names an `alternative`."""
+    """Make a folder; raise `InputError`, with an allowed `alternative`, if it has other files than leftovers."""
     try:
         if folder.exists() and not (
             folder.is_dir() and all(files.is_leftover(path) or path.name == LOCK_FILE for path in folder.iterdir())
@@ -144,7 +144,10 @@ def make_new_folder(folder: Path, alternative: str = "") -> None:
 
 @contextmanager
 def lock_new_folder(folder: Path, resumable_file: str = "") -> Iterator[None]:
-    """Make and lock a folder, and remove it if it stays empty; `InputError` if locked, or used and not resumable."""
+    """Make and lock a folder for the block, and remove it if it stays empty.
+
+    Raise `InputError` if the folder is locked, or has files but no `resumable_file`.
+    """
 
     def check() -> None:
         if not (resumable_file and (folder / resumable_file).is_file()):
@@ -166,13 +169,13 @@ def removing_if_empty(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def discarding_refused(folder: Path) -> Iterator[None]:
+def empty_if_refused(folder: Path) -> Iterator[None]:
     """Empty the locked folder of a run if the block raises `InputError` before the first iteration is complete."""
     try:
         yield
     except InputError:
         if not read_progress(folder):
-            for path in [each for each in folder.iterdir() if each.name != LOCK_FILE]:
+            for path in [path for path in folder.iterdir() if path.name != LOCK_FILE]:
                 files.remove(path)
         raise
 
@@ -190,9 +193,10 @@ def _write_manifest(folder: Path) -> None:
 
 
 def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
-    """Return the configuration of a run folder; raise `InputError` if it is none, or of another format.
+    """Return the configuration of a run folder; raise `InputError` if the folder is no run or has another format.
 
-    Also if it names untrusted Python code: without `check_trust` only if its roads do; no other may be run then.
+    Also raise it for untrusted Python code. Without `check_trust`, only the code of scenarios is checked, and no other
+    code may be run.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
@@ -206,45 +210,45 @@ def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
         return build_dataclass(RunConfig, values, "")
     except InputError:
         with suppress(OSError, ValueError, RecursionError, AttributeError, KeyError):
-            made = json.loads((folder / MANIFEST_FILE).read_text())
-            if (found := made.get("format", 4)) != CHECKPOINT_FORMAT:
-                version = f"format {found}, written by unjam {made['unjam']} (commit {made['commit']})"
+            origin = json.loads((folder / MANIFEST_FILE).read_text())
+            if (found_format := origin.get("format", 4)) != CHECKPOINT_FORMAT:
+                version = f"format {found_format}, written by unjam {origin['unjam']} (commit {origin['commit']})"
                 raise InputError(f"run: {str(folder)!r} has {version}; allowed: format {CHECKPOINT_FORMAT}") from None
         raise
 
 
 def resume_run_folder(folder: Path, config: RunConfig) -> None:
-    """Write the new budget of `config` into the run in `folder`.
+    """Write the steps and workers of `config` into the run in `folder`.
 
-    Raise `InputError` if more than steps and workers differs, if the folder belongs to one task of a run, or if the run
+    Raise `InputError` if another setting differs, if the steps are not possible, for the folder of a task, or if the run
     has lost its checkpoints.
     """
     parent = folder.absolute().parent
     if folder.name in _task_names(parent):
         raise InputError(f"resume: {str(folder)!r} is one task of a run; allowed: {parent}")
-    before, progress = read_config(folder), read_complete_progress(folder)
-    if replace(before, steps=config.steps, workers=config.workers) != config:
+    stored, progress = read_config(folder), read_complete_progress(folder)
+    if replace(stored, steps=config.steps, workers=config.workers) != config:
         raise InputError("resume: only steps and workers may change")
-    if config.steps > before.steps and before.evaluation.should_stop_early(progress):
-        reason = f"evaluation.patience or evaluation.convergence_window ended it; allowed: {before.steps}, or a new run"
+    if config.steps > stored.steps and stored.evaluation.should_stop_early(progress):
+        reason = f"evaluation.patience or evaluation.convergence_window ended it; allowed: {stored.steps}, or a new run"
         raise InputError(f"steps: {config.steps} is not allowed: {reason}")
-    done = max((row.get("environment_steps", 0) for row in progress), default=0)
-    if config.steps < min(before.steps, done):
-        raise invalid_value("steps", config.steps, f">= {done}, which are done")
+    done_steps = max((row.get("environment_steps", 0) for row in progress), default=0)
+    if config.steps < min(stored.steps, done_steps):
+        raise invalid_value("steps", config.steps, f">= {done_steps}, which are done")
     check_run_files(folder, config, "resume", ignored_prefixes=())
-    is_evaluated = any((folder / task / EVALUATION_FILE).is_file() for task in before.task_configs())
+    is_evaluated = any((folder / task / EVALUATION_FILE).is_file() for task in stored.task_configs())
     if (is_evaluated or len(progress) > 1) and not _checkpoint_files(folder / "checkpoint"):
         reason = "has no checkpoint to continue from, and a new start would overwrite its results"
         raise InputError(f"resume: {str(folder)!r} {reason}; allowed: the run with its checkpoint/, or a new run")
-    if config != before:  # names of files remain as they are
-        changed = {**read_toml(folder / CONFIG_FILE), "steps": config.steps, "workers": config.workers}
-        files.atomic_write(folder / CONFIG_FILE, tomli_w.dumps(changed))
+    if config != stored:  # `read_config` makes file names absolute, and the stored names must not change
+        values = {**read_toml(folder / CONFIG_FILE), "steps": config.steps, "workers": config.workers}
+        files.atomic_write(folder / CONFIG_FILE, tomli_w.dumps(values))
     if not (folder / MANIFEST_FILE).is_file():  # the run was stopped before it wrote the manifest
         _write_manifest(folder)
 
 
 def _task_names(folder: Path) -> Collection[str]:
-    """Return the names of the tasks of a run folder; other folders have none."""
+    """Return the names of the tasks of a run folder, or an empty collection for other folders."""
     with suppress(InputError):
         if (folder / MANIFEST_FILE).is_file():
             return read_config(folder, check_trust=False).task_configs()
@@ -252,18 +256,18 @@ def _task_names(folder: Path) -> Collection[str]:
 
 
 def append_lineage(folder: Path, iteration: int) -> None:
-    """Add to a run's manifest the environment in which it is resumed after an iteration."""
+    """Add the versions with which a run is resumed after an iteration to the run's manifest."""
     path = folder / MANIFEST_FILE
-    facts = files.read_json_object(path)
-    lineage = facts.get("lineage", [])
+    origin = files.read_json_object(path)
+    lineage = origin.get("lineage", [])
     if not isinstance(lineage, list):
         raise InputError(f"{path}: lineage is no list; allowed: the file as unjam wrote it")
-    facts["lineage"] = [*lineage, {"iteration": iteration, **manifest()}]
-    files.atomic_write(path, to_json(facts, indent=1))
+    origin["lineage"] = [*lineage, {"iteration": iteration, **manifest()}]
+    files.atomic_write(path, to_json(origin, indent=1))
 
 
 def controller_origin(scenario: Scenario, expert: Driver) -> dict[str, Any]:
-    """Return the origin of a controller for its manifest; it is the same for the same run."""
+    """Return the entries of a controller's manifest about its origin, which are equal for equal runs."""
     return {
         "scenario": scenario_recipe(scenario),
         "time_step": scenario.control_step,
@@ -289,26 +293,26 @@ def save_checkpoint(folder: Path, state: dict[str, Any], tensors: "Tensors") -> 
 def restore_newest_checkpoint(
     folder: Path, progress_folders: Iterable[Path], expected: dict[str, Any] | None = None
 ) -> "tuple[dict[str, Any], Tensors] | None":
-    """Return the newest checkpoint of a run, and remove everything later; None before the first one.
+    """Return the newest checkpoint of a run, and remove later rows of progress; return None without a checkpoint.
 
-    Raise `InputError` if no checkpoint is valid, if its fingerprint differs from the `expected` one, or if a row of
-    progress before it is missing.
+    Raise `InputError` if all checkpoints are damaged, if the fingerprint differs from the `expected` fingerprint, or if
+    a row of progress before the checkpoint is missing.
     """
     checkpoint = load_checkpoint(folder / "checkpoint")
     if checkpoint and expected and "fingerprint" in checkpoint[0]:
         check_fingerprint(checkpoint[0]["fingerprint"], expected)
     iteration = checkpoint[0]["iteration"] if checkpoint else 0
-    progress = {place: _progress_until(place, iteration) for place in progress_folders}
+    progress = {progress_folder: _progress_until(progress_folder, iteration) for progress_folder in progress_folders}
     _remove_old_checkpoints(folder / "checkpoint")
-    for place, rows in progress.items():
-        files.remove_leftovers(place)
-        if (place / PROGRESS_FILE).is_file():
-            files.atomic_write(place / PROGRESS_FILE, "".join(to_json(row) + "\n" for row in rows))
+    for progress_folder, rows in progress.items():
+        files.remove_leftovers(progress_folder)
+        if (progress_folder / PROGRESS_FILE).is_file():
+            files.atomic_write(progress_folder / PROGRESS_FILE, "".join(to_json(row) + "\n" for row in rows))
     return checkpoint
 
 
 def read_complete_progress(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of progress of a run; raise `InputError` if one before its newest checkpoint is missing."""
+    """Return the rows of progress of a run; raise `InputError` if a row before the newest checkpoint is missing."""
     rows = read_progress(folder)
     state = next((state for _, state, _ in _valid_checkpoints(folder / "checkpoint")), {})
     newest = state.get("iteration", max((row["iteration"] for row in rows), default=0))
@@ -317,7 +321,7 @@ def read_complete_progress(folder: Path) -> list[dict[str, Any]]:
 
 
 def _progress_until(folder: Path, iteration: int) -> list[dict[str, Any]]:
-    """Return the rows of progress of all iterations up to this one; raise `InputError` if they are not all there."""
+    """Return the rows of progress up to this iteration; raise `InputError` if a row is missing."""
     rows = [row for row in read_progress(folder) if row["iteration"] <= iteration]
     for expected, found in enumerate([*(row["iteration"] for row in rows), iteration + 1], 1):
         if found != expected:
@@ -334,13 +338,12 @@ def load_checkpoint(folder: Path) -> "tuple[dict[str, Any], Tensors] | None":
 
     for path, state, data in _valid_checkpoints(folder):
         try:
-            found, tensors = state.pop("format", 1), load(data)
+            found_format, tensors = state.pop("format", 1), load(data)
         except files.INVALID_DATA_ERRORS:
             continue
-        if found != CHECKPOINT_FORMAT:
-            raise InputError(
-                f"checkpoint: {path} has format {found!r}, of another version of unjam; allowed: {CHECKPOINT_FORMAT}"
-            )
+        if found_format != CHECKPOINT_FORMAT:
+            version = f"has format {found_format!r}, of another version of unjam"
+            raise InputError(f"checkpoint: {path} {version}; allowed: {CHECKPOINT_FORMAT}")
         check_integer("checkpoint: iteration", state.get("iteration"), 0)
         return state, tensors
     if paths := _checkpoint_files(folder):
@@ -361,9 +364,9 @@ def _valid_checkpoints(folder: Path) -> Iterator[tuple[Path, dict[str, Any], byt
 def check_run_files(
     folder: Path, config: RunConfig, command: str, ignored_prefixes: tuple[str, ...] = ("evaluation.",)
 ) -> None:
-    """Raise `InputError` if files or settings that a run was trained with have changed; not without a checkpoint.
+    """Raise `InputError` if files or settings with which a run was trained have changed since its checkpoint.
 
-    The folder of a task has the checkpoint of its run.
+    `folder` is the folder of a run or of one of its tasks. A run without a checkpoint is not checked.
     """
     newest = next((state for _, state, _ in _valid_checkpoints(folder / "checkpoint")), {})
     stored = newest.get("fingerprint")
@@ -378,13 +381,13 @@ def check_run_files(
 
 
 def check_controllers(driver_name: str, command: str) -> None:
-    """Check the folders of runs that the name of a driver has, as `check_controller` does."""
+    """Call `check_controller` for each run folder in the name of a driver."""
     for name in split_names(driver_name):
         check_controller(Path(name), command)
 
 
 def check_controller(folder: Path, command: str) -> None:
-    """Raise `InputError` if the controller in the folder of a run or task is not one of the newest checkpoint.
+    """Raise `InputError` if the controller in the folder of a run or task is not a controller of the newest checkpoint.
 
     Other folders and runs that are being trained are not checked; for a run without a checkpoint a warning is logged.
     `folder` may be the path of the controller in the folder.

@@ -4,6 +4,7 @@ import logging
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,32 +40,35 @@ RunState = Literal["running", "finished", "stopped", "damaged"]
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder and its progress."""
+    """A run folder with the progress and results of the run."""
 
     name: str
-    """path below the listed folder"""
+    """path relative to the listed folder"""
     folder: Path
     config: RunConfig = field(repr=False)
     state: RunState
-    """`running`: a process of this machine writes it; `stopped`: `unjam train --resume` can continue it"""
+    """`running`: a process of this machine trains it; `stopped`: `unjam train --resume` can continue it"""
     steps: int
-    """completed environment steps, of `config.steps`"""
+    """completed environment steps, out of `config.steps`"""
     gains: dict[str, Estimate | None]
-    """return difference to the expert on test seeds by task; the name of a single task is empty"""
+    """difference of return to the expert on test seeds, by task; a single task has an empty name"""
 
     def document(self) -> dict[str, Any]:
         """Return the run as JSON."""
         config = self.config
         return {
-            **{"name": self.name, "folder": str(self.folder), "scenario": config.scenario},
-            **{"preset": config.preset, "expert": config.expert, "agent": config.agent, "seed": config.seed},
-            **{"state": self.state, "steps": self.steps, "steps_total": config.steps},
+            "name": self.name,
+            "folder": str(self.folder),
+            **{name: getattr(config, name) for name in ("scenario", "preset", "expert", "agent", "seed")},
+            "state": self.state,
+            "steps": self.steps,
+            "steps_total": config.steps,
             "test_gain": {task: asdict(gain) if gain else None for task, gain in self.gains.items()},
         }
 
 
 def list_runs(root: Path | str = "runs", scenario: str = "") -> list[Run]:
-    """Return the runs in a folder and below it, by name; with `scenario`, only those that train on it.
+    """Return the runs in a folder and its subfolders, sorted by folder; with `scenario`, only runs on this scenario.
 
     Raise `InputError` if there is no such folder.
     """
@@ -83,13 +87,13 @@ def list_runs(root: Path | str = "runs", scenario: str = "") -> list[Run]:
 
 
 def _run_folders(root: Path) -> Iterator[tuple[Path, RunConfig]]:
-    for place, subfolders, files in os.walk(root):
+    for path, subfolders, files in os.walk(root):
         if {CONFIG_FILE, MANIFEST_FILE} <= set(files):
             subfolders.clear()  # the tasks of a run are not runs
             try:
-                yield Path(place), read_config(Path(place), check_trust=False)
-            except UnjamError as error:  # it is of another version or program, or its road is untrusted code
-                _LOG.warning("%s is not listed: %s", place, error)
+                yield Path(path), read_config(Path(path), check_trust=False)
+            except UnjamError as error:  # for example of another version, or with an untrusted scenario
+                _LOG.warning("%s is not listed: %s", path, error)
 
 
 def read_run(folder: Path, name: str = "") -> Run:
@@ -100,7 +104,7 @@ def read_run(folder: Path, name: str = "") -> Run:
     try:
         steps = int(progress[-1]["environment_steps"]) if progress else 0
         evaluations = {task: _current_evaluation(folder / task) for task in config.task_configs()}
-        gains = {task: found and _test_gain(*found) for task, found in evaluations.items()}
+        gains = {task: evaluation and _test_gain(*evaluation) for task, evaluation in evaluations.items()}
     except INVALID_DATA_ERRORS as error:
         raise damaged_results_error(folder, error) from None
     is_evaluated = all(evaluations.values())
@@ -110,7 +114,7 @@ def read_run(folder: Path, name: str = "") -> Run:
 
 
 def _current_evaluation(folder: Path) -> tuple[dict[str, Any], RowsByDriver] | None:
-    """Return metadata and rows of the evaluation of the controller in a folder; None before it."""
+    """Return metadata and rows of the evaluation of the controller in a folder; None if it is not evaluated."""
     if not (folder / EVALUATION_FILE).is_file():
         return None
     metadata, rows = read_evaluation(folder)
@@ -118,22 +122,22 @@ def _current_evaluation(folder: Path) -> tuple[dict[str, Any], RowsByDriver] | N
 
 
 def _test_gain(metadata: dict[str, Any], rows: RowsByDriver) -> Estimate | None:
-    """Return the return difference to the expert; None without an expert."""
+    """Return the paired difference of return to the expert; None without an expert."""
     expert = rows.get(metadata.get("expert", ""))
     return paired_difference(rows[metadata["trained"]], expert, "return") if expert else None
 
 
 def find_run(name: str, root: Path) -> Path:
-    """Return the folder of a run by its name below `root`, or by its path."""
+    """Return the folder of a run, given by its name relative to `root`, or by its path."""
     return root / name if (root / name).is_dir() else Path(name)
 
 
 def config_differences(runs: Sequence[Run]) -> dict[str, list[Any]]:
-    """Return the settings in which runs differ, with the value of each run; keys have dots."""
-    settings = [flatten_keys(asdict(run.config)) for run in runs]
-    names = dict.fromkeys(name for each in settings for name in each)
-    values = {name: [each.get(name) for each in settings] for name in names}
-    return {name: each for name, each in values.items() if any(value != each[0] for value in each)}
+    """Return the values of all runs for each setting in which they differ; names have dots."""
+    run_settings = [flatten_keys(asdict(run.config)) for run in runs]
+    names = dict.fromkeys(chain(*run_settings))
+    values_by_name = {name: [settings.get(name) for settings in run_settings] for name in names}
+    return {name: values for name, values in values_by_name.items() if any(value != values[0] for value in values)}
 
 
 def remove_run(folder: Path) -> list[Path]:

@@ -1,6 +1,6 @@
-"""Search for the settings with which a training learns best. `unjam search`, with Optuna.
+"""Search for the best settings of a training with Optuna (`unjam search`).
 
-The objective is the validation return, which also selects the controller of a training; test seeds are not used.
+The objective is the validation return, by which a training also selects its controller; test seeds are not used.
 """
 
 import math
@@ -33,26 +33,24 @@ from unjam.training.trial_log import TRIALS_FILE, TrialLog
 SEARCH_FILE, BEST_CONFIG_FILE = "search.json", "best.toml"
 MESSAGE_INTERVAL = 30.0
 """time without a message after which the progress of trainings is shown [s]"""
-
-
 TRIAL_FAILURE_CODES = (UnjamError.exit_code, InputError.exit_code)
-"""exit codes with which a trial has failed for good; it resumes after others, as of a full disk"""
+"""exit codes of failed trials; after other codes, such as that of a full disk, a trial is resumed"""
 
 
 def check_search_space(base: RunConfig, space: SearchSpace) -> None:
-    """Raise `InputError` for an unknown key, a value out of range, and without validations."""
+    """Raise `InputError` for an unknown key, a value out of range, or a configuration without validations."""
     if base.evaluation.validation_interval == 0:
         raise invalid_value("evaluation.validation_interval", 0, ">= 1: trials are compared by validations")
-    for key, values in space.items():
-        for value in boundary_values(values):
+    for key, distribution in space.items():
+        for value in boundary_values(distribution):
             check_config(trial_config(base, {key: value}))
 
 
 def trial_config(base: RunConfig, values: dict[str, Any]) -> RunConfig:
-    """Return a configuration with some values changed; keys may have dots."""
+    """Return the base configuration with the values of a trial; keys may have dots."""
     unused = unused_tables(values.get("agent", base.agent))
-    kept = {key: value for key, value in asdict(base).items() if key not in unused}
-    return load_config(changes=merge_changes(kept, nest_keys(values)))
+    base_values = {key: value for key, value in asdict(base).items() if key not in unused}
+    return load_config(changes=merge_changes(base_values, nest_keys(values)))
 
 
 @dataclass(frozen=True)
@@ -63,8 +61,9 @@ class SearchTrial:
     values: dict[str, Any]
     folder: Path
     gain: float | None
-    """validation return of the best controller minus that of the expert; None if it failed"""
+    """validation return of the best controller minus that of the expert; None if the training failed"""
     last_gain: float | None
+    """the same for the last validation"""
 
 
 def search(
@@ -80,40 +79,49 @@ def search(
 
     The folder gets `search.json`, and `best.toml` for `unjam train --config`. An interrupted search resumes, also with
     more `trials` in total. `base` and `space` must pass `check_search_space`. Raise `InputError` if the folder has
-    another search, `UnjamError` if all trainings failed or one was stopped: then the same search resumes.
+    another search, and `UnjamError` if all trainings failed, or if a training was stopped, so that the search can be
+    resumed.
     """
     files = _file_hashes(base, space)
     log = TrialLog(folder, {"config": asdict(base), "space": repr(space), "files": files})
-    atomic_write(folder / CONFIG_FILE, to_toml(base))  # below it, files may only name trusted code
+    atomic_write(folder / CONFIG_FILE, to_toml(base))  # marks the folder: files in it may only name trusted code
     study = _restore_study(log, space)
-    proposed = _propose_trials(study, log, space, trials, base.seed)
+    proposals = _propose_trials(study, log, space, trials, base.seed)
     with open_executor(executor, workers) as start:
-        jobs: dict[Future[int], int] = {}
+        trial_by_future: dict[Future[int], int] = {}
         while True:
-            for number, values in islice(proposed, workers - len(jobs)):
-                jobs[start(_trial_command(base, folder, number, values))] = number
-            if not jobs:
+            for number, values in islice(proposals, workers - len(trial_by_future)):
+                trial_by_future[start(_trial_command(base, folder, number, values))] = number
+            if not trial_by_future:
                 break
-            ended_jobs = wait(jobs, MESSAGE_INTERVAL, FIRST_COMPLETED).done
-            if not ended_jobs:
-                on_message(_running_line(folder, jobs.values(), base.steps))
-            for done in ended_jobs:
-                number, now = jobs.pop(done), _file_hashes(base, space)
-                if changed := {name for name, _ in files.items() ^ now.items()}:
+            done_futures = wait(trial_by_future, MESSAGE_INTERVAL, FIRST_COMPLETED).done
+            if not done_futures:
+                on_message(_running_line(folder, trial_by_future.values(), base.steps))
+            for future in done_futures:
+                number = trial_by_future.pop(future)
+                if changed := {name for name, _ in files.items() ^ _file_hashes(base, space).items()}:
                     raise changed_file_error(min(changed))
-                if (code := done.result()) not in (0, *TRIAL_FAILURE_CODES):  # a full disk would end all others, too
-                    reason = f"trial {number} was stopped with exit code {code}; its log: {_log_file(folder, number)}"
-                    raise (DiskError if code == DiskError.exit_code else UnjamError)(reason)
-                objective = _objective(_trial_folder(folder, number), space) if code == 0 else None
+                exit_code = future.result()
+                if exit_code not in (0, *TRIAL_FAILURE_CODES):  # such as a full disk, which concerns all trials
+                    log_file = _log_file(folder, number)
+                    reason = f"trial {number} was stopped with exit code {exit_code}; its log: {log_file}"
+                    raise (DiskError if exit_code == DiskError.exit_code else UnjamError)(reason)
+                objective = _objective(_trial_folder(folder, number), space) if exit_code == 0 else None
                 log.append({"trial": number, "objective": objective})
                 study.tell(number, objective, state=TrialState.FAIL if objective is None else None)
                 on_message(_progress_line(study, number, trials))
     ended = study.get_trials()
-    ended.sort(key=lambda one: -math.inf if one.value is None else one.value, reverse=True)
-    results = [_make_trial(folder, one.number, one.params, one.value is None) for one in ended]
+    ended.sort(key=lambda trial: -math.inf if trial.value is None else trial.value, reverse=True)
+    results = [_make_trial(folder, trial.number, trial.params, trial.value is None) for trial in ended]
     rows = [
-        {"trial": one.number, "gain": one.gain, "last_gain": one.last_gain, "folder": str(one.folder), **one.values}
-        for one in results
+        {
+            "trial": trial.number,
+            "gain": trial.gain,
+            "last_gain": trial.last_gain,
+            "folder": str(trial.folder),
+            **trial.values,
+        }
+        for trial in results
     ]
     atomic_write(folder / SEARCH_FILE, to_json({"manifest": manifest(), "trials": rows}, indent=1))
     if results[0].gain is None:
@@ -126,8 +134,8 @@ def search(
 
 def _file_hashes(base: RunConfig, space: SearchSpace) -> dict[str, str]:
     """Return the hashes of all experts and files of the user that a trial may use."""
-    choices = ((key, each) for key, each in space.items() if isinstance(each, CategoricalDistribution))
-    configs = [base, *(trial_config(base, {key: value}) for key, each in choices for value in each.choices)]
+    choices = {key: values.choices for key, values in space.items() if isinstance(values, CategoricalDistribution)}
+    configs = [base, *(trial_config(base, {key: value}) for key, values in choices.items() for value in values)]
     return {name: sha256 for config in configs for name, sha256 in fingerprint(config)["files"].items()}
 
 
@@ -143,7 +151,7 @@ def _trial_folder(folder: Path, number: int) -> Path:
 
 def _trial_command(base: RunConfig, folder: Path, number: int, values: dict[str, Any]) -> CommandLine:
     config = trial_config(base, values)
-    short_evaluation = replace(config.evaluation, baselines=(), episodes=1)  # test seeds do not count in a search
+    short_evaluation = replace(config.evaluation, baselines=(), episodes=1)  # a search does not use test seeds
     log = _log_file(folder, number)
     config = replace(config, workers=1, evaluation=short_evaluation)
     return training_command(config, _trial_folder(folder, number), log.with_suffix(".toml"), log)
@@ -154,7 +162,7 @@ def _log_file(folder: Path, number: int) -> Path:
 
 
 def _restore_study(log: TrialLog, space: SearchSpace) -> Study:
-    """Return the study with the trials of earlier calls; some may have been interrupted."""
+    """Return the study with the trials of earlier calls, including interrupted trials."""
     proposals = [row["values"] for row in log.rows if "values" in row]
     study = create_study(direction="maximize")
     if [row.get("proposal") for row in log.rows if "values" in row] != [*range(len(proposals))]:
@@ -163,8 +171,8 @@ def _restore_study(log: TrialLog, space: SearchSpace) -> Study:
         objectives = {row["trial"]: row["objective"] for row in log.rows if "trial" in row}
         for number, values in enumerate(proposals):
             value = objectives.get(number)
-            ended = TrialState.FAIL if value is None else TrialState.COMPLETE
-            state = ended if number in objectives else TrialState.RUNNING
+            ended_state = TrialState.FAIL if value is None else TrialState.COMPLETE
+            state = ended_state if number in objectives else TrialState.RUNNING
             study.add_trial(create_trial(state=state, value=value, params=values, distributions=dict(space)))
     except (ValueError, TypeError, LookupError, AttributeError):  # a text outside the space may name code
         raise InputError(f"out: {TRIALS_FILE} has a trial outside the search space; allowed: a new folder") from None
@@ -174,7 +182,7 @@ def _restore_study(log: TrialLog, space: SearchSpace) -> Study:
 def _propose_trials(
     study: Study, log: TrialLog, space: SearchSpace, trials: int, seed: int
 ) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield number and values of interrupted trials, then of new ones, up to a total number."""
+    """Yield number and values of interrupted trials, then of new trials, up to a total number of `trials`."""
     stored = study.get_trials()
     yield from ((trial.number, trial.params) for trial in stored if not trial.state.is_finished())
     for number in range(len(stored), trials):
@@ -194,7 +202,7 @@ def validation_gain(folder: Path) -> float | None:
 
 
 def _objective(folder: Path, space: SearchSpace) -> float | None:
-    """Return the objective of a search: the gain or, because gains over different experts differ, the return."""
+    """Return the objective of a trial: the gain, or the return if experts vary, which have different gains."""
     gain = validation_gain(folder)
     if gain is None or "expert" not in space:
         return gain
@@ -202,7 +210,7 @@ def _objective(folder: Path, space: SearchSpace) -> float | None:
 
 
 def describe_trial(trial: SearchTrial) -> str:
-    """Return the gains of a trial as text: of the selected controller and of the last checkpoint."""
+    """Return a line with the gains of the selected controller and of the last checkpoint, and the values of a trial."""
     values = ", ".join(f"{key}={value}" for key, value in trial.values.items())
     if trial.gain is None or trial.last_gain is None:
         return f"trial {trial.number}: failed: {values}"
@@ -211,17 +219,17 @@ def describe_trial(trial: SearchTrial) -> str:
     return f"trial {trial.number}: validation gain over expert {trial.gain:+.1f}, {last}{untrained}: {values}"
 
 
-def _running_line(folder: Path, numbers: Iterable[int], steps: int) -> str:
-    rows = {number: read_progress(_trial_folder(folder, number))[-1:] for number in numbers}
-    texts = (f"trial {number} {row[0]['environment_steps'] if row else 0:,}" for number, row in rows.items())
-    return f"steps of {steps:,}: {', '.join(texts)}"
+def _running_line(folder: Path, numbers: Iterable[int], total_steps: int) -> str:
+    last_rows = {number: read_progress(_trial_folder(folder, number))[-1:] for number in numbers}
+    texts = (f"trial {number} {rows[0]['environment_steps'] if rows else 0:,}" for number, rows in last_rows.items())
+    return f"steps of {total_steps:,}: {', '.join(texts)}"
 
 
 def _progress_line(study: Study, number: int, trials: int) -> str:
-    stored = study.get_trials(deepcopy=False)
-    trial, ended = stored[number], sum(one.state.is_finished() for one in stored)
+    study_trials = study.get_trials(deepcopy=False)
+    trial, ended_count = study_trials[number], sum(trial.state.is_finished() for trial in study_trials)
     values = ", ".join(
         f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in trial.params.items()
     )
     result = "failed" if trial.value is None else f"{trial.value:+.1f}"
-    return f"{ended} of {trials}: trial {number}: {values}: {result}"
+    return f"{ended_count} of {trials}: trial {number}: {values}: {result}"

@@ -1,6 +1,6 @@
-"""Selection of a controller for each penetration rate, and its comparison with ACC vehicles and human drivers.
+"""Selection of a controller for each penetration rate, and its comparison with the human baseline and ACC vehicles.
 
-Selection seeds select it by successive halving, test seeds compare it.
+Controllers are selected by successive halving on selection seeds, and compared on test seeds.
 """
 
 import time
@@ -19,13 +19,13 @@ from unjam.text import format_count, format_duration
 from unjam.training.executors import MessageCallback
 
 MAX_SELECTION_SEEDS = 10
-"""seeds of a round of successive halving, at most"""
+"""maximum number of seeds of a round of successive halving"""
 MIN_HARM_SEEDS = 6
-"""fewest seeds with which an option is rejected for harm"""
+"""minimum number of seeds to reject an option for harm"""
 MIN_TEST_SEEDS = 3
-"""fewest test seeds with a confidence interval"""
+"""minimum number of test seeds for a confidence interval"""
 SELECTION_BUDGET_FRACTION = 0.4
-"""part of the budget that selection may use"""
+"""maximum part of the budget for the selection"""
 
 EpisodeSeed = tuple[int, ...]
 OptionRows = list[dict[str, Any]]
@@ -47,12 +47,13 @@ HUMAN_BASELINE = Option(0.0, "human")
 ACC_DRIVER = "cruise"
 """driver of ACC vehicles without a controller"""
 UNCHANGED_ACC_DRIVER = "acc with unchanged vehicles"
-"""the same, with the properties of the replaced vehicles instead of those that the user has set for CAVs"""
+"""driver of ACC vehicles with the properties of the replaced vehicles instead of those that the user sets for CAVs"""
 OptionRunner = Callable[[Sequence[Option], Sequence[EpisodeSeed]], dict[Option, OptionRows]]
+"""runs options on seeds and returns their rows, if the time is up only of the first seeds"""
 
 
 class EpisodeBudget:
-    """Counts episodes, and estimates how many more fit into the time."""
+    """Counts episodes, and estimates how many more episodes fit into the limits of number and time."""
 
     def __init__(
         self, episodes: int, minutes: float | None = None, workers: int = 1, clock: Callable[[], float] = time.monotonic
@@ -61,7 +62,7 @@ class EpisodeBudget:
         self._workers, self._completed_rounds, self._clock, self._start_time = workers, 0, clock, clock()
 
     def spend(self, count: int, simulated_count: int | None = None) -> None:
-        """Count episodes, of which `simulated_count` (all if None) have run in parallel and the rest were known."""
+        """Count episodes, of which `simulated_count` (None: all) have run in parallel, and the others were stored."""
         self.used_episodes += count
         self._completed_rounds += ceil((count if simulated_count is None else simulated_count) / self._workers)
 
@@ -86,7 +87,7 @@ class EpisodeBudget:
         return not is_limited or self.elapsed_seconds + self.estimate_seconds(episodes) <= 60.0 * (self.minutes or 0.0)
 
     def affordable_seeds(self, option_count: int, fraction: float = 1.0) -> int:
-        """Return the number of seeds on which so many options can run within a fraction of the budget."""
+        """Return the number of seeds on which a number of options can run within a fraction of the budget."""
         episodes = int(fraction * self.episodes + 1e-9) - self.used_episodes
         if self.minutes is not None and self._completed_rounds:
             rounds = (fraction * 60.0 * self.minutes - self.elapsed_seconds) / max(self.estimate_seconds(1), 1e-9)
@@ -95,28 +96,28 @@ class EpisodeBudget:
 
 
 def seeds_at_once(option_count: int, workers: int) -> int:
-    """Return the number of seeds on which so many options keep all workers busy, at least one."""
+    """Return the number of seeds on which a number of options keep all workers busy, at least one."""
     return max(1, workers // option_count)
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Result of the selection seeds."""
+    """Result of the selection on selection seeds."""
 
     rows: dict[Option, OptionRows]
     rejection_reasons: dict[Option, str]
     finalists: list[Option]
-    """options that are tested, at most one for each penetration rate"""
+    """selected options, at most one for each penetration rate"""
 
     def effect(self, option: Option) -> Effect:
-        """Return the effect of an option compared with the human baseline on the same seeds."""
+        """Return the effect of an option relative to the human baseline on the same seeds."""
         return effect_of(self.rows[option], self.rows[HUMAN_BASELINE])
 
 
 def min_episodes(rate_count: int, driver_count: int, with_unchanged_acc: bool = False) -> int:
-    """Return the smallest budget with which every option runs and the selected ones are tested."""
-    selection = 1 + rate_count * driver_count if driver_count > 1 else 0
-    return selection + MIN_TEST_SEEDS * (1 + rate_count * (1 + bool(driver_count) + with_unchanged_acc))
+    """Return the smallest budget with which every option runs and the selected options are tested."""
+    selection_episodes = 1 + rate_count * driver_count if driver_count > 1 else 0
+    return selection_episodes + MIN_TEST_SEEDS * (1 + rate_count * (1 + bool(driver_count) + with_unchanged_acc))
 
 
 def verdict_episodes(
@@ -126,20 +127,20 @@ def verdict_episodes(
     seeds: int = MIN_VERDICT_SEEDS,
     undecided_rate_count: int = 0,
 ) -> int:
-    """Return a budget that is enough for a number of test seeds, whatever selection uses.
+    """Return a budget that is enough for a number of test seeds after a selection with its maximum budget.
 
-    Of the seeds beyond those of any verdict, only `undecided_rate_count` penetration rates need all.
+    All penetration rates run on the first `MIN_VERDICT_SEEDS`, and `undecided_rate_count` rates on all seeds.
     """
     options_per_rate = 1 + bool(driver_count) + with_unchanged_acc
-    first = MIN_VERDICT_SEEDS * (1 + rate_count * options_per_rate)
-    test_episodes = first + (seeds - MIN_VERDICT_SEEDS) * (1 + undecided_rate_count * options_per_rate)
+    first_episodes = MIN_VERDICT_SEEDS * (1 + rate_count * options_per_rate)
+    test_episodes = first_episodes + (seeds - MIN_VERDICT_SEEDS) * (1 + undecided_rate_count * options_per_rate)
     return ceil(test_episodes / (1.0 - SELECTION_BUDGET_FRACTION)) if driver_count > 1 else test_episodes
 
 
 def select_controllers(
     options: Sequence[Option], run_options: OptionRunner, budget: EpisodeBudget, on_message: MessageCallback
 ) -> Selection:
-    """Select a controller for each penetration rate: the better half continues after each round.
+    """Select a controller for each penetration rate by successive halving.
 
     Raise `UnjamError` if the human baseline or all options fail.
     """
@@ -148,23 +149,23 @@ def select_controllers(
     selection, remaining = Selection(rows, rejected, []), list(options)
     rates = [option.penetration_rate for option in options]
     max_drivers = max(map(rates.count, rates), default=0)
-    rounds = ceil(log2(max_drivers)) if max_drivers > 1 else 0
-    for number in range(rounds):
-        fraction = SELECTION_BUDGET_FRACTION * (number + 1) / rounds
+    round_count = ceil(log2(max_drivers)) if max_drivers > 1 else 0
+    for round_number in range(1, round_count + 1):
+        fraction = SELECTION_BUDGET_FRACTION * round_number / round_count
         affordable = budget.affordable_seeds(1 + len(remaining), fraction)
-        count = max(min(MAX_SELECTION_SEEDS, affordable), int(number == 0))
+        count = max(min(MAX_SELECTION_SEEDS, affordable), int(round_number == 1))
         if count:
             seeds = selection_seeds(count, len(rows[HUMAN_BASELINE]))
             _extend_rows(rows, run_options([HUMAN_BASELINE, *remaining], seeds))
         rejected |= _failure_reasons(rows, remaining)
         seed_count = len(rows[HUMAN_BASELINE])
         if seed_count >= MIN_HARM_SEEDS:
-            rejected |= {each: harm for each in remaining if (harm := describe_harm(selection.effect(each)))}
+            rejected |= {option: harm for option in remaining if (harm := describe_harm(selection.effect(option)))}
         remaining = [option for option in remaining if option not in rejected]
         for rate in dict.fromkeys(option.penetration_rate for option in remaining):
             ranked = sorted(
-                (each for each in remaining if each.penetration_rate == rate),
-                key=lambda each: _ranking_key(selection.effect(each)),
+                (option for option in remaining if option.penetration_rate == rate),
+                key=lambda option: _ranking_key(selection.effect(option)),
             )
             reason = f"behind {ranked[0].driver} ({format_count(seed_count, 'tuning seed')})"
             rejected |= dict.fromkeys(ranked[ceil(len(ranked) / 2) :], reason)
@@ -180,7 +181,7 @@ def select_controllers(
 
 @dataclass(frozen=True)
 class AssessmentFindings:
-    """Result of the test seeds."""
+    """Result of the comparison on test seeds."""
 
     rows: dict[Option, OptionRows]
     controller_results: list[ControllerResult]
@@ -200,45 +201,48 @@ def compare_on_test_seeds(
     """Compare human baseline, ACC vehicles and the selected controllers on test seeds.
 
     An option runs until its CIs are narrower than `precision`, a share of the baseline's travel time, or until more
-    seeds within the budget can hardly lead to a recommendation; a good result ends none, so that CIs are not too
-    narrow. CIs hold together for all penetration rates with 95 % (Bonferroni). ACC vehicles with all properties of the
-    vehicles that they replace run `with_unchanged_acc`, too. `on_findings` is called after each round but the last.
+    seeds within the budget can hardly lead to a recommendation. A good result does not end an option, because its CIs
+    would be too narrow. CIs hold together for all penetration rates with 95 % (Bonferroni). `with_unchanged_acc` adds
+    ACC vehicles with all properties of the replaced vehicles. `on_findings` is called after each round except the last.
     """
     acc_options = [Option(rate, ACC_DRIVER) for rate in penetration_rates]
-    unchanged = [Option(rate, UNCHANGED_ACC_DRIVER) for rate in penetration_rates if with_unchanged_acc]
-    rows: dict[Option, OptionRows] = {option: [] for option in (HUMAN_BASELINE, *acc_options, *unchanged, *finalists)}
+    unchanged_acc = [Option(rate, UNCHANGED_ACC_DRIVER) for rate in penetration_rates if with_unchanged_acc]
+    compared_options = [*acc_options, *unchanged_acc, *finalists]
+    rows: dict[Option, OptionRows] = {option: [] for option in (HUMAN_BASELINE, *compared_options)}
     confidence = 1.0 - (1.0 - CONFIDENCE) / max(1, len(penetration_rates))
-    active, results, acc_results = [*rows][1:], list[ControllerResult](), list[AccResult]()
+    active, results, acc_results = compared_options, list[ControllerResult](), list[AccResult]()
     while active:
-        seeds = len(rows[HUMAN_BASELINE])
-        # The first round ends options that can never be recommended, such as infeasible ones.
-        wanted = seeds // 2 if seeds >= MIN_VERDICT_SEEDS else MIN_VERDICT_SEEDS - seeds if seeds else MIN_TEST_SEEDS
-        count = max(min(wanted, budget.affordable_seeds(1 + len(active))), 0 if seeds else MIN_TEST_SEEDS)
+        seed_count = len(rows[HUMAN_BASELINE])
+        if seed_count >= MIN_VERDICT_SEEDS:
+            wanted = seed_count // 2
+        else:  # a short first round ends options that can never be recommended, such as infeasible options
+            wanted = MIN_VERDICT_SEEDS - seed_count if seed_count else MIN_TEST_SEEDS
+        count = max(min(wanted, budget.affordable_seeds(1 + len(active))), 0 if seed_count else MIN_TEST_SEEDS)
         if not count:
             break
-        _extend_rows(rows, run_options([HUMAN_BASELINE, *active], held_out_seeds(count, seeds)))
-        if len(rows[HUMAN_BASELINE]) == seeds:  # the time has ended
+        _extend_rows(rows, run_options([HUMAN_BASELINE, *active], held_out_seeds(count, seed_count)))
+        if len(rows[HUMAN_BASELINE]) == seed_count:  # the time is up
             break
         results = [_controller_result(option, rows, confidence, precision) for option in finalists]
         acc_results = [_acc_result(option, rows, confidence, precision) for option in acc_options]
         max_seeds = len(rows[HUMAN_BASELINE]) + budget.affordable_seeds(1 + len(active))
         undecided = {
-            Option(each.penetration_rate, each.driver)
-            for each in results
-            if _may_change_verdict(each, max_seeds, precision)
+            Option(result.penetration_rate, result.driver)
+            for result in results
+            if _may_change_verdict(result, max_seeds, precision)
         }
         undecided_rates = {option.penetration_rate for option in undecided} | {
-            each.penetration_rate
-            for each in acc_results
-            if 0 < each.missing_seeds <= max_seeds - each.effect.travel_time.count
+            acc_result.penetration_rate
+            for acc_result in acc_results
+            if 0 < acc_result.missing_seeds <= max_seeds - acc_result.effect.travel_time.count
         }
         active = [
             option
             for option in active
             if option in undecided or (option not in finalists and option.penetration_rate in undecided_rates)
         ]
-        widths = _width_text([each.effect.relative_half_width for each in (*results, *acc_results)], precision)
-        status = f"{format_count(len(rows[HUMAN_BASELINE]), 'test seed')}: {widths}"
+        half_widths = [result.effect.relative_half_width for result in (*results, *acc_results)]
+        status = f"{format_count(len(rows[HUMAN_BASELINE]), 'test seed')}: {_precision_text(half_widths, precision)}"
         verb = "remains" if len(active) == 1 else "remain"
         remaining = f"; {format_count(len(active), 'option')} {verb}, {_remaining_time_text(budget)}" if active else ""
         on_message(status + remaining)
@@ -259,7 +263,7 @@ def _controller_result(
     differences = (paired_difference(rows[option], acc_rows, name, confidence) for name in (TIME_METRIC, FLOW_METRIC))
     difference, flow_difference = differences
     half_width = precision * effect.baseline_travel_time
-    required = max(required_seeds(each, half_width) for each in (difference, effect.travel_time))
+    required = max(required_seeds(estimate, half_width) for estimate in (difference, effect.travel_time))
     required = MIN_VERDICT_SEEDS if _is_rejected(effect, difference) else required
     missing = 0.0 if _has_failed(effect) else max(0.0, required - difference.count)
     cav_speed_change = relative_difference(rows[option], acc_rows, "cav_mean_speed")
@@ -274,7 +278,7 @@ def _is_rejected(effect: Effect, difference_to_acc: Estimate) -> bool:
 
 
 def _has_failed(effect: Effect) -> bool:
-    """Return whether an episode rules a recommendation out, however many others follow."""
+    """Return whether an episode rules out a recommendation, so that more seeds are useless."""
     return bool(effect.failed_episodes) or effect.is_infeasible
 
 
@@ -289,7 +293,7 @@ def _acc_result(option: Option, rows: dict[Option, OptionRows], confidence: floa
 
 
 def _may_change_verdict(result: ControllerResult, max_seeds: int, precision: float) -> bool:
-    """Return whether more test seeds may still lead to a recommendation, or make it more precise."""
+    """Return whether up to `max_seeds` test seeds may still lead to a recommendation, or to narrower CIs."""
     effect, difference = result.effect, result.difference_to_acc
     if difference.count < MIN_VERDICT_SEEDS:
         return not _has_failed(effect)
@@ -301,8 +305,8 @@ def _may_change_verdict(result: ControllerResult, max_seeds: int, precision: flo
 
 def _extend_rows(rows: dict[Option, OptionRows], new_rows: dict[Option, OptionRows]) -> None:
     raise_failure(new_rows[HUMAN_BASELINE])
-    for option, new in new_rows.items():
-        rows[option] += new
+    for option, option_rows in new_rows.items():
+        rows[option] += option_rows
 
 
 def _failure_reasons(rows: dict[Option, OptionRows], options: Iterable[Option]) -> dict[Option, str]:
@@ -313,15 +317,15 @@ def _failure_reasons(rows: dict[Option, OptionRows], options: Iterable[Option]) 
 
 
 def _ranking_key(effect: Effect) -> tuple[bool, bool, float]:
-    """Return the sort key of options: no collisions first, then feasibility, then travel time."""
+    """Return the sort key of options: those without collisions first, then feasible options, then by travel time."""
     return effect.collisions > 0, effect.feasibility != FEASIBLE, effect.relative_travel_time
 
 
-def _width_text(widths: Sequence[float], precision: float) -> str:
+def _precision_text(half_widths: Sequence[float], precision: float) -> str:
     target = f"(target: ±{100 * precision:g} %)"
-    if not all(map(isfinite, widths)):
+    if not all(map(isfinite, half_widths)):
         return f"too few for a confidence interval of travel time {target}"
-    return f"CI of travel time at most ±{100 * max(widths):.1f} % of the human baseline's {target}"
+    return f"CI of travel time at most ±{100 * max(half_widths):.1f} % of the human baseline's {target}"
 
 
 def _remaining_time_text(budget: EpisodeBudget) -> str:

@@ -1,6 +1,6 @@
 """Speed of episodes on this machine, relative to plain SUMO and to TraCI, and of batches of rings on a CPU or a GPU.
 
-Speed changes from minute to minute: ratios within one run count, with their parts measured alternately.
+Speed changes from minute to minute, so that only ratios of parts are reliable, which a run measures alternately.
 """
 
 import itertools
@@ -49,18 +49,20 @@ from unjam.worlds.sumo.backend import SumoBackend, make_traffic
 from unjam.worlds.sumo.simulation import Simulation
 
 TRACI_STEPS = 200
+"""control steps of measurements over TraCI"""
 RING_SIZES = {22: 3000, 220: 800, 2200: 200}
-"""vehicles on the ring, one in 22 a CAV, and control steps"""
+"""control steps by number of vehicles on the ring, of which one in 22 is a CAV"""
 ROLLOUT_SIZES = ((2000, 50), (1200, 10))
 """rows and control steps of model rollouts: with an accurate model, and as in a training iteration on the ring"""
 BATCH_VEHICLES = 90_112
+"""vehicles on all rings of a batch"""
 BENCHMARK_SCENARIOS = ("ring", "figure-eight", "merge")
 VECTOR_ENVIRONMENTS = ((1024, False), (4096, False), (1024, True))
 """numbers of rings in vector environments, and whether they equal SUMO exactly"""
 ASYNC_ENVIRONMENTS = 2
-"""number of processes of Gymnasium's own vector environment"""
+"""number of processes of Gymnasium's asynchronous vector environment"""
 MOTORWAYS, FILLING_STEPS, MOTORWAY_STEPS = 256, 150, 20
-"""number of motorways in a vector environment, control steps before they are measured, and in each round"""
+"""number of motorways in a vector environment, of control steps before the measurement, and of those in each round"""
 BUSY_ON_RAMP: dict[str, Any] = {
     "scenario": "on-ramp",
     "slots": 8,
@@ -70,34 +72,35 @@ BUSY_ON_RAMP: dict[str, Any] = {
 }
 """arguments of environments of motorways: some 120 vehicles are on each after `FILLING_STEPS`"""
 STEPS_PER_ROUND = 100
+"""control steps of batches and vector environments in each round"""
 METERS_PER_VEHICLE = 245 / 22
 VEHICLES_PER_RING = 22
 BATCH_SIZES = {"cpu": (64, 256, 1024, 4096, 16_384), "cuda": (64, 256, 1024, 4096, 16_384, 65_536, 262_144)}
 BENCHMARK_MODEL = ModelSettings(hidden=(32, 32))
 SUMO_PART, EPISODE_PART = "SUMO alone", "run_episode"
-"""what other parts are related to, after the name of a scenario"""
+"""names of two reference parts, after the name of a scenario"""
 ENVIRONMENT_PART = "ring: env.step"
-"""part of the Gymnasium environment in SUMO, to which vector environments are related"""
+"""reference part of vector environments: the Gymnasium environment in SUMO"""
 SLOTS_PART = "on-ramp: env.step with slots"
-"""part of the PettingZoo environment in SUMO, to which vector environments of motorways are related"""
+"""reference part of vector environments of motorways: the PettingZoo environment in SUMO"""
 
 
 class Part(NamedTuple):
-    """What a round measures."""
+    """A part of the benchmark, the speed of which is measured in each round."""
 
     name: str
     reference: str = ""
-    """name of the part to which its speed is related; empty: none"""
+    """name of the part with which the speed is compared; empty: none"""
     vehicles: int = 0
-    """on a road, if the cost of a vehicle-step is of interest"""
+    """number of vehicles on a road, if the time per vehicle and step is of interest, else 0"""
 
 
 def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: None) -> dict[str, Any]:
     """Return control steps per second, and their ratios, for each `Part`; on one core, medians over the rounds.
 
-    Episodes have the default residual driver of training, and are loaded, filtered, audited and recorded. Batches of
-    rings have single precision and fast noise. Environments have no policy: actions are random in SUMO, zeros in
-    batches.
+    Episodes have the default residual driver of training, and include loading, safety filter, audit and recording.
+    Batches of rings have single precision and fast noise. Environments have no policy: actions are random in SUMO, and
+    zero in batches.
     """
     cores = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else None
     if cores is not None:
@@ -107,53 +110,56 @@ def benchmark_episodes(rounds: int, on_message: MessageCallback = lambda line: N
         driver = make_benchmark_driver(SCENARIOS["ring"].control_step)
         batches = {vehicles: start_batch(BATCH_VEHICLES // vehicles, vehicles, driver) for vehicles in RING_SIZES}
         motorways = [motorway_rates(MOTORWAYS, is_exact) for is_exact in (False, True)]
-        vectors = list(itertools.starmap(VectorBenchmark, VECTOR_ENVIRONMENTS))
+        vector_benchmarks = list(itertools.starmap(VectorBenchmark, VECTOR_ENVIRONMENTS))
         with Simulation() as simulation:  # writes network files and fills caches
             episode, *_ = [_run_episode(SCENARIOS[name], 0, simulation) for name in BENCHMARK_SCENARIOS]
         rates: defaultdict[Part, list[float]] = defaultdict(list)
-        for number in range(1, rounds + 1):
-            on_message(f"round {number} of {rounds}")
-            vector_rates = itertools.chain.from_iterable(vector.measure() for vector in vectors)
-            sumo_rates = _measure_round(number, driver, episode, batches)
+        for round_number in range(1, rounds + 1):
+            on_message(f"round {round_number} of {rounds}")
+            vector_rates = itertools.chain.from_iterable(benchmark.measure() for benchmark in vector_benchmarks)
+            sumo_rates = _measure_round(round_number, driver, episode, batches)
             for part, rate in itertools.chain(sumo_rates, vector_rates, map(next, motorways)):
                 rates[part].append(rate)
     finally:
         if cores is not None:
             os.sched_setaffinity(0, cores)
-    by_name = {part.name: values for part, values in rates.items()}
+    rates_by_name = {part.name: part_rates for part, part_rates in rates.items()}
     parts = []
-    for part, values in rates.items():
-        ratios = [a / b for a, b in zip(values, by_name.get(part.reference, ()), strict=False)]
+    for part, part_rates in rates.items():
+        pairs = zip(part_rates, rates_by_name.get(part.reference, ()), strict=False)
+        ratios = [rate / reference_rate for rate, reference_rate in pairs]
         ratio = median(ratios) if ratios else None
-        parts.append({**part._asdict(), "steps_per_s": median(values), "ratio": ratio})
+        parts.append({**part._asdict(), "steps_per_s": median(part_rates), "ratio": ratio})
     return {"manifest": manifest(), "rounds": rounds, "parts": parts}
 
 
 def _measure_round(
-    number: int, driver: ResidualDriver, episode: Episode, batches: Mapping[int, Iterator[object]]
+    seed: int, driver: ResidualDriver, episode: Episode, batches: Mapping[int, Iterator[object]]
 ) -> Iterator[tuple[Part, float]]:
+    """Yield each part with its control steps per second, except vector environments."""
     ring = SCENARIOS["ring"]
-    sumo, own = f"ring: {SUMO_PART}", f"ring: {EPISODE_PART}"
+    ring_sumo, ring_episode = f"ring: {SUMO_PART}", f"ring: {EPISODE_PART}"
     unfiltered = replace(ring, safety=replace(ring.safety, active=False))
     with Simulation() as simulation:
         for name in BENCHMARK_SCENARIOS:
             scenario, sumo_part = SCENARIOS[name], f"{name}: {SUMO_PART}"
-            make_traffic(scenario, (number,), simulation)
+            make_traffic(scenario, (seed,), simulation)
             step_sumo = partial(_step_sumo, simulation, scenario.horizon * scenario.steps_per_control_step)
             yield Part(sumo_part), steps_per_second(step_sumo, scenario.horizon)
-            yield Part(f"{name}: {EPISODE_PART}", sumo_part), _episode_rate(scenario, number, simulation)
-        yield Part(f"{own}, network in every step", sumo), _episode_rate(ring, number, simulation, 0.0)
-        yield Part(f"{own} without safety filter", own), _episode_rate(unfiltered, number, simulation)
-        yield Part(ENVIRONMENT_PART, sumo), _environment_rate(ring.horizon, number, simulation)
-        yield Part(SLOTS_PART), _slots_rate(number, simulation)
-        yield Part("ring: audit of an episode", own), steps_per_second(partial(_repeat_audit, episode), ring.horizon)
+            yield Part(f"{name}: {EPISODE_PART}", sumo_part), _episode_rate(scenario, seed, simulation)
+        yield Part(f"{ring_episode}, network in every step", ring_sumo), _episode_rate(ring, seed, simulation, 0.0)
+        yield Part(f"{ring_episode} without safety filter", ring_episode), _episode_rate(unfiltered, seed, simulation)
+        yield Part(ENVIRONMENT_PART, ring_sumo), _environment_rate(ring.horizon, seed, simulation)
+        yield Part(SLOTS_PART), _slots_rate(seed, simulation)
+        audit_rate = steps_per_second(partial(_repeat_audit, episode), ring.horizon)
+        yield Part("ring: audit of an episode", ring_episode), audit_rate
         for rows, steps in ROLLOUT_SIZES:
             name = f"learned model: {rows:,} rollouts of {steps} control steps"
-            yield Part(name, own), _rollout_rate(episode, ring, driver, rows, steps)
+            yield Part(name, ring_episode), _rollout_rate(episode, ring, driver, rows, steps)
         for vehicles, batch in batches.items():
             rings = BATCH_VEHICLES // vehicles
             name = f"batch of {rings:,} rings of {vehicles:,} vehicles"
-            yield Part(name, sumo, vehicles), ring_steps_per_second(batch, rings)
+            yield Part(name, ring_sumo, vehicles), ring_steps_per_second(batch, rings)
     for vehicles, horizon in RING_SIZES.items():  # of the same density
         with Simulation() as simulation:
             rate = _loop_rate(make_benchmark_ring(vehicles, horizon), driver, simulation)
@@ -162,14 +168,14 @@ def _measure_round(
     with Simulation("traci") as simulation:
         rate = _loop_rate(make_benchmark_ring(smallest, TRACI_STEPS), driver, simulation)
         yield Part("driving loop over TraCI", f"driving loop, ring of {smallest} vehicles"), rate
-        rate = _environment_rate(TRACI_STEPS, number, simulation)
+        rate = _environment_rate(TRACI_STEPS, seed, simulation)
         yield Part("ring: env.step over TraCI", ENVIRONMENT_PART), rate
     name = f"Gymnasium's async vector environment of {ASYNC_ENVIRONMENTS} rings in SUMO"
-    yield Part(name, ENVIRONMENT_PART), _async_rate(number)
+    yield Part(name, ENVIRONMENT_PART), _async_rate(seed)
 
 
 class VectorBenchmark:
-    """A vector environment of rings, and the same batch alone with constant commands."""
+    """A vector environment of rings, and the same batch without the environment, with constant commands."""
 
     def __init__(self, rings: int, is_exact: bool) -> None:
         self.rings, self.is_exact = rings, is_exact
@@ -180,24 +186,20 @@ class VectorBenchmark:
         self._batch.start(True)
 
     def measure(self) -> Iterator[tuple[Part, float]]:
-        """Yield the speeds in rings times steps per second."""
+        """Yield each part with its control steps per second, of all rings together."""
         actions, command = np.zeros((self.rings, 1), np.float32), Command(np.zeros(self.rings, np.float32))
-        bare = f"{self.name}: batch alone"
-        yield Part(bare), self._rate(lambda: self._batch.advance(command))
-        yield Part(self.name, bare), (rate := self._rate(lambda: self._environment.step(actions)))
+        batch_part = f"{self.name}: batch alone"
+        yield Part(batch_part), _repetition_rate(lambda: self._batch.advance(command), STEPS_PER_ROUND, self.rings)
+        rate = _repetition_rate(lambda: self._environment.step(actions), STEPS_PER_ROUND, self.rings)
+        yield Part(self.name, batch_part), rate
         yield Part(f"{self.name}, compared with SUMO", ENVIRONMENT_PART), rate
-
-    def _rate(self, step: Callable[[], object]) -> float:
-        return _repetition_rate(step, STEPS_PER_ROUND, self.rings)
 
 
 def motorway_rates(roads: int, is_exact: bool) -> Iterator[tuple[Part, float]]:
-    """Yield the speed of a vector environment of busy on-ramps, in roads times steps per second, again and again."""
+    """Yield endlessly the control steps per second, of all roads together, of a vector environment of busy on-ramps."""
     environment = SlottedRoadVectorEnv(roads, exact=is_exact, **BUSY_ON_RAMP)
     environment.reset(seed=0)
-    actions = np.zeros((roads, BUSY_ON_RAMP["slots"]), np.float32)
-
-    step = partial(environment.step, actions)
+    step = partial(environment.step, np.zeros((roads, BUSY_ON_RAMP["slots"]), np.float32))
     _repetition_rate(step, FILLING_STEPS)
     while True:
         rate = _repetition_rate(step, MOTORWAY_STEPS, roads)
@@ -205,7 +207,7 @@ def motorway_rates(roads: int, is_exact: bool) -> Iterator[tuple[Part, float]]:
 
 
 def _slots_rate(seed: int, simulation: Simulation) -> float:
-    """Return control steps per second of the same environment in SUMO, after as many control steps."""
+    """Return control steps per second of one busy on-ramp in SUMO, after `FILLING_STEPS`."""
     environment = parallel_env(**BUSY_ON_RAMP, backend=SumoBackend(simulation))
     environment.reset(seed=seed)
     actions, world = dict.fromkeys(environment.agents, 0.0), environment._road.world
@@ -238,7 +240,7 @@ def _environment_rate(steps: int, seed: int, simulation: Simulation) -> float:
 
 
 def _async_rate(seed: int) -> float:
-    """Return control steps per second, of all environments together, of processes of Gymnasium on the same core."""
+    """Return control steps per second of all environments of Gymnasium's processes together, on the same core."""
     environment = gymnasium.make_vec("unjam/Ring-v0", ASYNC_ENVIRONMENTS, vectorization_mode="async")
     try:
         environment.reset(seed=seed)
@@ -276,14 +278,15 @@ def _step_sumo(simulation: Simulation, steps: int) -> None:
 
 
 def make_benchmark_driver(time_step: float, action_duration: float = 1.0) -> ResidualDriver:
-    """Return PI with a residual network of the paper's size that is evaluated every `action_duration` seconds."""
+    """Return PI with a residual network of the paper's size that acts every `action_duration` seconds."""
     generator = np.random.default_rng(0)
     layers = tuple(
         (generator.normal(size=(inputs, outputs)) / 100, np.zeros(outputs))
         for inputs, outputs in itertools.pairwise([5, 64, 64, 1])
     )
-    repeat = PolicySettings(action_duration=action_duration).action_repeat(time_step)
-    return ResidualDriver(PISaturation(time_step=time_step), Network(layers, 1.0, 0.1), 1.0, action_repeat=repeat)
+    expert, network = PISaturation(time_step=time_step), Network(layers, 1.0, 0.1)
+    action_repeat = PolicySettings(action_duration=action_duration).action_repeat(time_step)
+    return ResidualDriver(expert, network, 1.0, action_repeat=action_repeat)
 
 
 def make_benchmark_ring(vehicles: int, horizon: int) -> Ring:
@@ -295,11 +298,14 @@ def make_benchmark_ring(vehicles: int, horizon: int) -> Ring:
 def start_batch(
     rings: int, vehicles: int, driver: Driver, device: Device = "cpu", human_drivers: HumanSpeedModel | None = None
 ) -> Iterator[object]:
-    """Return an iterator over control steps of new rings, in single precision with fast noise, by default the IDM."""
+    """Return an iterator over control steps of new rings, in single precision with fast noise.
+
+    Human drivers follow `human_drivers`, by default the IDM.
+    """
     generator, to_array = torch_generator((0,), device), partial(to_device, device=device)
     world = RingBatch(
         [make_benchmark_ring(vehicles, MAX_HORIZON)] * rings,
-        [(number,) for number in range(rings)],
+        [(seed,) for seed in range(rings)],
         to_array,
         keep_record=False,
         draw=lambda shape: torch.randn(shape, generator=generator, device=device),
@@ -310,30 +316,31 @@ def start_batch(
 
 @torch.no_grad()
 def ring_steps_per_second(batch: Iterator[object], rings: int) -> float:
-    """Return steps of whole rings per second."""
+    """Return control steps per second of all rings together."""
     steps = itertools.islice(batch, STEPS_PER_ROUND)
     return steps_per_second(lambda: deque(steps, maxlen=0), rings * STEPS_PER_ROUND)
 
 
 def _repetition_rate(step: Callable[[], object], count: int, roads: int = 1) -> float:
-    """Return the steps per second of all roads together while `step` is called so many times."""
+    """Return control steps per second of all roads together, while `step` is called `count` times."""
     return steps_per_second(lambda: deque((step() for _ in range(count)), 0), roads * count)
 
 
 def steps_per_second(run: Callable[[], object], steps: int) -> float:
-    """Return the steps per second of `run`, which makes so many steps; pending work of a GPU is included."""
+    """Return the steps per second of `run`, which makes a number of `steps`; pending work of a GPU is included."""
     synchronize = torch.cuda.synchronize if torch.cuda.is_initialized() else lambda: None
     synchronize()
-    started = time.perf_counter()
+    start_time = time.perf_counter()
     run()
     synchronize()
-    return steps / (time.perf_counter() - started)
+    return steps / (time.perf_counter() - start_time)
 
 
 def benchmark_batches(device: Device, on_message: MessageCallback = lambda line: None) -> dict[str, Any]:
-    """Return the speed of batches of growing size with a residual driver, by model of the human drivers.
+    """Return the speed of batches of increasing size with a residual driver, by model of the human drivers.
 
-    Networks of human drivers add nothing. A CPU uses one core. Raise `MissingPartError` if there is no such device.
+    The networks of human drivers have an output of zero. A CPU uses one core. Raise `MissingPartError` if there is no
+    such device.
     """
     check_device(device)
     torch.set_num_threads(1)

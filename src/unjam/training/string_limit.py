@@ -14,46 +14,49 @@ from unjam.measures.metrics import measure
 from unjam.scenarios.road import ClosedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import tuning_seeds
-from unjam.training.export import driver_with_filter, without_filter
+from unjam.training.export import driver_with_filter, remove_filter
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 MAX_STRING_GAIN = 1.0 + GAIN_TOLERANCE
-"""largest gain of a controller that counts as string stable"""
+"""maximum gain of a controller that is called string stable"""
 HUMAN_EPISODES = 2
 """episodes of human traffic that determine the operating speeds of a road"""
 
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Where the string gain of CAVs on a closed road is measured."""
+    """A closed road and the speeds at which the string gain of CAVs is measured."""
 
     road: Scenario
     loop_length: float
-    """length of the closed road [m]; NaN: unknown"""
+    """length of the closed road [m]; NaN if unknown"""
     speeds: tuple[float, ...]
     """speeds of the leader [m/s]"""
 
     def string_gain(self, driver: Driver) -> float:
-        """Return the largest gain at any speed and frequency, with filter and actuator of the road.
+        """Return the largest gain over speeds and frequencies, with the filter and the actuator of the road.
 
-        It is infinite for a driver that falls behind its leader.
+        The gain of a driver that falls behind its leader is infinite.
         """
-        in_car = driver_with_filter(without_filter(driver), self.road)  # a file may have a filter for another car
-        gains = string_gains(in_car, self.speeds, self.road.humans, self.loop_length)
+        filtered = driver_with_filter(remove_filter(driver), self.road)  # a file may have the filter of another car
+        gains = string_gains(filtered, self.speeds, self.road.humans, self.loop_length)
         return float(np.nan_to_num(gains, nan=np.inf).max(initial=0.0))
 
 
 def find_operating_points(roads: Mapping[str, Scenario], workers: WorkerPool) -> dict[str, OperatingPoint]:
-    """Return the operating points of the closed roads: around the mean speed of human traffic on tuning seeds."""
-    closed = {name: road for name, road in roads.items() if road.is_closed}
-    tasks = [EpisodeTask(road, Human(), seed) for road in closed.values() for seed in tuning_seeds(HUMAN_EPISODES)]
-    rows = workers.run_and_map(tasks, lambda index, episode: measure(episode))
+    """Return the operating points of closed roads by name, around the mean speed of human-only traffic."""
+    closed_roads = {name: road for name, road in roads.items() if road.is_closed}
+    seeds = tuning_seeds(HUMAN_EPISODES)
+    rows = workers.run_and_map(
+        [EpisodeTask(road, Human(), seed) for road in closed_roads.values() for seed in seeds],
+        lambda index, episode: measure(episode),
+    )
     raise_failure(rows)
     points: dict[str, OperatingPoint] = {}
-    for number, (name, road) in enumerate(closed.items()):
-        own = rows[number * HUMAN_EPISODES : (number + 1) * HUMAN_EPISODES]
-        mean_speed = float(np.mean([row["mean_speed"] for row in own]))
-        drawn, _ = road.draw_from_seed(tuning_seeds(1)[0])
-        loop_length = drawn.loop_length if isinstance(drawn, ClosedRoad) else nan
+    for index, (name, road) in enumerate(closed_roads.items()):
+        road_rows = rows[index * HUMAN_EPISODES : (index + 1) * HUMAN_EPISODES]
+        mean_speed = float(np.mean([row["mean_speed"] for row in road_rows]))
+        drawn_road, _ = road.draw_from_seed(tuning_seeds(1)[0])
+        loop_length = drawn_road.loop_length if isinstance(drawn_road, ClosedRoad) else nan
         points[name] = OperatingPoint(road, loop_length, tuple(operating_speeds(mean_speed, road.humans)))
     return points

@@ -18,7 +18,7 @@ from unjam.drivers.user_driver import is_file_reference
 from unjam.errors import InputError, invalid_value, raise_failure
 from unjam.files import UNREADABLE_ERRORS, append_line, atomic_write, make_folder, to_json
 from unjam.kernels import needs_new_process
-from unjam.learners.agent import AgentSpec, check_network, check_state, learner_class, reporting_user_errors
+from unjam.learners.agent import AgentSpec, check_network, check_state, convert_user_errors, learner_class
 from unjam.learners.algorithm import (
     Collector,
     IterationLog,
@@ -164,7 +164,7 @@ def train_in_process(
         run_folder.make_new_folder(folder, f", or --resume {folder}")
     with run_folder.removing_if_empty(folder), expecting_code(), lock_folder(folder):
         (run_folder.resume_run_folder if resume else run_folder.create_run_folder)(folder, config)
-        refusals = nullcontext() if resume else run_folder.discarding_refused(folder)
+        refusals = nullcontext() if resume else run_folder.empty_if_refused(folder)
         with refusals, ExitStack() as locks, WorkerPool(config.workers) as workers:
             for task_folder in [folder / name for name in config.task_configs() if name]:
                 make_folder(task_folder)
@@ -204,7 +204,7 @@ class Trainer:
         self.spec = AgentSpec(self.tasks, config.policy, config.model, config.learner.gamma, config.seed, string_gain)
         self.collector = Collector(self.collect)
         seed_iteration(config.seed, 0)
-        with reporting_user_errors(config.agent):
+        with convert_user_errors(config.agent):
             self.algorithm = make_algorithm(config.agent, config.learner, self.spec)
         self._on_iteration = on_iteration or (lambda row: None)
         self._best_validation, self._expert_returns = -np.inf, [float("nan")] * len(self.tasks)
@@ -229,7 +229,7 @@ class Trainer:
         is_stopped = self.config.evaluation.should_stop_early(read_progress(self.folder))
         self._controllers.restore(tensors, is_stopped or state.environment_steps >= self.config.steps)
         self.collector.iteration, self.collector.environment_steps = state.iteration, state.environment_steps
-        with reporting_user_errors(self.config.agent):
+        with convert_user_errors(self.config.agent):
             self.algorithm.restore(state.algorithm, tensors_with_prefix(ALGORITHM_PREFIX, tensors))
         self._best_validation, self._expert_returns = state.best_validation, state.expert_returns
         self._sampler.restore(state.sampler)
@@ -260,12 +260,12 @@ class Trainer:
             self._best_validation = self._sampler.weighted_mean(self._expert_returns)
         if not self.config.evaluation.should_stop_early(read_progress(self.folder)):
             config = self.config
-            with reporting_user_errors(config.agent):
+            with convert_user_errors(config.agent):
                 run_iterations(self.algorithm, self.collector, config.steps, config.seed, self.finish_iteration)
 
     def network(self) -> Network:
         """Return the present policy."""
-        with reporting_user_errors(self.config.agent):
+        with convert_user_errors(self.config.agent):
             return check_network(self.config.agent, self.algorithm.network(), self.spec)
 
     def make_drivers(self, network: Network) -> list[Driver]:
