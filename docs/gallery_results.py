@@ -20,7 +20,7 @@ from unjam.measures.statistics import metric_estimate
 from unjam.reports.figures import png_bytes
 from unjam.reports.results import to_plot_episode
 from unjam.reports.space_time import space_time_figure
-from unjam.training.export import read_in_car
+from unjam.training.export import read_with_filter
 from unjam_paper.results_file import write_results
 
 ROADS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -37,7 +37,7 @@ PICTURES = Path(__file__).parent / "pictures"
 
 def certify(name: str) -> dict[str, Any]:
     """Return the string stability and the operating domain of a controller in a usual car."""
-    controller = read_in_car(f"unjam:{name}", {"actuator": asdict(STANDARD_ACTUATOR)})
+    controller = read_with_filter(f"unjam:{name}", {"actuator": asdict(STANDARD_ACTUATOR)})
     assert isinstance(controller.driver, FilteredDriver)
     certificate = make_certificate(controller)
     text = describe_string_stability(certificate, controller.driver)

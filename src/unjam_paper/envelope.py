@@ -20,7 +20,7 @@ from unjam.scenarios.figure_eight import FigureEight
 from unjam.scenarios.motorway import Motorway, Ramp
 from unjam.scenarios.ring import Ring
 from unjam.scenarios.scenario import Scenario
-from unjam.training.export import read_in_car
+from unjam.training.export import read_with_filter
 from unjam_paper.results_file import StudyPart, read_part
 from unjam_paper.study import NO_VALUE_TEXT, DriverComparison, Study, StudyFolder, evaluate_metrics, mean_text
 
@@ -132,7 +132,7 @@ def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart
 
 
 def _certify_worst_cases(controller: str, road: str, actuator: Actuator, workers: int) -> dict[str, Any]:
-    return make_certificate(read_in_car(controller, {"actuator": asdict(actuator)}, road))["worst_cases"]
+    return make_certificate(read_with_filter(controller, {"actuator": asdict(actuator)}, road))["worst_cases"]
 
 
 def worst_table(part: str, folder: Path) -> pd.DataFrame:

@@ -27,7 +27,7 @@ from unjam.errors import InputError, invalid_value
 from unjam.files import check_parent_folder
 from unjam.processes import continue_in_limited_child
 from unjam.scenarios import scenario_from_recipe
-from unjam.training.export import export_controller, has_usual_car, measure_test_episode, read_in_car
+from unjam.training.export import export_controller, has_usual_car, measure_test_episode, read_with_filter
 from unjam.training.run_folder import check_controller
 
 
@@ -117,7 +117,7 @@ def certify_command(
     if settings and not is_packaged:
         raise invalid_value("set", settings[0], "a packaged controller, or a file of unjam export --set")
     changes = parse_settings(settings)
-    controller = _read_with_filter(str(file), changes) if is_packaged else read_controller(file)
+    controller = _read_packaged_for_car(str(file), changes) if is_packaged else read_controller(file)
     check_controller(file, "certify")
     file = controller_file(file)
     target = out or (Path(file.name) if is_packaged else file).with_suffix(".html")
@@ -149,7 +149,7 @@ def certify_command(
     err_console.print(f"page: {target}")
 
 
-def _read_with_filter(name: str, settings: dict[str, Any]) -> Controller:
+def _read_packaged_for_car(name: str, settings: dict[str, Any]) -> Controller:
     """Return a packaged controller with the safety filter of its road, for the car of this road, and a sample of it."""
     controller = read_controller(Path(name))
     recipe = controller.manifest.get("scenario")
@@ -158,7 +158,7 @@ def _read_with_filter(name: str, settings: dict[str, Any]) -> Controller:
     is_usual = has_usual_car(scenario_from_recipe(recipe))
     if isinstance(controller.driver, FilteredDriver) and is_usual and not settings:
         return controller
-    return read_in_car(name, settings)
+    return read_with_filter(name, settings)
 
 
 def verify_command(

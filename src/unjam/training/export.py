@@ -197,7 +197,7 @@ def _is_exported(file: Path) -> bool:
     return False
 
 
-def read_in_car(source: str, settings: dict[str, Any], scenario: str = "") -> Controller:
+def read_with_filter(source: str, settings: dict[str, Any], scenario: str = "") -> Controller:
     """Return a controller as `export_controller` writes it, with the filter for a car and a sample; no file stays."""
     with PrivateFolder() as private:
         return read_controller(
