@@ -284,10 +284,10 @@ def calibrate(
         study.tell(asked, trial.score, state=TrialState.FAIL if trial.score is None else None)
         text = trial.failure if trial.score is None else f"{trial.score:.4g}"
         on_message(f"{number + 1} of {trials}: {_factor_text(trial.factors)}: {text}")
-    ranked = sorted((each for each in results if each.score is not None), key=_ranking_score)[:CALIBRATION_FINALISTS]
-    again = [*ranked, original_trial]
+    ranked = sorted((trial for trial in results if trial.score is not None), key=_score_or_infinity)
+    again = [*ranked[:CALIBRATION_FINALISTS], original_trial]
     finalists = [score_factors(each.factors, seeds_per_trial, 2 * seeds_per_trial) for each in again]
-    best = min(finalists, key=_ranking_score).factors
+    best = min(finalists, key=_score_or_infinity).factors
     on_message(f"evaluating on {CALIBRATION_TEST_SEEDS} test seeds: {_factor_text(best)}")
     before, after = (simulate(factors, held_out_seeds(CALIBRATION_TEST_SEEDS)) for factors in (original, best))
     types, file = scale_vehicle_types(corridor.files, best), folder / CALIBRATED_NETWORK_FILE
@@ -317,7 +317,8 @@ def calibration_document(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def _ranking_score(trial: CalibrationTrial) -> float:
+def _score_or_infinity(trial: CalibrationTrial) -> float:
+    """Return the score of a trial, of which smaller ones are better; infinity for a failed trial."""
     return inf if trial.score is None else trial.score
 
 
