@@ -27,9 +27,9 @@ from unjam.training.config import RunConfig, load_config
 from unjam.worlds.record import Floats
 from unjam_paper.results_file import read_part, write_figure, write_part
 from unjam_paper.study import (
+    FILTERED_ROADS,
     FINAL_SHARE,
     NO_VALUE_TEXT,
-    ORIGINAL_ROADS,
     PAPER_ROADS,
     PlannedRun,
     Study,
@@ -141,7 +141,7 @@ def comparison_rows(study_folder: StudyFolder, road: str, variants: Sequence[str
 
 
 def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows: dict[str, Table]) -> dict[str, Any]:
-    reported = PAPER_RESULTS.get((ORIGINAL_ROADS.get(road, road), VARIANTS[variant].paper_variant or variant))
+    reported = PAPER_RESULTS.get((FILTERED_ROADS.get(road, road), VARIANTS[variant].paper_variant or variant))
     metric = return_metric(road, variant)
     best = best_expert(reference_rows, metric)
     row: dict[str, Any] = {"road": road, "name": VARIANTS[variant].label, "variant": variant, "is_learned": True}

@@ -32,7 +32,7 @@ from unjam.worlds.episode import can_drive
 from unjam.worlds.worker_pool import WorkerPool
 from unjam_paper.results_file import collect_results
 from unjam_paper.studies import STUDIES, STUDY_GROUPS
-from unjam_paper.study import ORIGINAL_ROADS, STUDY_ROADS, PlannedRun, Study, StudyFolder, write_manifest
+from unjam_paper.study import FILTERED_ROADS, STUDY_ROADS, PlannedRun, Study, StudyFolder, write_manifest
 from unjam_paper.variants import REFERENCE_DRIVERS, TUNED_REFERENCES
 
 TRAINING_SECONDS: dict[str, dict[str, float]] = {
@@ -153,7 +153,7 @@ def drive_references(road: str, study_folder: StudyFolder, workers: int) -> None
 def _reference_drivers(road: str) -> tuple[RunConfig, Scenario, dict[str, Driver]]:
     config = load_config(changes=STUDY_ROADS[road])
     scenario = config.make_scenario()
-    names = {**REFERENCE_DRIVERS, **TUNED_REFERENCES.get(ORIGINAL_ROADS.get(road, road), {})}
+    names = {**REFERENCE_DRIVERS, **TUNED_REFERENCES.get(FILTERED_ROADS.get(road, road), {})}
     drivers = {label: make_driver(name, scenario.control_step) for label, name in names.items()}
     return config, scenario, {label: driver for label, driver in drivers.items() if can_drive(driver, scenario)}
 
