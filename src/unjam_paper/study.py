@@ -342,8 +342,8 @@ def number_text(value: float | None, digits: int, sign: str = "") -> str:
 
 
 def interval_text(entries: Mapping[str, Any], digits: int, sign: str = "") -> str:
-    """Return an estimate of a results file as text, with its 95 % CI, or without one with the range if it is stored."""
-    names = [field.name for field in fields(Estimate)]
-    value = Estimate(**{name: nan if entry is None else entry for name, entry in entries.items() if name in names})
-    ci = format_ci(value, f"{sign}.{digits}f")
-    return with_no_break_spaces(f"{number_text(value.mean, digits, sign)} {ci}".strip())
+    """Return a stored estimate as text, with its 95 % CI, or with its range if it has no CI."""
+    values: dict[str, Any] = {name: nan if value is None else value for name, value in entries.items()}
+    stored = Estimate(**{field.name: values[field.name] for field in fields(Estimate) if field.name in values})
+    ci = format_ci(stored, f"{sign}.{digits}f")
+    return with_no_break_spaces(f"{number_text(stored.mean, digits, sign)} {ci}".strip())
