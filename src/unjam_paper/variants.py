@@ -42,9 +42,8 @@ def reduced_step_variants(
 
     With the model, seven eighths of each iteration are model steps, in episodes of `horizon` control steps.
     """
-    few, double = (
-        {"backend": "batch", **common, "trpo.steps_per_iteration": factor * batch_steps} for factor in (1, 2)
-    )
+    few = {"backend": "batch", **common, "trpo.steps_per_iteration": batch_steps}
+    double = {**few, "trpo.steps_per_iteration": 2 * batch_steps}
     model = {"model.model_ratio": 7.0, "model.kind": "road", "model.rollout_starts": "first", "model.k_max": horizon}
     return {
         f"{prefix}-few": Variant("unjam residual, few steps", "best", few, steps),
