@@ -99,7 +99,7 @@ def _rate_label(driver: str, rate: float) -> str:
 
 
 def _evaluate_rate(rows: Mapping[str, Table], rate: float) -> HarmVerdict:
-    """Return the verdict at a penetration rate; a breakdown is one on at least half of the seeds of human drivers."""
+    """Return the verdict at a penetration rate; a breakdown counts if human traffic has it on half of the seeds."""
     controller, acc = (rows.get(_rate_label(driver, rate), []) for driver in (TESTED_CONTROLLER, ACC_DRIVER))
     breakdowns = [row["breakdown"] for row in rows.get(HUMAN_LABEL, [])]
     return evaluate_harm(controller, acc, 2 * sum(breakdowns) >= max(len(breakdowns), 1))
