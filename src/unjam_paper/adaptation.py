@@ -1,4 +1,4 @@
-"""Time until traffic settles after a change that drivers are not informed of, on rings in batches."""
+"""Time until traffic on a ring settles after a change of which the drivers are not informed."""
 
 from dataclasses import replace
 from functools import partial
@@ -31,14 +31,14 @@ from unjam_paper.study import NO_VALUE_TEXT, Study, mean_text
 ADAPTATION_EPISODES = 20
 STEPS_PER_SECOND = 10
 CHANGE_STEP, END_STEP = 3000, 7200
-"""control steps of the change and of the end"""
+"""control steps of the change and of the end of an episode"""
 CHANGE_SECOND = CHANGE_STEP // STEPS_PER_SECOND
 WAVE_BRAKING, WAVE_SPEED, WAVE_STEPS = 2.0, 0.5, 200
-"""a vehicle causes a wave by this braking [m/s2] down to this speed [m/s], for this number of control steps"""
+"""braking [m/s2], lowest speed [m/s] and number of control steps of a vehicle that causes a wave"""
 SMOOTHING_SECONDS, FINAL_SECONDS = 10, 60
-"""duration over which the mean speed is averaged for the settling time, and at the end of an episode [s]"""
+"""durations of averages of the mean speed [s]: for the settling time, and at the end of an episode"""
 SETTLED_SHARE = 0.95
-"""mean speed that counts as settled, as a share of the speed limit of the road"""
+"""smallest mean speed of settled traffic, as a share of the limit speed of the ring"""
 ADAPTATION_DRIVERS = {
     **{HUMAN_LABEL: "human", PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS},
     **{"FollowerStopper": "follower-stopper", "unjam:best": "unjam:best"},
@@ -46,7 +46,7 @@ ADAPTATION_DRIVERS = {
 
 
 class ChangingRings(RingBatch):
-    """Rings on which something changes in control step `CHANGE_STEP`."""
+    """Rings with a change in control step `CHANGE_STEP`."""
 
     humans_after: ClassVar[IDMParameters] = PAPER_IDM
     """parameters of the human drivers after the change"""
@@ -58,7 +58,7 @@ class ChangingRings(RingBatch):
 
 
 class WaveArrives(ChangingRings):
-    """The vehicle halfway around the ring from the first CAV brakes, and drives slowly for twenty seconds."""
+    """The vehicle half a ring ahead of the first CAV brakes, and drives slowly for twenty seconds."""
 
     def _human_speeds(self, speed: Array, leader: Leader) -> Array:
         speeds = super()._human_speeds(speed, leader)
@@ -70,7 +70,7 @@ class WaveArrives(ChangingRings):
 
 
 class HumansChange(ChangingRings):
-    """Human drivers follow closer, and accelerate and brake harder after the change."""
+    """Human drivers follow at smaller gaps, accelerate faster and brake harder after the change."""
 
     humans_after = replace(PAPER_IDM, **AGGRESSIVE_IDM)
 
@@ -81,7 +81,7 @@ class HumansChange(ChangingRings):
 
 
 class CAVSwitchesOff(ChangingRings):
-    """The last CAV drives as human drivers do after the change, within the limits for commands of CAVs."""
+    """After the change the last CAV drives as human drivers do, within the limits for commands of CAVs."""
 
     def advance(self, command: Command | None) -> None:
         """Simulate one control step."""
@@ -104,32 +104,32 @@ ROAD_CHANGES: dict[str, tuple[Ring, type[ChangingRings]]] = {
 
 
 def _measure_speeds(name: str, driver: str, workers: int) -> dict[str, list[Any]]:
-    """Return the mean speed of all vehicles in each second and the limit after the change, by episode [m/s]."""
-    ring, world = ROAD_CHANGES[name]
-    rings = [ring.stratum(number, ADAPTATION_EPISODES) for number in range(ADAPTATION_EPISODES)]
-    changing = world(rings, held_out_seeds(ADAPTATION_EPISODES))
-    episodes = finish_drive(start_batch_drive(changing, make_driver(driver, ring.control_step)))
+    """Return the mean speed of all vehicles in each second and the limit speed after the change, by episode [m/s]."""
+    ring, batch_class = ROAD_CHANGES[name]
+    rings = [ring.stratum(index, ADAPTATION_EPISODES) for index in range(ADAPTATION_EPISODES)]
+    batch = batch_class(rings, held_out_seeds(ADAPTATION_EPISODES))
+    episodes = finish_drive(start_batch_drive(batch, make_driver(driver, ring.control_step)))
     speeds = [episode.speeds[1:].mean(1).reshape(-1, STEPS_PER_SECOND).mean(1) for episode in episodes]
-    after = replace(ring, humans=world.humans_after)
-    limits = [after.limit_speed(episode.drawn_values[after.size_parameter]) for episode in episodes]
+    changed_ring = replace(ring, humans=batch_class.humans_after)
+    limits = [changed_ring.limit_speed(episode.drawn_values[ring.size_parameter]) for episode in episodes]
     return {"limits": limits, "speeds": [values.round(2).tolist() for values in speeds]}
 
 
 def read_speeds(folder: Path, name: str, label: str) -> dict[str, Floats]:
     """Return the speeds of a driver at a change: `speeds` (episodes, seconds) and `limits` (episodes,) [m/s]."""
-    number, position = list(ROAD_CHANGES).index(name), list(ADAPTATION_DRIVERS).index(label)
-    return {key: np.array(values) for key, values in read_part(folder, f"{number}-{position}").items()}
+    part = f"{list(ROAD_CHANGES).index(name)}-{list(ADAPTATION_DRIVERS).index(label)}"
+    return {key: np.array(values) for key, values in read_part(folder, part).items()}
 
 
 def settling_times(speeds: Floats, limits: Floats) -> Floats:
-    """Return the time until the mean of ten seconds stays above `SETTLED_SHARE` of the limit [s]; NaN if it does not.
+    """Return the times until the moving average of speeds stays above a share of `limits`, shape (episodes,) [s].
 
-    It must stay there for at least a minute; shape (episodes,).
+    NaN for episodes in which the average is below `SETTLED_SHARE` of the limit in the last minute.
     """
     times = []
     for values, limit in zip(speeds, limits, strict=True):
-        low = np.flatnonzero(_moving_average(values[CHANGE_SECOND:]) < SETTLED_SHARE * limit)
-        time = float(low[-1] + 1 if len(low) else 0)
+        unsettled = np.flatnonzero(_moving_average(values[CHANGE_SECOND:]) < SETTLED_SHARE * limit)
+        time = float(unsettled[-1] + 1 if len(unsettled) else 0)
         times.append(time if CHANGE_SECOND + time <= speeds.shape[1] - FINAL_SECONDS else np.nan)
     return np.array(times)
 
@@ -139,15 +139,15 @@ def _moving_average(values: Floats) -> Floats:
 
 
 def adaptation_table(name: str, folder: Path) -> pd.DataFrame:
-    """Return the mean speed before and after a change, and the settling time, by driver."""
+    """Return the mean speeds before and after a change and the settling time of each driver."""
     rows = []
     for label in ADAPTATION_DRIVERS:
         results = read_speeds(folder, name, label)
         speeds, times = results["speeds"], settling_times(**results)
         slowest = np.array([_moving_average(values[CHANGE_SECOND:]).min() for values in speeds])
         median = np.median(np.where(np.isfinite(times), times, np.inf))  # episodes that never settle come last
-        before = speeds[:, CHANGE_SECOND - FINAL_SECONDS : CHANGE_SECOND]
-        row = {"": label, "before [m/s]": mean_text(before.mean(1), 2)}
+        speeds_before = speeds[:, CHANGE_SECOND - FINAL_SECONDS : CHANGE_SECOND]
+        row = {"": label, "before [m/s]": mean_text(speeds_before.mean(1), 2)}
         row |= {"slowest ten seconds after [m/s]": mean_text(slowest, 2)}
         row |= {"last minute [m/s]": mean_text(speeds[:, -FINAL_SECONDS:].mean(1), 2)}
         row |= {"settled": f"{np.isfinite(times).sum()} of {len(times)}"}
@@ -157,7 +157,7 @@ def adaptation_table(name: str, folder: Path) -> pd.DataFrame:
 
 @rc_context(PLOT_STYLE)
 def adaptation_figure(folder: Path) -> Figure:
-    """Return the mean speed over time: the mean and the interquartile range over the episodes."""
+    """Draw the mean speed of all vehicles over time: mean and interquartile range over the episodes."""
     figure = new_figure(2.4 * len(ROAD_CHANGES))
     panels = figure.subplots(len(ROAD_CHANGES), 1, sharex=True)
     for axes, name in zip(panels, ROAD_CHANGES, strict=True):
@@ -177,9 +177,9 @@ def adaptation_figure(folder: Path) -> Figure:
 ADAPTATION = Study(
     title="time until traffic settles after a change of the road",
     make_parts=lambda study_folder, seeds: {
-        f"{number}-{position}": (_measure_speeds, (name, driver))
-        for number, name in enumerate(ROAD_CHANGES)
-        for position, driver in enumerate(ADAPTATION_DRIVERS.values())
+        f"{change_index}-{driver_index}": (_measure_speeds, (name, driver))
+        for change_index, name in enumerate(ROAD_CHANGES)
+        for driver_index, driver in enumerate(ADAPTATION_DRIVERS.values())
     },
     minutes=10.0,
     tables={name: partial(adaptation_table, name) for name in ROAD_CHANGES},

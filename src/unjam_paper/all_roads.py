@@ -1,6 +1,6 @@
-"""Gain of drivers on the training roads and the unseen roads of the family, and of joint trainings on many roads.
+"""Gain of drivers on the training roads and unseen roads of the family, and of trainings on many roads together.
 
-On each road a gain of 0 is the human baseline, and 1 is its best tuned expert, selected on other seeds.
+On each road the human baseline has a gain of 0, and the best tuned expert, selected on other seeds, a gain of 1.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -69,27 +69,27 @@ FAMILY_EXPERTS: dict[str, tuple[str, ...]] = {
 }
 """experts by group of roads; the best one on a road has a gain of 1 there"""
 UNSEEN_PARTS = ("combination", "axis")
-"""parts of the family that no driver was trained or tuned on"""
+"""parts of the family on which no driver was trained or tuned"""
 TABLE_PARTS = {"training": ("training",), "unseen": UNSEEN_PARTS}
-"""parts of the family by table of the page"""
+"""parts of the family by name of a table"""
 PI_ON_ALL_LABEL, JAM_AHEAD_ON_ALL_LABEL = "PI, tuned on all roads", "jam-ahead, tuned on all roads"
 PI_ON_RINGS_LABEL = "PI, tuned on the rings"
 SINGLE_CONTROLLERS: dict[str, str] = {
     **{"unjam:best": "unjam:best", PI_ON_ALL_LABEL: PI_TUNED_ON_ALL, "gap PI, tuned on all roads": GAP_PI_TUNED_ON_ALL},
     **{JAM_AHEAD_ON_ALL_LABEL: JAM_AHEAD_TUNED_ON_ALL, PI_ON_RINGS_LABEL: PI_TUNED_ON_RINGS},
 }
-"""controllers for all roads: one expert, or one file with several"""
+"""drivers for all roads, by label: experts, and a file with several experts"""
 CLOSED_ROAD_CONTROLLERS = ("unjam:ring-best-ideal", "unjam:ring-jammed-best-ideal", "unjam:figure-eight-best-ideal")
 MOTORWAY_CONTROLLERS = ("unjam:on-ramp-tuned",)
-"""packaged controllers, each with the control step of its type of road"""
+"""packaged controllers with the control step of closed roads, and with that of motorways"""
 FAMILY_DRIVERS: dict[str, str] = {
     **SINGLE_CONTROLLERS,
     **{"jam-ahead": "jam-ahead", "FollowerStopper": "follower-stopper"},
     **{name: name for name in (*CLOSED_ROAD_CONTROLLERS, *MOTORWAY_CONTROLLERS)},
 }
 """drivers that are evaluated on every road, by label"""
-TWO_LAWS_LABEL = "PI on rings and figure eights, jam-ahead on motorways (tuned on all roads)"
-"""label of the combination of two controllers by the type of road; its results are taken from theirs"""
+TWO_FORMULAS_LABEL = "PI on rings and figure eights, jam-ahead on motorways (tuned on all roads)"
+"""label of the combination of two controllers by type of road; its results are those of the two controllers"""
 RING_GROUP = "rings"
 RING_BASELINES = {
     RINGS_EXPERT: RINGS_EXPERT,
@@ -97,7 +97,7 @@ RING_BASELINES = {
 }
 SHARED_RING_BASELINES = {SHARED_RINGS_EXPERT: SHARED_RINGS_EXPERT, RINGS_EXPERT: RINGS_EXPERT}
 ALL_ROADS_BASELINES = {label: FAMILY_DRIVERS[label] for label in ("unjam:best", PI_ON_RINGS_LABEL, "jam-ahead")}
-"""drivers that are evaluated together with the trained ones; the first is the expert for these roads"""
+"""drivers that are compared with trainings, by label; the first one is the expert for these roads"""
 UNSEEN_SHARED_RINGS = {
     "ring-88-grown-6-cavs": ring_options(88, 6, LONG_WARM_UP),
     "ring-44-aggressive-3-cavs": ring_options(44, 3, LONG_WARM_UP, humans=AGGRESSIVE_IDM),
@@ -110,28 +110,28 @@ UNSEEN_SHARED_RINGS = {
 }
 SHARED_RING_ROADS = family_roads(SHARED_RINGS_GROUP)
 SHARED_RING_ROADS |= {name: FamilyRoad("ring", options, "axis") for name, options in UNSEEN_SHARED_RINGS.items()}
-"""rings that several CAVs share: those of the family, and further unseen ones"""
+"""rings with several CAVs: those of the family, and other unseen rings"""
 FRESH_TEST_SEEDS = held_out_seeds(20, 1000)
-"""test seeds that were not used in the decision which rings get an expert of their own"""
+"""test seeds that were not used to decide which rings have an expert of their own"""
 
 
 def _family_drivers(road: FamilyRoad) -> dict[str, str]:
-    """Return the drivers by label; a controller that cannot drive on a road neither gains nor loses there."""
-    others = CLOSED_ROAD_CONTROLLERS if _is_motorway(road) else MOTORWAY_CONTROLLERS
-    return FAMILY_DRIVERS | dict.fromkeys(others, HUMAN_LABEL)
+    """Return the drivers of a road by label, with `human` for controllers that cannot drive on it: their gain is 0."""
+    unsuitable = CLOSED_ROAD_CONTROLLERS if _is_motorway(road) else MOTORWAY_CONTROLLERS
+    return FAMILY_DRIVERS | dict.fromkeys(unsuitable, HUMAN_LABEL)
 
 
 def road_parts(
     roads: Mapping[str, FamilyRoad],
-    drivers_on: Callable[[FamilyRoad], Mapping[str, str]],
+    make_drivers: Callable[[FamilyRoad], Mapping[str, str]],
     test_seeds: Seeds,
     in_batches: bool,
 ) -> dict[str, StudyPart]:
     """Return a part for each road, with the drivers that are evaluated on it."""
     parts: dict[str, StudyPart] = {}
-    for number, (name, road) in enumerate(roads.items()):
+    for index, (name, road) in enumerate(roads.items()):
         experts = FAMILY_EXPERTS[GROUP_BY_SCENARIO[road.scenario]]
-        parts[f"{number:02d}"] = measure_road, (name, road, experts, drivers_on(road), test_seeds, in_batches)
+        parts[f"{index:02d}"] = measure_road, (name, road, experts, make_drivers(road), test_seeds, in_batches)
     return parts
 
 
@@ -148,7 +148,7 @@ def measure_road(
     in_batches: bool,
     workers: int,
 ) -> dict[str, Any]:
-    """Return the metrics of all drivers on a road on the test seeds; its best expert is selected on other seeds."""
+    """Return the metrics of all drivers of a road on the test seeds, and its best expert, selected on other seeds."""
     scenario = make_scenario(road.scenario, road.options)
     candidates = {driver: driver for driver in (HUMAN_LABEL, *experts)}
     with WorkerPool(workers) as pool:
@@ -159,51 +159,51 @@ def measure_road(
 
 
 def best_feasible_driver(rows: Mapping[str, EpisodeRows]) -> str:
-    """Return the best driver of those that are feasible in every episode; `human` if none is."""
-    baseline, others = rows[HUMAN_LABEL], [label for label in rows if label != HUMAN_LABEL]
-    feasible = [HUMAN_LABEL, *(label for label in others if overall_feasibility(rows[label], baseline) == FEASIBLE)]
+    """Return the best of the drivers that are feasible in all episodes; `human` if none is."""
+    baseline, candidates = rows[HUMAN_LABEL], [label for label in rows if label != HUMAN_LABEL]
+    feasible = [HUMAN_LABEL, *(label for label in candidates if overall_feasibility(rows[label], baseline) == FEASIBLE)]
     return max(feasible, key=lambda label: float(np.mean([gain.performance(row) for row in rows[label]])))
 
 
 def road_gains(folder: Path, parts: Sequence[str] = ("training", *UNSEEN_PARTS)) -> dict[str, dict[str, Any]]:
-    """Return for each road its part, its best expert, and for each label the gain, the speeds and the verdict.
+    """Return for each road its part of the family, its best expert, and gains, speeds and feasibility by driver.
 
-    `has_potential_gain`: the best expert is not negligibly better than the human baseline. Speeds are by seed [m/s].
+    `has_potential_gain`: the best expert is more than negligibly better than human traffic. Speeds are by seed [m/s].
     """
     roads: dict[str, dict[str, Any]] = {}
-    for number, results in read_parts(folder).items():
-        if not number.isdecimal() or results["part"] not in parts:
+    for name, results in read_parts(folder).items():
+        if not name.isdecimal() or results["part"] not in parts:
             continue
-        rows: dict[str, EpisodeRows] = {label: list(map(replace_null, own)) for label, own in results["rows"].items()}
+        stored: dict[str, EpisodeRows] = results["rows"]
+        rows = {label: list(map(replace_null, episodes)) for label, episodes in stored.items()}
         best = [gain.performance(row) for row in rows[results["best"]]]
         baseline = rows.pop(HUMAN_LABEL)
         roads[results["road"]] = {
             **{key: results[key] for key in ("part", "best")},
             "has_potential_gain": not gain.is_gain_negligible(baseline, best),
-            "gains": {label: gain.normalized_gain(own, baseline, best) for label, own in rows.items()},
-            "by_seed": {label: gain.gain_by_seed(own, baseline, best) for label, own in rows.items()},
-            "speeds": {label: np.array([row["mean_speed"] for row in own]) for label, own in rows.items()},
-            "verdicts": {label: overall_feasibility(own, baseline) for label, own in rows.items()},
+            "gains": {label: gain.normalized_gain(episodes, baseline, best) for label, episodes in rows.items()},
+            "by_seed": {label: gain.gain_by_seed(episodes, baseline, best) for label, episodes in rows.items()},
+            "speeds": {label: np.array([row["mean_speed"] for row in episodes]) for label, episodes in rows.items()},
+            "verdicts": {label: overall_feasibility(episodes, baseline) for label, episodes in rows.items()},
         }
     return roads
 
 
 def suite_references(path: Path) -> dict[str, Any]:
-    """Return by road the best expert, and the performance of it and of human drivers by test seed, for benchmarks."""
+    """Return by road the best expert, and its performance and that of human drivers by seed, for benchmarks."""
     parts = read_parts(path)
-    manifest, origin = parts["manifest"], ("unjam", "commit", "started")
-    references: dict[str, Any] = {}
-    for number, part in parts.items():
-        if number.isdecimal():
+    manifest, references = parts["manifest"], dict[str, Any]()
+    for name, part in parts.items():
+        if name.isdecimal():
             rows = {label: map(replace_null, part["rows"][label]) for label in (HUMAN_LABEL, part["best"])}
             human, best = (list(map(gain.performance, rows[label])) for label in (HUMAN_LABEL, part["best"]))
             references[part["road"]] = {"expert": part["best"], "baseline": human, "performance": best}
-    origin = {key: manifest[key] for key in origin} | {"sumo": manifest["packages"]["eclipse-sumo"]}
-    return {"study": "all-roads", **origin, "roads": references}
+    origin = {key: manifest[key] for key in ("unjam", "commit", "started")}
+    return {"study": "all-roads", **origin, "sumo": manifest["packages"]["eclipse-sumo"], "roads": references}
 
 
 def all_roads_table(parts: Sequence[str], folder: Path) -> pd.DataFrame:
-    """Return the gain of each single controller on each road of some parts of the family, the mean and the worst."""
+    """Return the gains of the `SINGLE_CONTROLLERS` on roads of some parts of the family, their means and minima."""
     roads = road_gains(folder, parts)
     labels = {driver: label for label, driver in FAMILY_DRIVERS.items()}
     rows = []
@@ -211,24 +211,24 @@ def all_roads_table(parts: Sequence[str], folder: Path) -> pd.DataFrame:
         best: str = road["best"]
         gains = {label: format_difference(road["gains"][label], 2) for label in SINGLE_CONTROLLERS}
         rows.append({"road": name, "best expert": labels.get(best, best).removeprefix(PACKAGED_PREFIX), **gains})
-    gainful = [road for road in roads.values() if road["has_potential_gain"]]
-    for name, averaged in (("mean", [*roads.values()]), ("mean, roads with a potential gain", gainful)):
-        means = {label: _mean_gain(road["by_seed"][label] for road in averaged) for label in SINGLE_CONTROLLERS}
-        rows.append({"road": name, **means})
+    roads_with_gain = [road for road in roads.values() if road["has_potential_gain"]]
+    for heading, group in (("mean", [*roads.values()]), ("mean, roads with a potential gain", roads_with_gain)):
+        means = {label: _mean_gain(road["by_seed"][label] for road in group) for label in SINGLE_CONTROLLERS}
+        rows.append({"road": heading, **means})
     rows.append({"road": "worst", **{label: _worst_gain(roads, label) for label in SINGLE_CONTROLLERS}})
     return pd.DataFrame(rows).fillna("")
 
 
 def all_drivers_table(folder: Path) -> pd.DataFrame:
-    """Return the mean gain of each driver over the roads of each part, and how much larger that of the first is."""
+    """Return the mean and the smallest gain of each driver by part of the family, and the difference to the first."""
     first, *others = FAMILY_DRIVERS
-    rows = {label: {"": label} for label in (first, TWO_LAWS_LABEL, *others)}
+    rows = {label: {"": label} for label in (first, TWO_FORMULAS_LABEL, *others)}
     for heading, parts in TABLE_PARTS.items():
         roads = road_gains(folder, parts)
         for name, road in roads.items():
-            law = JAM_AHEAD_ON_ALL_LABEL if _is_motorway(FAMILY[name]) else PI_ON_ALL_LABEL
-            for values in (road["gains"], road["by_seed"]):
-                values[TWO_LAWS_LABEL] = values[law]
+            formula = JAM_AHEAD_ON_ALL_LABEL if _is_motorway(FAMILY[name]) else PI_ON_ALL_LABEL
+            for gains in (road["gains"], road["by_seed"]):
+                gains[TWO_FORMULAS_LABEL] = gains[formula]
         for label, row in rows.items():
             differences = (road["by_seed"][first] - road["by_seed"][label] for road in roads.values())
             row[heading] = _mean_gain(road["by_seed"][label] for road in roads.values())
@@ -242,17 +242,17 @@ def _worst_gain(roads: Mapping[str, dict[str, Any]], label: str) -> str:
 
 
 def _mean_gain(by_road: Iterable[Floats]) -> str:
-    """Return the mean over roads with its 95 % CI over roads: they differ more than seeds do."""
+    """Return the mean over roads with its 95 % CI over roads, which differ more than seeds."""
     return format_difference(estimate([float(np.mean(values)) for values in by_road]), 2)
 
 
 def all_roads_figure(folder: Path) -> Figure:
-    """Return a map of the gains, roads by drivers."""
+    """Draw a map of the gains, roads by drivers."""
     roads = road_gains(folder)
     values = np.array([[road["gains"][label].mean for label in FAMILY_DRIVERS] for road in roads.values()])
     figure = new_figure(0.3 * len(roads) + 1.0)
     axes = figure.subplots()
-    # The pale half of the color map: numbers stay legible on it.
+    # Limits twice as wide as the gains select the pale half of the color map, on which numbers are legible.
     image = axes.imshow(values, cmap="RdYlGn", vmin=-2 * gain.MAX_GAIN, vmax=2 * gain.MAX_GAIN, aspect="auto")
     for (row, column), value in np.ndenumerate(values):
         axes.text(column, row, f"{value:+.2f}", ha="center", va="center", color=TEXT_COLOR, fontsize=8)
@@ -268,7 +268,10 @@ ALL_ROADS_STUDY = Study(
     title="gain of one controller on every road of the family, training roads and unseen roads",
     make_parts=lambda study_folder, seeds: road_parts(FAMILY, _family_drivers, FAMILY_TEST_SEEDS, in_batches=False),
     minutes=60.0,
-    tables={**{name: partial(all_roads_table, own) for name, own in TABLE_PARTS.items()}, "drivers": all_drivers_table},
+    tables={
+        **{name: partial(all_roads_table, parts) for name, parts in TABLE_PARTS.items()},
+        "drivers": all_drivers_table,
+    },
 )
 
 
@@ -280,17 +283,23 @@ def joint_training_study(
     roads: Mapping[str, FamilyRoad] | None = None,
     test_seeds: Seeds = FAMILY_TEST_SEEDS,
 ) -> Study:
-    """Return the study of variants, each with its maximum number of trainings, on all roads of a group, or `roads`."""
+    """Return the study of variants that were trained on a group of roads, on all roads of this group, or on `roads`.
+
+    `variants` has the maximum number of trainings by variant.
+    """
 
     def make_runs(seeds: int) -> list[PlannedRun]:
         return [PlannedRun(group, name, seed) for name, limit in variants.items() for seed in range(min(seeds, limit))]
 
     def make_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
-        def drivers_on(road: FamilyRoad) -> dict[str, str]:
-            controllers = ((run, joint_controller(road, run, study_folder)) for run in make_runs(seeds))
-            return {**baselines, **{f"{VARIANTS[run.variant].label} {run.seed}": str(own) for run, own in controllers}}
+        def make_drivers(road: FamilyRoad) -> dict[str, str]:
+            trained = {
+                f"{VARIANTS[run.variant].label} {run.seed}": str(joint_controller(road, run, study_folder))
+                for run in make_runs(seeds)
+            }
+            return {**baselines, **trained}
 
-        return road_parts(roads or family_roads(group), drivers_on, test_seeds, in_batches=True)
+        return road_parts(roads or family_roads(group), make_drivers, test_seeds, in_batches=True)
 
     labels = [VARIANTS[name].label for name in variants]
     tables = {name: partial(joint_training_table, labels, parts, baselines) for name, parts in TABLE_PARTS.items()}
@@ -298,7 +307,7 @@ def joint_training_study(
 
 
 def joint_controller(road: FamilyRoad, run: PlannedRun, study_folder: StudyFolder) -> Path:
-    """Return the folder of a training's controller for a road: that of the first training road of the same type."""
+    """Return the folder of the controller of a training for the first of its roads that has the type of `road`."""
     group = GROUP_BY_SCENARIO[road.scenario]
     configs = run.config.task_configs().items()
     name = next(name for name, config in configs if GROUP_BY_SCENARIO[config.scenario] == group)
@@ -308,12 +317,14 @@ def joint_controller(road: FamilyRoad, run: PlannedRun, study_folder: StudyFolde
 def joint_training_table(
     labels: Sequence[str], parts: Sequence[str], baselines: Mapping[str, str], folder: Path
 ) -> pd.DataFrame:
-    """Return the gain of each driver on each road, and the difference of trainings to the expert for such roads."""
+    """Return gains of baselines and trainings on each road, and differences of trainings to the first baseline."""
     roads = road_gains(folder, parts)
     drivers = next(iter(roads.values()))["gains"]
     expert = next(iter(baselines))
-    every = *baselines, *labels
-    groups = {label: [each for each in drivers if label in (each, each.rpartition(" ")[0])] for label in every}
+    groups = {
+        label: [driver for driver in drivers if label in (driver, driver.rpartition(" ")[0])]
+        for label in (*baselines, *labels)
+    }
 
     def values_by_label(name: str) -> dict[str, Floats]:
         """Return a quantity of the drivers of each label, shape (roads, drivers, seeds)."""
@@ -322,7 +333,7 @@ def joint_training_table(
             for label, group in groups.items()
         }
 
-    def cell(values: Floats) -> str:
+    def cell_text(values: Floats) -> str:
         return format_difference(estimate_on_shared_seeds(values), 2)
 
     gains, speeds = values_by_label("by_seed"), values_by_label("speeds")
@@ -330,14 +341,14 @@ def joint_training_table(
     pairs = [(label, expert) for label in labels]
     if expert != RINGS_EXPERT and RINGS_EXPERT in baselines:
         pairs.append((expert, RINGS_EXPERT))
-    for one, other in pairs:
-        columns[f"{one}, difference to {other}"] = gains[one] - gains[other]
-        columns[f"{one}, mean speed, difference to {other} [m/s]"] = speeds[one] - speeds[other]
+    for label, baseline in pairs:
+        columns[f"{label}, difference to {baseline}"] = gains[label] - gains[baseline]
+        columns[f"{label}, mean speed, difference to {baseline} [m/s]"] = speeds[label] - speeds[baseline]
     rows: list[dict[str, str]] = []
-    for number, (name, road) in enumerate(roads.items()):
-        cells = {column: cell(values[number]) for column, values in columns.items()}
+    for index, (name, road) in enumerate(roads.items()):
+        cells = {column: cell_text(values[index]) for column, values in columns.items()}
         rows.append({"road": name, "best expert": road["best"].removeprefix("unjam:"), **cells})
-    rows.append({"road": "mean", **{column: cell(values.mean(0)) for column, values in columns.items()}})
+    rows.append({"road": "mean", **{column: cell_text(values.mean(0)) for column, values in columns.items()}})
     worst, infeasible = {"road": "worst"}, {"road": "infeasible"}
     for label, group in groups.items():
         worst[label] = f"{gains[label].mean((1, 2)).min():+.2f}"

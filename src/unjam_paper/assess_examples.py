@@ -1,4 +1,4 @@
-"""Assessments of `unjam assess` on five small roads, as user networks."""
+"""Assessments by `unjam assess` of five small roads, which are written as user networks."""
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -35,23 +35,23 @@ from unjam_paper.study import NO_VALUE_TEXT, Study
 
 EXAMPLES_PART = "roads"
 MAX_EPISODES, PRECISION = 51, 0.02
-"""episodes per road, which leave ten test seeds to the comparison; sufficient half-width of the CI of travel time"""
+"""episodes per road, ten of them with test seeds; largest half-width of the CI of travel time, relative to its mean"""
 BLOCK_LENGTH, SIGNALS, GRID_FLOW, TURNING_FLOW = 250.0, 3, 300.0, 60.0
-"""distance of signals [m], signals in each direction, flow on each straight route and on each that turns [veh/h]"""
+"""distance of signals [m], signals in each direction, flow on each straight and on each turning route [veh/h]"""
 MOTORWAY_FLOW, RAMP_FLOW = 3000.0, 500.0
 """flow on the motorway with SUMO's default vehicles, and on its ramp [veh/h]"""
 ON_RAMP_DEMAND = replace(ON_RAMP, peak=(100.0, 700.0), horizon=int(EPISODE_SECONDS))
 """the built-in scenario that is exported"""
 Example = tuple[Callable[[Path], Path], float]
-"""writes the files of a road into a folder and returns the configuration; and the penetration rate of its assessment"""
+"""function that writes the files of a road into a folder and returns the configuration, and the penetration rate"""
 
 
 def write_grid(folder: Path) -> Path:
     """Write a grid of signals; vehicles of SUMO's default type go straight, or turn left once."""
     inside, ends = range(1, SIGNALS + 1), (0, SIGNALS + 1)
     signals = [(x, y) for x in inside for y in inside]
-    every = [(x, y) for x in (0, *inside, SIGNALS + 1) for y in (0, *inside, SIGNALS + 1)]
-    arms = [(x, y) for x, y in every if (x in ends) != (y in ends)]
+    points = product((0, *inside, SIGNALS + 1), repeat=2)
+    arms = [(x, y) for x, y in points if (x in ends) != (y in ends)]
     kinds = {**dict.fromkeys(signals, "traffic_light"), **dict.fromkeys(arms, "priority")}
     nodes = [(f"n{x}{y}", BLOCK_LENGTH * x, BLOCK_LENGTH * y, kind) for (x, y), kind in kinds.items()]
     edges = [
@@ -61,15 +61,15 @@ def write_grid(folder: Path) -> Path:
     ]
     last, routes = SIGNALS + 1, dict[str, float]()
     for row in inside:
-        east, west = (_route([(x, row) for x in way]) for way in (range(last + 1), range(last, -1, -1)))
-        north, south = (_route([(row, y) for y in way]) for way in (range(last + 1), range(last, -1, -1)))
+        east, west = (_route_edges([(x, row) for x in line]) for line in (range(last + 1), range(last, -1, -1)))
+        north, south = (_route_edges([(row, y) for y in line]) for line in (range(last + 1), range(last, -1, -1)))
         routes |= dict.fromkeys((east, west, north, south), GRID_FLOW)
         left = [*((x, row) for x in range(row + 1)), *((row, y) for y in range(row + 1, last + 1))]
-        routes[_route(left)] = TURNING_FLOW
+        routes[_route_edges(left)] = TURNING_FLOW
     return write_network(folder, nodes, edges, [], _default_traffic(routes))
 
 
-def _route(nodes: Sequence[tuple[int, int]]) -> str:
+def _route_edges(nodes: Sequence[tuple[int, int]]) -> str:
     return " ".join(f"{x}{y}to{to_x}{to_y}" for (x, y), (to_x, to_y) in pairwise(nodes))
 
 
@@ -82,16 +82,16 @@ def write_ramp(folder: Path) -> Path:
     lanes = [("before", "merging", 0, 1), ("before", "merging", 1, 2), ("ramp", "merging", 0, 0)]
     lanes += [("merging", "after", 1, 0), ("merging", "after", 2, 1)]
     traffic = _default_traffic({"before merging after": MOTORWAY_FLOW, "ramp merging after": RAMP_FLOW})
-    return write_network(folder, nodes, edges, [Connection(*each) for each in lanes], traffic)
+    return write_network(folder, nodes, edges, [Connection(*lane) for lane in lanes], traffic)
 
 
 def _default_traffic(routes: Mapping[str, float]) -> list[str]:
     """Return a flow of default vehicles for each route [veh/h]."""
-    elements = [xml_element("route", id=f"r{number}", edges=edges) for number, edges in enumerate(routes)]
-    entry = {"begin": 0, "end": EPISODE_SECONDS, "departLane": "best", "departSpeed": "max"}
+    elements = [xml_element("route", id=f"r{index}", edges=edges) for index, edges in enumerate(routes)]
+    departure = {"begin": 0, "end": EPISODE_SECONDS, "departLane": "best", "departSpeed": "max"}
     return elements + [
-        xml_element("flow", id=f"f{number}", route=f"r{number}", vehsPerHour=flow, **entry)
-        for number, flow in enumerate(routes.values())
+        xml_element("flow", id=f"f{index}", route=f"r{index}", vehsPerHour=flow, **departure)
+        for index, flow in enumerate(routes.values())
     ]
 
 
@@ -121,8 +121,8 @@ EXAMPLES: dict[str, Example] = {
 
 def assess_example(name: str, rate: float, max_episodes: int, precision: float, workers: int) -> dict[str, Any]:
     """Return the assessment of an example at a penetration rate."""
-    with TemporaryDirectory() as place, WorkerPool(workers) as pool:
-        road, results = Path(place, "road"), Path(place, "assessment")
+    with TemporaryDirectory() as folder, WorkerPool(workers) as pool:
+        road, results = Path(folder, "road"), Path(folder, "assessment")
         road.mkdir()
         write_files, _ = EXAMPLES[name]
         request = make_request(str(write_files(road)), [rate], max_episodes, precision)
@@ -131,10 +131,10 @@ def assess_example(name: str, rate: float, max_episodes: int, precision: float, 
     return {
         "settings": {"rate": rate, "episodes": max_episodes, "seconds": None, "precision": precision},
         "headline": document["headline"],
-        "sentences": [each.summary for each in (*assessment.controller_results, *assessment.acc_results)],
+        "sentences": [result.summary for result in (*assessment.controller_results, *assessment.acc_results)],
         "notes": document["notes"],
         "drivers": driver_rows(assessment),
-        "rejection_reasons": {each["driver"]: each["rejection_reason"] for each in document["candidates"]},
+        "rejection_reasons": {row["driver"]: row["rejection_reason"] for row in document["candidates"]},
         "test_seeds": document["seeds"]["test"],
         "episodes": document["episodes"],
     }
@@ -143,20 +143,20 @@ def assess_example(name: str, rate: float, max_episodes: int, precision: float, 
 def driver_rows(assessment: Assessment) -> list[dict[str, Any]]:
     """Return a row for the human baseline, for ACC vehicles and for the controller, with paired differences.
 
-    `difference` and `flow_difference` are to the human baseline, `difference_to_acc` is to ACC vehicles [s, veh/h].
+    `difference` [s] and `flow_difference` [veh/h] refer to the human baseline, `difference_to_acc` [s] to ACC vehicles.
     """
     baseline = assessment.document["baseline"]
     time, flow = baseline["travel_time"]["mean"], baseline["outflow_veh_per_h"]["mean"]
     rows: list[dict[str, Any]] = [{"driver": "human", "travel_time": time, "flow": flow}]
-    for each in (*assessment.acc_results, *assessment.controller_results):
-        effect = each.effect
-        row = {"driver": getattr(each, "driver", "cruise"), "rate": each.penetration_rate}
+    for result in (*assessment.acc_results, *assessment.controller_results):
+        effect = result.effect
+        row = {"driver": getattr(result, "driver", "cruise"), "rate": result.penetration_rate}
         row |= {"travel_time": effect.baseline_travel_time + effect.travel_time.mean}
         row |= {"difference": asdict(effect.travel_time), "flow": effect.baseline_flow + effect.flow.mean}
         row |= {"flow_difference": asdict(effect.flow), "feasibility": effect.feasibility}
-        if isinstance(each, ControllerResult):
-            row["difference_to_acc"] = asdict(each.difference_to_acc)
-            row["verdict"] = "; ".join(each.reasons) or "recommended"
+        if isinstance(result, ControllerResult):
+            row["difference_to_acc"] = asdict(result.difference_to_acc)
+            row["verdict"] = "; ".join(result.reasons) or "recommended"
         rows.append(row)
     return rows
 
@@ -165,13 +165,13 @@ def examples_table(folder: Path) -> pd.DataFrame:
     """Return travel time and flow of the human baseline, of ACC vehicles and of the controller on each road."""
     rows = []
     for name, results in read_part(folder, EXAMPLES_PART).items():
-        for own in results["drivers"]:
-            row = {"road": name, "CAVs": f"{100 * own['rate']:g} %" if "rate" in own else "none"}
-            row |= {"driver": own["driver"], "travel time [s]": f"{own['travel_time']:.1f}"}
-            row |= {"difference to human baseline [s]": _difference_text(own, "difference", 1)}
-            row |= {"difference to ACC [s]": _difference_text(own, "difference_to_acc", 1)}
-            row |= {"flow, difference to human baseline [veh/h]": _difference_text(own, "flow_difference", 0)}
-            rows.append({**row, "feasible": own.get("feasibility", NO_VALUE_TEXT)})
+        for row in results["drivers"]:
+            cells = {"road": name, "CAVs": f"{100 * row['rate']:g} %" if "rate" in row else "none"}
+            cells |= {"driver": row["driver"], "travel time [s]": f"{row['travel_time']:.1f}"}
+            cells |= {"difference to human baseline [s]": _difference_text(row, "difference", 1)}
+            cells |= {"difference to ACC [s]": _difference_text(row, "difference_to_acc", 1)}
+            cells |= {"flow, difference to human baseline [veh/h]": _difference_text(row, "flow_difference", 0)}
+            rows.append({**cells, "feasible": row.get("feasibility", NO_VALUE_TEXT)})
     return pd.DataFrame(rows)
 
 

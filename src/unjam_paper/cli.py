@@ -15,7 +15,7 @@ def reproduce_command(
     studies: Annotated[
         list[str], typer.Argument(help="Names of studies: table-1, figure-4 ..., or all.", metavar="STUDY...")
     ],
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Trainings of each variant.")] = 3,
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Trainings of each variant, one per seed.")] = 3,
     workers: opt.TrainingWorkersOption = opt.DEFAULT_WORKERS,
     executor: opt.ExecutorOption = "local",
     out: Annotated[Path, typer.Option(help="Folder of all studies; existing trainings are reused.")] = Path(
@@ -41,7 +41,7 @@ def reproduce_command(
 
     plan = make_plan(studies, seeds, StudyFolder(out))
     minutes = plan.seconds(workers) / 60.0
-    names = [planned.name for planned in plan.runs]
+    names = [run.name for run in plan.runs]
     if dry_run and json:
         counts = {"planned_trainings": names, "finished_trainings": plan.finished_count, "reference_roads": plan.roads}
         print_json({**counts, "minutes": minutes})

@@ -1,14 +1,14 @@
 """Comparisons of learners: Tables 1 and 2, Figures 4, 5, 7 and 9 of the paper, its exact settings, and road models.
 
-A table has the convention of the paper with the numbers of the paper, and that of unjam: test seeds, paired differences
-and confidence intervals. Curves are the mean and the range over trainings of a variant.
+Tables have results in the convention of the paper, next to the numbers of the paper, and in that of unjam: on test
+seeds, with paired differences and confidence intervals. Curves are the mean and the range over trainings of a variant.
 """
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import cycle
-from math import ceil, inf, nan
+from math import ceil, inf, isfinite, nan
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +25,11 @@ from unjam.reports.results import PlotEpisode, read_results, validation_gains
 from unjam.reports.space_time import trajectory_figure
 from unjam.training.config import RunConfig, load_config
 from unjam.worlds.record import Floats
-from unjam_paper.results_file import read_part, write_figure, write_part
+from unjam_paper.results_file import read_part, read_part_or_empty, write_figure, write_part
 from unjam_paper.study import (
+    FILTERED_ROADS,
     FINAL_SHARE,
     NO_VALUE_TEXT,
-    ORIGINAL_ROADS,
     PAPER_ROADS,
     PlannedRun,
     Study,
@@ -59,14 +59,14 @@ PAPER_RESULTS: dict[tuple[str, str], tuple[float, float, float]] = {
     ("merge", "sac"): (449.72, 16.47, 2.38),
     ("merge", "proposed"): (492.93, 17.44, 2.22),
 }
-"""Tables 1 and 2 of the paper, by road and variant: reward, and the mean (`average speed`) and the standard deviation
-over time (`speed std`) of the CAV's own speed, including the start and exploration [m/s]"""
+"""Tables 1 and 2 of the paper, by road and variant: reward, mean (`average speed`) and standard deviation over time
+(`speed std`) of the CAV's speed [m/s], both including the start of the episode and exploration"""
 PAPER_COLUMNS = {
     "reward": ("return", "return_mean"),
     "speed": ("cav_mean_speed", "cav_mean_speed"),
     "std": ("speed_std_cav", "speed_std_cav"),
 }
-"""columns of the paper: each as a metric of episodes and as a number of the training batches"""
+"""columns of the paper: the metric of episodes and the entry of the progress of each"""
 COMPARISON_METRICS = (
     *("return", "return_eq16", "mean_speed", "mean_speed_steady", "speed_limit_ratio_steady", "speed_std_fleet"),
     *("time_to_dissolve", "outflow_veh_per_h", "insertion_backlog_veh", "min_time_gap", "collisions"),
@@ -74,26 +74,26 @@ COMPARISON_METRICS = (
 )
 """metrics of the deterministic policy on test seeds"""
 TRIMMED_SHARE = 0.25
-"""share left out at either end: Agarwal et al. 2021, `Deep RL at the edge of the statistical precipice`"""
+"""share of trainings left out at either end: Agarwal et al. 2021, `Deep RL at the edge of the statistical precipice`"""
 MAX_LEGEND_ROW_LENGTH, LEGEND_ENTRY_OVERHEAD = 155, 8
-"""characters in a row of a legend, and those that the line and margins of an entry take"""
+"""characters in a row of a legend; width of the line and margins of an entry, in characters"""
 CURVE_POINTS = 100
 CURVE_LABELS = {"return_mean": "return, in training", "cav_mean_speed": "CAV's mean speed, in training [m/s]"}
 RETURN_COLUMNS, SPEED_COLUMNS = ("return_mean", "return_validation"), ("cav_mean_speed", "speed_std_cav")
 FIGURE_5_VARIANTS = ("proposed", "ours")
 EFFICIENCY_STEPS = (190_000, 380_000, 750_000, 1_500_000, 3_000_000, 6_000_000)
 ON_RAMP_EFFICIENCY_STEPS = (28_800,)
-"""environment steps after which trainings are compared; on the on-ramp, those of a training with the model"""
+"""environment steps after which trainings are compared; on the on-ramp, the steps of a training with the model"""
 STEP_MULTIPLES = (1, 2, 3)
-"""multiples of the environment steps that variants without the model use"""
+"""multiples of environment steps with which variants without the model are compared"""
 MODEL_FREE_VARIANTS = {
     "best": ("best-few", "best-double", "best"),
     "jammed": ("jammed-few", "jammed-double", "jammed-ideal"),
     "eight": ("eight-few", "eight-double", "best-in-batches"),
     "ramp": ("ramp-few",) * len(STEP_MULTIPLES) + ("ramp-small",) * len(STEP_MULTIPLES),
 }
-"""variants without the model, for `STEP_MULTIPLES`, by prefix. On figure eights, which a batch steps only in
-distribution, the last is trained in batches, too"""
+"""variants without the model, for `STEP_MULTIPLES`, by prefix. On figure eights, where batches equal SUMO only in
+distribution, the last variant is trained in batches, too"""
 
 
 def comparison_study(title: str, variants: Sequence[str], road: str = "ring") -> Study:
@@ -119,7 +119,7 @@ def best_expert(reference_rows: dict[str, Table], metric: str = "return") -> str
 
 
 def return_metric(road: str, variant: str) -> str:
-    """Return the return metric for a training's reward: one that all drivers have, of the reward as intended."""
+    """Return the metric that has the return of a variant's reward for all drivers; for Eq. 16 the intended reward."""
     return "return_eq16" if PlannedRun(road, variant, 0).config.reward.startswith("eq16") else "return"
 
 
@@ -128,39 +128,39 @@ def comparison_rows(study_folder: StudyFolder, road: str, variants: Sequence[str
     references, metric = study_folder.reference_rows(road), return_metric(road, variants[0])
     best, verdicts = best_expert(references, metric), feasibility_by_driver(references)
     rows: Table = []
-    for label, found in references.items():
-        row = {"road": road, "name": label, "is_learned": False, "trainings": 0, "episodes": len(found)}
+    for label, episodes in references.items():
+        row = {"road": road, "name": label, "is_learned": False, "trainings": 0, "episodes": len(episodes)}
         row |= {"best_expert": label == best, "feasibility": verdicts[label]}
-        row |= estimate_metrics(found, COMPARISON_METRICS)
-        row["gain_over_best_expert"] = asdict(statistics.paired_difference(found, references[best], metric))
-        columns = {key: [each[name] for each in found] for key, (name, _) in PAPER_COLUMNS.items()}
-        values = {key: [each for each in column if np.isfinite(each)] for key, column in columns.items()}
-        rows.append({**row, "paper_convention": {key: _mean_and_std(each) for key, each in values.items()}})
+        row |= estimate_metrics(episodes, COMPARISON_METRICS)
+        row["gain_over_best_expert"] = asdict(statistics.paired_difference(episodes, references[best], metric))
+        columns = {key: [episode[name] for episode in episodes] for key, (name, _) in PAPER_COLUMNS.items()}
+        finite = {key: list(filter(isfinite, values)) for key, values in columns.items()}
+        rows.append({**row, "paper_convention": {key: _mean_and_std(values) for key, values in finite.items()}})
     trained = study_folder.trained_runs(road, variants, seeds)
     return [*rows, *(_variant_row(road, variant, runs, references) for variant, runs in trained.items())]
 
 
 def _variant_row(road: str, variant: str, runs: list[TrainedRun], reference_rows: dict[str, Table]) -> dict[str, Any]:
-    reported = PAPER_RESULTS.get((ORIGINAL_ROADS.get(road, road), VARIANTS[variant].paper_variant or variant))
+    paper_values = PAPER_RESULTS.get((FILTERED_ROADS.get(road, road), VARIANTS[variant].paper_variant or variant))
     metric = return_metric(road, variant)
     best = best_expert(reference_rows, metric)
     row: dict[str, Any] = {"road": road, "name": VARIANTS[variant].label, "variant": variant, "is_learned": True}
     row |= {"trainings": len(runs), "episodes": len(runs[0].rows), "steps": runs[0].run.config.steps}
-    row["paper"] = dict(zip(PAPER_COLUMNS, reported, strict=True)) if reported else None
+    row["paper"] = dict(zip(PAPER_COLUMNS, paper_values, strict=True)) if paper_values else None
     for name in COMPARISON_METRICS:
         is_comparable = name != "return" or metric == "return"  # returns of another reward are not comparable
         values = [statistics.estimate([row[name] for row in run.rows]).mean if is_comparable else nan for run in runs]
         row[name] = asdict(statistics.estimate_over_trainings(values, TRIMMED_SHARE, METRICS[name].bounds))
     differences = statistics.paired_differences([run.rows for run in runs], reference_rows[best], metric)
-    validated = [gains for run in runs if (gains := validation_gains(run.progress))]
-    final = {key: [run.final_training_mean(name) for run in runs] for key, (_, name) in PAPER_COLUMNS.items()}
+    all_gains = [gains for run in runs if (gains := validation_gains(run.progress))]
+    final_means = {key: [run.final_training_mean(name) for run in runs] for key, (_, name) in PAPER_COLUMNS.items()}
     return {
         **row,
-        "paper_convention": {key: _mean_and_std(each) for key, each in final.items()},
+        "paper_convention": {key: _mean_and_std(means) for key, means in final_means.items()},
         "gain_reference": {"expert": best, "metric": metric},
         "gain_over_best_expert": asdict(statistics.estimate_crossed(differences)),
         "probability_of_improvement": asdict(statistics.probability_of_improvement(differences)),
-        "untrained_count": sum(best <= 0 for best, _ in validated),
+        "untrained_count": sum(best_gain <= 0 for best_gain, _ in all_gains),
         "feasibility": [overall_feasibility(run.rows, reference_rows["human"]) for run in runs],
         "seconds": float(np.mean([run.seconds for run in runs])),
         "gains": differences.mean(1).tolist(),
@@ -177,14 +177,14 @@ def _mean_and_std(values: Sequence[float]) -> dict[str, float]:
 
 
 def training_curves(study_folder: StudyFolder, road: str, variants: Sequence[str], seeds: int) -> dict[str, Any]:
-    """Return the curves of a road by variant: the steps, and each quantity at these steps, one list per seed.
+    """Return the curves of a road by variant: environment steps, and quantities at these steps, one list per seed.
 
-    Returns of another reward than that of the first variant and what was not measured are left out.
+    Quantities that were not measured, and returns of another reward than that of the first variant, are left out.
     """
 
     def resample(progress: Table, name: str) -> list[float]:
-        known = [(row["environment_steps"], row[name]) for row in progress if row[name] is not None]
-        steps, values = np.array(known, float).T
+        points = [(row["environment_steps"], row[name]) for row in progress if row[name] is not None]
+        steps, values = np.array(points, float).T
         return [float(f"{value:.5g}") for value in np.interp(grid, steps, values)]
 
     curves: dict[str, Any] = {}
@@ -202,8 +202,11 @@ def training_curves(study_folder: StudyFolder, road: str, variants: Sequence[str
 
 
 def _checkpoint_table(road: str, folder: Path) -> pd.DataFrame:
-    """Return the best and the last checkpoint on validation seeds, and how often the untrained network was kept."""
-    curves, table = read_part(folder, "curves")[road], []
+    """Return the returns of the best and the last checkpoint in validation, and how often training did not help.
+
+    The table is empty for results without curves.
+    """
+    curves, table = read_part_or_empty(folder, "curves").get(road, {}), []
     for row in read_part(folder, "table"):
         if "return_validation" in curves.get(row.get("variant"), {}):
             values = np.array(curves[row["variant"]]["return_validation"])
@@ -218,19 +221,19 @@ def _checkpoint_table(road: str, folder: Path) -> pd.DataFrame:
 
 @rc_context(PLOT_STYLE)
 def curve_figure(road: str, curves: dict[str, Any], reference_rows: dict[str, Table], metric: str = "return") -> Figure:
-    """Draw return and speed in training against environment steps; reference drivers are lines at their means."""
+    """Draw return and speed in training over environment steps; horizontal lines are the means of reference drivers."""
     figure = new_figure(3.1)
-    for (name, label), axes in zip(CURVE_LABELS.items(), figure.subplots(1, len(CURVE_LABELS)), strict=True):
+    for (name, heading), axes in zip(CURVE_LABELS.items(), figure.subplots(1, len(CURVE_LABELS)), strict=True):
         for (variant, curve), color in zip(curves.items(), LINE_COLORS[1:], strict=False):
             if name in curve:
                 steps, values = np.array(curve["steps"]) / 1000.0, np.array(curve[name])
                 axes.fill_between(steps, values.min(0), values.max(0), color=color, alpha=0.15, lw=0)
                 axes.plot(steps, values.mean(0), color=color, lw=1.5, label=VARIANTS[variant].label)
-        for (reference, rows), style in zip(reference_rows.items(), ("--", ":"), strict=False):
+        for (label, rows), style in zip(reference_rows.items(), ("--", ":"), strict=False):
             value = statistics.metric_estimate(rows, metric if name == "return_mean" else name).mean
-            axes.axhline(value, color=TEXT_COLOR, lw=1.0, ls=style, label=reference)
+            axes.axhline(value, color=TEXT_COLOR, lw=1.0, ls=style, label=label)
         axes.margins(x=0.01)
-        axes.set(title=f"{road}: {label}", xlabel="environment steps [thousands]")
+        axes.set(title=f"{road}: {heading}", xlabel="environment steps [thousands]")
     lines, labels = figure.axes[-1].get_legend_handles_labels()
     rows = ceil(sum(len(label) + LEGEND_ENTRY_OVERHEAD for label in labels) / MAX_LEGEND_ROW_LENGTH)
     figure.legend(lines, labels, loc="outside upper left", ncols=ceil(len(labels) / rows))
@@ -243,7 +246,7 @@ def _write_figure_5(study_folder: StudyFolder, seeds: int, folder: Path) -> None
 
 
 def figure_5_episodes(study_folder: StudyFolder, road: str) -> list[PlotEpisode]:
-    """Return episodes of the same traffic: human baseline, best expert, and the first training of two variants."""
+    """Return episodes with the same traffic: of humans, the best expert, and the first training of two variants."""
     references = read_results(study_folder.reference_folder(road)).plot_episodes
     episodes = [references["human"], references[best_expert(study_folder.reference_rows(road))]]
     for variant in FIGURE_5_VARIANTS:
@@ -263,7 +266,7 @@ FIGURE_5 = Study(
 
 
 def paper_exact_study(road: str) -> Study:
-    """Return the study of the exact settings of the paper; where its convergence rule ends a training is computed."""
+    """Return the study of the exact settings of the paper, with the steps after which its convergence rule holds."""
     suffix = {"merge": "-million", "ring": "-filtered", "figure-eight": "-filtered"}.get(road, "")
     variants = (f"trpo-exact{suffix}", f"proposed-exact{suffix}")
     study = comparison_study(f"exact settings of the paper, on {road}", variants, road)
@@ -271,19 +274,23 @@ def paper_exact_study(road: str) -> Study:
     def write(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
         study.write(study_folder, seeds, folder)
         trained = study_folder.trained_runs(road, variants, seeds)
-        write_part(folder, "paper-exact", {name: list(map(_paper_exact_facts, runs)) for name, runs in trained.items()})
+        results = {name: list(map(_paper_exact_results, runs)) for name, runs in trained.items()}
+        write_part(folder, "paper-exact", results)
 
     return replace(study, write=write, tables={"paper-exact": _paper_exact_table})
 
 
-def _paper_exact_facts(run: TrainedRun) -> dict[str, Any]:
-    facts = {"converged": paper_convergence(run.progress), "eps_m": transition_model_errors(run.progress)}
-    facts["last"] = run.final_training_mean("return_mean")
-    return {**facts, "test_return": float(np.mean([row["return"] for row in run.rows]))}
+def _paper_exact_results(run: TrainedRun) -> dict[str, Any]:
+    return {
+        "converged": paper_convergence(run.progress),
+        "eps_m": transition_model_errors(run.progress),
+        "last": run.final_training_mean("return_mean"),
+        "test_return": float(np.mean([row["return"] for row in run.rows])),
+    }
 
 
 def paper_convergence(progress: Table) -> dict[str, float] | None:
-    """Return the steps after which the rule of the paper ends a training, and the return then; None: never."""
+    """Return steps and return when the rule of the paper ends a training; None if the rule never does."""
     rule = load_config(preset="paper-exact").evaluation
     window = rule.convergence_window
     for count in range(window, len(progress) + 1, window):
@@ -294,7 +301,7 @@ def paper_convergence(progress: Table) -> dict[str, float] | None:
 
 
 def transition_model_errors(progress: Table) -> list[float] | None:
-    """Return the model error on environment transitions in the first and the last tenth; None without a model."""
+    """Return the model error on environment transitions in the first and last tenth of a training; None: no model."""
     errors = [row["model"]["eps_m_by_estimator"]["transitions"] for row in progress if row["model"]]
     if not errors:
         return None
@@ -303,19 +310,20 @@ def transition_model_errors(progress: Table) -> list[float] | None:
 
 
 def _paper_exact_table(folder: Path) -> pd.DataFrame:
-    """Return when trainings converge by the rule of the paper, their returns then and at the end, and eps_m."""
+    """Return when trainings converge by the rule of the paper, their returns at this time and at the end, and eps_m."""
     table = []
     for variant, trainings in read_part(folder, "paper-exact").items():
-        ends = [each["converged"] for each in trainings if each["converged"]]
-        errors = [each["eps_m"] for each in trainings if each["eps_m"]]
+        ends = [training["converged"] for training in trainings if training["converged"]]
+        errors = [training["eps_m"] for training in trainings if training["eps_m"]]
         change = " → ".join(f"{mean:.3f}" for mean in np.mean(errors, 0)) if errors else NO_VALUE_TEXT
         rises = sum(last > first for first, last in errors)
         cells = {"": VARIANTS[variant].label, "trainings": str(len(trainings))}
         cells["converge, by the rule"] = f"{len(ends)} of {len(trainings)}"
-        cells["after [steps]"] = f"{np.median([each['steps'] for each in ends]):,.0f}" if ends else NO_VALUE_TEXT
-        cells["return then, in training"] = trainings_text([each["return"] for each in ends], 0)
-        cells["return in the last tenth"] = trainings_text([each["last"] for each in trainings], 0)
-        cells["last checkpoint, test seeds"] = trainings_text([each["test_return"] for each in trainings], 0)
+        cells["after [steps]"] = f"{np.median([end['steps'] for end in ends]):,.0f}" if ends else NO_VALUE_TEXT
+        cells["return then, in training"] = trainings_text([end["return"] for end in ends], 0)
+        cells["return in the last tenth"] = trainings_text([training["last"] for training in trainings], 0)
+        test_returns = [training["test_return"] for training in trainings]
+        cells["last checkpoint, test seeds"] = trainings_text(test_returns, 0)
         cells["eps_m, first and last tenth"] = change
         cells["eps_m rises in"] = f"{rises} of {len(errors)}" if errors else NO_VALUE_TEXT
         table.append(cells)
@@ -323,7 +331,7 @@ def _paper_exact_table(folder: Path) -> pd.DataFrame:
 
 
 def road_model_study(road: str, prefix: str) -> Study:
-    """Return the study of the environment steps that a model of the whole road saves, for variants with a prefix."""
+    """Return the study of environment steps that a model of the whole road saves, for the variants with a prefix."""
     variants = compared_variants(prefix)
     title = f"environment steps that a model of the whole road saves, on {road}"
     study = comparison_study(title, tuple(dict.fromkeys(variants)), road)
@@ -332,29 +340,29 @@ def road_model_study(road: str, prefix: str) -> Study:
 
 
 def compared_variants(prefix: str) -> tuple[str, ...]:
-    """Return the variant of a prefix with the model, and those without it by `STEP_MULTIPLES`."""
+    """Return the variant with the model, and the variants without it in the order of `STEP_MULTIPLES`."""
     return (f"{prefix}-road-model", *MODEL_FREE_VARIANTS[prefix])
 
 
 def efficiency_table(road: str, variants: Sequence[str], step_counts: Sequence[int], folder: Path) -> pd.DataFrame:
-    """Return the validation returns after environment steps, and the differences of the first variant to the others."""
-    curves, (modeled, *others) = read_part(folder, "curves")[road], variants
+    """Return validation returns after environment steps, and the differences of the first variant to the others."""
+    curves, (model_variant, *other_variants) = read_part(folder, "curves")[road], variants
     returns = {name: partial(_returns_after, PlannedRun(road, name, 0).config, curves[name]) for name in variants}
     rows = [
-        {"": VARIANTS[name].label, **{f"{at:,}": trainings_text(after(at), 0) for at in step_counts}}
+        {"": VARIANTS[name].label, **{f"{steps:,}": trainings_text(after(steps), 0) for steps in step_counts}}
         for name, after in returns.items()
     ]
-    for name, times in zip(others, cycle(STEP_MULTIPLES)):
-        more = "as many" if times == 1 else f"{times} times as many"
-        gains = {at: returns[modeled](at) - returns[name](times * at) for at in step_counts}
-        label = f"with the model, difference to “{VARIANTS[name].label}” after {more}"
-        rows.append({"": label, **{f"{at:,}": trainings_text(gain, 0, "+") for at, gain in gains.items()}})
+    for name, factor in zip(other_variants, cycle(STEP_MULTIPLES)):
+        multiple = "as many" if factor == 1 else f"{factor} times as many"
+        gains = {steps: returns[model_variant](steps) - returns[name](factor * steps) for steps in step_counts}
+        label = f"with the model, difference to “{VARIANTS[name].label}” after {multiple}"
+        rows.append({"": label, **{f"{steps:,}": trainings_text(gain, 0, "+") for steps, gain in gains.items()}})
     return pd.DataFrame(rows)
 
 
 def _returns_after(config: RunConfig, curve: dict[str, list[float]], steps: int) -> Floats:
-    """Return the validation return of each training after some steps; NaN outside of its validated range."""
+    """Return the validation return of each training after some steps; NaN outside of the validated steps."""
     trainings = curve["return_validation"]
     if steps < config.learner.steps_per_iteration * (config.evaluation.validation_interval or 1):
         return np.full(len(trainings), np.nan)
-    return np.array([np.interp(steps, curve["steps"], each, np.nan, np.nan) for each in trainings])
+    return np.array([np.interp(steps, curve["steps"], values, np.nan, np.nan) for values in trainings])

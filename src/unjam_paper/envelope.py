@@ -33,26 +33,26 @@ CONTROLLER_ROADS: dict[str, str] = {
     **{f"unjam:{name}-ideal": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
     **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best-ideal", "figure-eight-tuned-ideal")},
 }
-"""packaged controllers for closed roads that were tuned or trained for ideal cars, and the road of each"""
+"""roads of packaged controllers that were tuned or trained for ideal cars on closed roads"""
 USUAL_CAR_ROADS: dict[str, str] = {
     **{"unjam:ring-best": "ring", "unjam:ring-gap-tuned": "ring"},
     **{f"unjam:{name}": "ring-jammed" for name in ("ring-jammed-best", "ring-jammed-tuned")},
     **{f"unjam:{name}": "figure-eight" for name in ("figure-eight-best", "figure-eight-tuned")},
 }
-"""those that are evaluated in usual cars"""
+"""roads of packaged controllers that are evaluated in usual cars on closed roads"""
 LANE_CONTROLLERS = ("unjam:on-ramp-tuned",)
 USUAL_CAR_CONTROLLERS = tuple(name for name, road in USUAL_CAR_ROADS.items() if road != "figure-eight")
 USUAL_CAR_PACERS = tuple(name for name, road in USUAL_CAR_ROADS.items() if road == "figure-eight")
 RING_CONTROLLERS = tuple(name for name, road in CONTROLLER_ROADS.items() if road != "figure-eight")
 RING_STEPS: dict[str, Any] = {"simulation_step": 0.1, "steps_per_control_step": 1}
-"""those of the rings, which their controllers need on any road"""
+"""steps of the rings, which the controllers for rings need on other roads, too"""
 LANE_SECONDS = 900.0
 """duration of an episode on a motorway lane [s]"""
 IMPAIRED_DRIVERS = "unjam:best", "unjam:ring-best", "unjam:ring-jammed-best", "unjam:ring-jammed-tuned"
 VEHICLE_SPACINGS = {"shorter": (8, 10), "as trained on": (10, 12), "longer": (13, 18)}
 """range of the road length per vehicle [m]"""
 WORST_PART, USUAL_CAR_WORST_PART = "worst", "worst-usual-car"
-"""parts with the worst cases of the certificates"""
+"""names of the parts with the worst cases of the certificates"""
 ENVELOPE_METRICS = ("return", "mean_speed", "min_time_gap", "cav_max_braking", "steps", "collisions")
 LANE_CONDITIONS: dict[str, dict[str, Any]] = {
     "a free lane": {"inflow": 1200.0, "off_peak_inflow": 1200.0},
@@ -60,15 +60,18 @@ LANE_CONDITIONS: dict[str, dict[str, Any]] = {
     "a full lane, half of all automated": {"inflow": 2400.0, "off_peak_inflow": 2000.0, "penetration_rate": 0.5},
 }
 """demand on one lane of a motorway without cut-ins"""
-SENSED = ("gap_error", "speed_error")
+SENSOR_ERRORS = ("gap_error", "speed_error")
 IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "usual car, exact sensors": {},
     "ideal car": {"actuator": INSTANT_ACTUATOR},
     "delay 0.2 s, lag 0.5 s": {"actuator": Actuator(delay=0.2, lag=0.5)},
     "delay 0.5 s, lag 0.5 s": {"actuator": Actuator(delay=0.5, lag=0.5)},
     **{
-        label: {"sensors": Sensors(**dict.fromkeys(SENSED, off)), "safety": SafetyFilter(**dict.fromkeys(SENSED, off))}
-        for label, off in {"gap and speed off by up to 0.3": 0.3, "off by up to 1.0": 1.0}.items()
+        label: {"sensors": Sensors(**errors), "safety": SafetyFilter(**errors)}
+        for label, errors in {
+            "gap and speed off by up to 0.3": dict.fromkeys(SENSOR_ERRORS, 0.3),
+            "off by up to 1.0": dict.fromkeys(SENSOR_ERRORS, 1.0),
+        }.items()
     },
     "every tenth reading missing": {"sensors": Sensors(dropout=0.1)},
     "every third reading missing": {"sensors": Sensors(dropout=1.0 / 3.0)},
@@ -78,12 +81,12 @@ IMPAIRMENTS: dict[str, dict[str, Any]] = {
 
 def envelope_rings(**changes: Any) -> Iterator[tuple[str, Ring]]:
     """Yield the rings by name, with changes to all of them."""
-    each = product((5, 11, 22, 44), (1, 2, 3), VEHICLE_SPACINGS.items(), (0, LONG_WARM_UP))
-    for vehicles, cavs, (words, (low, high)), warmup in each:
-        name = f"{vehicles} vehicles, {cavs} automated, {words}{', jammed' if warmup else ''}"
+    combinations = product((5, 11, 22, 44), (1, 2, 3), VEHICLE_SPACINGS.items(), (0, LONG_WARM_UP))
+    for vehicles, cavs, (spacing, (low, high)), warmup in combinations:
+        name = f"{vehicles} vehicles, {cavs} automated, {spacing}{', jammed' if warmup else ''}"
         length = low * vehicles, high * vehicles
-        size: dict[str, Any] = {"vehicles": vehicles, "cavs": cavs, "length": length, "warmup": warmup}
-        yield name, Ring(**{"actuator": INSTANT_ACTUATOR, **size, **changes})
+        options: dict[str, Any] = {"vehicles": vehicles, "cavs": cavs, "length": length, "warmup": warmup}
+        yield name, Ring(**{"actuator": INSTANT_ACTUATOR, **options, **changes})
 
 
 def envelope_figure_eights(actuator: Actuator = INSTANT_ACTUATOR) -> Iterator[tuple[str, FigureEight]]:
@@ -93,7 +96,7 @@ def envelope_figure_eights(actuator: Actuator = INSTANT_ACTUATOR) -> Iterator[tu
 
 
 def envelope_lanes(**changes: Any) -> Iterator[tuple[str, Motorway]]:
-    """Yield motorway lanes by name on which the safety filter is active and the checks of SUMO are not."""
+    """Yield motorway lanes by name, with the safety filter and without the safety checks of SUMO."""
     lane = Motorway(lanes=1, ramps=(Ramp(position=2000.0, inflow=0.0, off_peak_inflow=0.0),), **changes)
     lane = replace(lane, horizon=round(LANE_SECONDS / lane.control_step), actuation="raw", safety=SafetyFilter())
     for name, demand in LANE_CONDITIONS.items():
@@ -108,15 +111,15 @@ def impaired_rings(warmup: int) -> Iterator[tuple[str, Ring]]:
 
 def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart]:
     """Return the parts of the study `envelope`."""
-    closed, parts = tuple(CONTROLLER_ROADS), dict[str, StudyPart]()
+    closed_road_controllers, parts = tuple(CONTROLLER_ROADS), dict[str, StudyPart]()
     cars = (WORST_PART, CONTROLLER_ROADS, INSTANT_ACTUATOR), (USUAL_CAR_WORST_PART, USUAL_CAR_ROADS, STANDARD_ACTUATOR)
     for part, road_by_driver, actuator in cars:
         for driver, road in road_by_driver.items():
-            parts[f"{part}/{driver}"] = _certify_worst_cases, (driver, road, actuator)
+            parts[f"{part}/{driver}"] = _measure_worst_cases, (driver, road, actuator)
     usual_cars: dict[str, Any] = {"actuator": STANDARD_ACTUATOR}
     tests: tuple[tuple[str, Iterator[tuple[str, Scenario]], tuple[str, ...], int], ...] = (
-        ("rings", envelope_rings(), closed, ENVELOPE_SEEDS),
-        ("figure-eights", envelope_figure_eights(), closed, ENVELOPE_SEEDS),
+        ("rings", envelope_rings(), closed_road_controllers, ENVELOPE_SEEDS),
+        ("figure-eights", envelope_figure_eights(), closed_road_controllers, ENVELOPE_SEEDS),
         ("figure-eights-usual-car", envelope_figure_eights(STANDARD_ACTUATOR), USUAL_CAR_PACERS, ENVELOPE_SEEDS),
         ("rings-raw-usual-car", envelope_rings(actuation="raw", **usual_cars), USUAL_CAR_CONTROLLERS, ENVELOPE_SEEDS),
         ("lanes-raw", envelope_lanes(), LANE_CONTROLLERS, RAW_ACTUATION_SEEDS),
@@ -131,12 +134,12 @@ def envelope_parts(study_folder: StudyFolder, seeds: int) -> dict[str, StudyPart
     return parts
 
 
-def _certify_worst_cases(controller: str, road: str, actuator: Actuator, workers: int) -> dict[str, Any]:
+def _measure_worst_cases(controller: str, road: str, actuator: Actuator, workers: int) -> dict[str, Any]:
     return make_certificate(read_exported_controller(controller, {"actuator": asdict(actuator)}, road))["worst_cases"]
 
 
 def worst_table(part: str, folder: Path) -> pd.DataFrame:
-    """Return how close each controller came to leaders that brake to a stop and to leaders found by a search."""
+    """Return the smallest gaps of each controller to leaders that brake to a stop and to leaders found by a search."""
     rows: list[dict[str, Any]] = []
     for controller, worst in read_part(folder, part).items():
         road = {**CONTROLLER_ROADS, **USUAL_CAR_ROADS}[controller]
@@ -148,22 +151,22 @@ def worst_table(part: str, folder: Path) -> pd.DataFrame:
 
 
 def domain_table(part: str, folder: Path) -> pd.DataFrame:
-    """Return on how many roads each controller is feasible, and its gain in speed in the mean and on the worst road."""
+    """Return on how many roads each controller is feasible, and its mean and smallest gain in speed over the roads."""
     roads, rows = read_part(folder, part), []
     comparison = DriverComparison([*roads.values()])
     for driver in (driver for driver in comparison.roads[0] if driver != HUMAN_LABEL):
         speeds = (comparison.values([label], "mean_speed").mean((1, 2)) for label in (driver, HUMAN_LABEL))
         gains = np.subtract(*speeds)
-        least = int(np.argmin(gains))
+        worst = int(np.argmin(gains))
         feasible = f"{comparison.verdicts([driver]).count(FEASIBLE)} of {len(roads)} roads"
         row = {"controller": driver, "feasible on": feasible, **_safety_cells(comparison, driver)}
         row["mean difference to human baseline [m/s]"] = f"{gains.mean():+.2f}"
-        rows.append({**row, "smallest difference [m/s]": f"{gains[least]:+.2f} ({list(roads)[least]})"})
+        rows.append({**row, "smallest difference [m/s]": f"{gains[worst]:+.2f} ({list(roads)[worst]})"})
     return pd.DataFrame(rows)
 
 
 def contact_table(part: str, folder: Path) -> pd.DataFrame:
-    """Return the contacts and the smallest time gap of each controller where SUMO's safety checks are off."""
+    """Return the contacts and the smallest time gap of each controller without the safety checks of SUMO."""
     roads = [*read_part(folder, part).values()]
     rows = []
     for driver in dict.fromkeys(label for road in roads for label in road if label != HUMAN_LABEL):
@@ -180,7 +183,7 @@ def _safety_cells(comparison: DriverComparison, driver: str) -> dict[str, str]:
 
 
 def impaired_table(part: str, folder: Path) -> pd.DataFrame:
-    """Return the return of each controller with impaired vehicles, its minimum time gap, and why it is infeasible."""
+    """Return for each impairment the return of each controller, its minimum time gap, and why it is infeasible."""
     rows: list[dict[str, Any]] = []
     for name, results in read_part(folder, part).items():
         comparison, row = DriverComparison([results]), {"impairment": name}

@@ -1,7 +1,7 @@
 """Fig. 6 of the paper: whether a car-following model helps a network to learn car following, on synthetic data.
 
-A network alone (`vanilla`) and one that learns the residual of the paper's IDM (`knowledge`) are trained on shares of
-the four-regime data set, of an IDM with other parameters (`other`), or of the paper's IDM itself (`same`).
+A network alone (`vanilla`) and a network that learns the residual of the paper's IDM (`knowledge`) are trained on
+shares of a four-regime data set. Its driver is an IDM with other parameters (`other`) or the paper's IDM (`same`).
 """
 
 from collections.abc import Sequence
@@ -30,15 +30,15 @@ from unjam_paper.results_file import read_part, write_part
 from unjam_paper.study import Study, StudyFolder, Table
 
 SplitKind = Literal["trajectories", "rows", "released"]
-"""How test rows are separated from training rows. `trajectories`: no row of their trajectory is in training. `rows`:
-rows are drawn one by one, so that the neighbors of a test row, 0.1 s before and after, can be in training. `released`:
-as in the authors' code, test rows are drawn from all rows, including those of training."""
+"""How test rows are separated from training rows. `trajectories`: whole trajectories are drawn. `rows`: single rows are
+drawn, so that the rows 0.1 s before and after a test row can be training rows. `released`: as in the authors' code,
+test rows are drawn from all rows, including training rows."""
 SPLIT_SHARES = (0.7, 0.1, 0.2)
 TRAINING_SIZES, LEAKING_SIZES = (0.01, 0.1, 0.3, 0.5, 1.0), (0.01, 0.1)
-"""shares of the training rows; the latter for splits with test rows close to training rows"""
+"""shares of the training rows, in general and for the splits `rows` and `released`"""
 FIT_REPEATS, FEWER_REPEATS = 5, 3
 LONG_PASS_REPEATS = 30
-"""how often each row occurs in a pass of the long fits at 1 % of the data: as many gradient steps as at 30 %"""
+"""how often a pass of the long fits uses each row of 1 % of the data, for as many gradient steps as with 30 %"""
 MAX_VALIDATION_ROWS = 5000
 DATA_SETTINGS = {"other": FourRegimesSettings(), "same": FourRegimesSettings(driver=PAPER_IDM)}
 FIGURE_6_NETWORKS = ("knowledge", "vanilla")
@@ -61,11 +61,11 @@ class FourRegimeFit:
     repeat: int
     split: SplitKind = "trajectories"
     is_long: bool = False
-    """whether each row occurs `LONG_PASS_REPEATS` times in a pass"""
+    """whether a pass uses each row `LONG_PASS_REPEATS` times"""
 
     @property
     def name(self) -> str:
-        """Name of the file with the result."""
+        """Name of the entry with the result."""
         words = (self.driver, self.split, self.network.replace(" ", "-"), f"{100 * self.size:g}", f"{self.repeat}")
         return "-".join((*words, "is_long") if self.is_long else words)
 
@@ -81,12 +81,12 @@ class DataSplit(NamedTuple):
 
 
 def four_regime_fits() -> list[FourRegimeFit]:
-    """Return all fits of the study, the most important first."""
-    unseen, both = get_args(SplitKind)[:1], FIGURE_6_NETWORKS
+    """Return all fits of the study, the most important ones first."""
+    trajectories, both = get_args(SplitKind)[:1], FIGURE_6_NETWORKS
     plan: list[tuple[int, Sequence[SplitKind], Sequence[float], Sequence[str], str, bool]] = [
-        (FIT_REPEATS, unseen, TRAINING_SIZES, both, "other", False),
-        (FEWER_REPEATS, unseen, TRAINING_SIZES[:1], both, "other", True),
-        (FEWER_REPEATS, unseen, TRAINING_SIZES[:2], both, "same", False),
+        (FIT_REPEATS, trajectories, TRAINING_SIZES, both, "other", False),
+        (FEWER_REPEATS, trajectories, TRAINING_SIZES[:1], both, "other", True),
+        (FEWER_REPEATS, trajectories, TRAINING_SIZES[:2], both, "same", False),
         (FEWER_REPEATS, ("rows", "released"), LEAKING_SIZES, both, "other", False),
         (1, get_args(SplitKind), (*LEAKING_SIZES, 1.0), (NEAREST_ROW,), "other", False),
     ]
@@ -99,11 +99,11 @@ def four_regime_fits() -> list[FourRegimeFit]:
 
 @cache
 def split_rows(driver: str, split: SplitKind) -> DataSplit:
-    """Return the rows for training, validation and test, always the same."""
+    """Return the rows for training, validation and test, the same in each call."""
     trajectories = make_four_regimes(DATA_SETTINGS[driver])
     if split == "trajectories":
-        chosen = split_by_driver(trajectories, SPLIT_SHARES, seed=0)
-        return DataSplit(*(following_samples(select_splits(chosen, name)) for name in SPLITS), overlap=0.0)
+        labeled = split_by_driver(trajectories, SPLIT_SHARES, seed=0)
+        return DataSplit(*(following_samples(select_splits(labeled, name)) for name in SPLITS), overlap=0.0)
     rows, generator = following_samples(trajectories), np.random.default_rng(0)
     borders = np.round(np.cumsum(SPLIT_SHARES)[:-1] * len(rows)).astype(int)
     training, validation, test = np.split(generator.permutation(len(rows)), borders)
@@ -114,9 +114,10 @@ def split_rows(driver: str, split: SplitKind) -> DataSplit:
 
 
 def measure_fit(fit: FourRegimeFit, workers: int = 1) -> dict[str, Any]:
-    """Return the errors of a fit on the test rows [m/s2], and its losses.
+    """Return the root mean square errors of a fit on the test rows [m/s2], and its losses.
 
-    `error` is that to the data, `driver_error` that to their driver's mean acceleration, `noise` that of this mean.
+    `error` refers to the data, `driver_error` to the mean acceleration of the driver of the data. `noise` is the error
+    of this mean acceleration.
     """
     started = perf_counter()
     rows = split_rows(fit.driver, fit.split)
@@ -124,45 +125,47 @@ def measure_fit(fit: FourRegimeFit, workers: int = 1) -> dict[str, Any]:
     count = max(1, round(fit.size * len(rows.training)))
     training = rows.training.select(generator.permutation(len(rows.training))[:count])
     predict = _predict_nearest if fit.network == NEAREST_ROW else _predict_learned
-    predicted, facts = predict(fit, training, rows)
+    predicted, details = predict(fit, training, rows)
     average, data = average_acceleration(rows.test, DATA_SETTINGS[fit.driver]), rows.test.acceleration
     differences = {"error": predicted - data, "driver_error": predicted - average, "noise": average - data}
     errors = {name: float(np.sqrt(np.square(values).mean())) for name, values in differences.items()}
     seconds = perf_counter() - started
-    return {**asdict(fit), "rows": count, "overlap": rows.overlap, **errors, "seconds": seconds, **facts}
+    return {**asdict(fit), "rows": count, "overlap": rows.overlap, **errors, "seconds": seconds, **details}
 
 
 def average_acceleration(rows: FollowingSamples, settings: FourRegimesSettings) -> Floats:
-    """Return the mean acceleration of the driver of the data over the noise, which cannot move it backwards [m/s2]."""
+    """Return the mean acceleration of the driver of the data over its noise [m/s2]; vehicles do not move backwards."""
     from scipy.stats import norm
 
     gap = clamp_min(rows.gap, MIN_REGIME_GAP)
     idm = idm_acceleration(rows.speed, rows.leader_speed, gap, settings.driver)
-    least = -rows.speed / settings.time_step
+    lowest = -rows.speed / settings.time_step
     if settings.acceleration_noise == 0:
-        return np.maximum(idm, least)
-    above = (idm - least) / settings.acceleration_noise
-    return least + settings.acceleration_noise * (norm.pdf(above) + above * norm.cdf(above))
+        return np.maximum(idm, lowest)
+    margin = (idm - lowest) / settings.acceleration_noise
+    return lowest + settings.acceleration_noise * (norm.pdf(margin) + margin * norm.cdf(margin))
 
 
 def _predict_learned(fit: FourRegimeFit, training: FollowingSamples, rows: DataSplit) -> tuple[Floats, dict[str, Any]]:
+    """Return the accelerations of the test rows by a trained network, and its losses."""
     base = idm_function(PAPER_IDM) if fit.network == "knowledge" else None
     if fit.is_long:
         training = training.select(np.tile(np.arange(len(training)), LONG_PASS_REPEATS))
-    chosen = np.random.default_rng(0).permutation(len(rows.validation))[:MAX_VALIDATION_ROWS]
-    network, losses = fit_one_step(training, rows.validation.select(chosen), base, NetworkSettings(), fit.repeat)
+    indices = np.random.default_rng(0).permutation(len(rows.validation))[:MAX_VALIDATION_ROWS]
+    network, losses = fit_one_step(training, rows.validation.select(indices), base, NetworkSettings(), fit.repeat)
     model = add_residual(as_driver_model(base) if base else None, batched_network(network.to_numpy_network()))
     predicted = model(rows.test.speed[:1], rows.test.gap[:1])(*rows.test.inputs)
-    facts = {"training_loss": losses.training, "validation_loss": losses.validation}
-    return predicted, {"epochs": len(losses.training), **facts}
+    loss_curves = {"training_loss": losses.training, "validation_loss": losses.validation}
+    return predicted, {"epochs": len(losses.training), **loss_curves}
 
 
 def _predict_nearest(fit: FourRegimeFit, training: FollowingSamples, rows: DataSplit) -> tuple[Floats, dict[str, Any]]:
+    """Return the accelerations of the training rows with the most similar inputs; there are no losses."""
     from scipy.spatial import KDTree
 
-    known, asked = (np.column_stack(each.inputs) for each in (training, rows.test))
-    scale = known.std(0)
-    _, nearest = KDTree(known / scale).query(asked / scale)
+    training_inputs, test_inputs = (np.column_stack(samples.inputs) for samples in (training, rows.test))
+    scale = training_inputs.std(0)
+    _, nearest = KDTree(training_inputs / scale).query(test_inputs / scale)
     return training.acceleration[np.asarray(nearest, np.int64)], {}
 
 
@@ -176,14 +179,14 @@ def _write_figure_6(study_folder: StudyFolder, seeds: int, folder: Path) -> None
 
 @rc_context(PLOT_STYLE)
 def figure_6(rows: Table) -> Figure:
-    """Return training loss, error by the share of the data, and the same with more gradient steps."""
-    main = [row for row in rows if row["split"] == "trajectories" and row["driver"] == "other"]
+    """Draw the training loss, the error by share of the data, and the same with more gradient steps at 1 %."""
+    main_rows = [row for row in rows if row["split"] == "trajectories" and row["driver"] == "other"]
     figure = new_figure(3.7, width=11)
     left, middle, right = figure.subplots(1, 3)
-    _draw_losses(left, [row for row in main if row["size"] == 1.0])
-    _draw_errors(middle, [row for row in main if not row["is_long"]], "200 passes, as in the paper")
-    long = [row for row in main if row["is_long"] or row["size"] == 0.3]
-    _draw_errors(right, long, "at 1 % as many gradient steps as at 30 %")
+    _draw_losses(left, [row for row in main_rows if row["size"] == 1.0])
+    _draw_errors(middle, [row for row in main_rows if not row["is_long"]], "200 passes, as in the paper")
+    long_rows = [row for row in main_rows if row["is_long"] or row["size"] == 0.3]
+    _draw_errors(right, long_rows, "at 1 % as many gradient steps as at 30 %")
     right.sharey(middle)
     middle.set_ylabel("error of the acceleration without noise [m/s²]")
     middle.legend()
@@ -206,8 +209,8 @@ def _draw_errors(axes: Axes, rows: Table, title: str) -> None:
     for network, color in NETWORK_COLORS.items():
         errors: Any = fits[fits["network"] == network].groupby("share")["driver_error"]
         mean, std = errors.mean(), errors.std(ddof=0)
-        look = {"color": color, "lw": 1.5, "marker": "o", "ms": 4, "capsize": 3}
-        axes.errorbar(mean.index, mean, std, label=NETWORK_LABELS[network], **look)
+        style = {"color": color, "lw": 1.5, "marker": "o", "ms": 4, "capsize": 3}
+        axes.errorbar(mean.index, mean, std, label=NETWORK_LABELS[network], **style)
     axes.set_xlabel("share of the training rows [%]")
     _set_log_axes(axes, title)
     ticks = sorted(fits["share"].unique())
@@ -216,7 +219,7 @@ def _draw_errors(axes: Axes, rows: Table, title: str) -> None:
 
 
 def _set_log_axes(axes: Axes, title: str) -> None:
-    """Make both axes logarithmic, the vertical one with legible numbers within a decade."""
+    """Make both axes logarithmic, with several numbers per decade on the vertical axis."""
     axes.set(title=title, xscale="log", yscale="log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 4.0, 6.0)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -225,7 +228,9 @@ def _set_log_axes(axes: Axes, title: str) -> None:
 
 FIGURE_6 = Study(
     title="networks that learn car following, with and without a car-following model",
-    make_parts=lambda folder, seeds: {f"figure-6/{fit.name}": (measure_fit, (fit,)) for fit in four_regime_fits()},
+    make_parts=lambda study_folder, seeds: {
+        f"figure-6/{fit.name}": (measure_fit, (fit,)) for fit in four_regime_fits()
+    },
     write=_write_figure_6,
     minutes=25.0,
     figures={"figure-6": lambda folder: figure_6(read_part(folder, "figure-6")["rows"])},

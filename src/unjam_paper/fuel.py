@@ -1,7 +1,6 @@
-"""Fuel on closed roads by two emission models, and how much of it an engine burns without moving the vehicle.
+"""Fuel on closed roads by two emission models, and the part of it that idling would burn.
 
-A model with a large idle rate rewards every gain of speed, since each kilometer then takes less time: less fuel is no
-evidence of smoother driving.
+In a model with a large idle rate, faster vehicles need less fuel per kilometer, even without smoother driving.
 """
 
 from collections.abc import Sequence
@@ -35,11 +34,11 @@ FUEL_DRIVERS: dict[str, tuple[str, ...]] = {
 }
 FUEL_SEEDS, SECONDS_PER_HOUR = 20, 3600.0
 IDLE_SPEED = 0.001
-"""speed below which an engine counts as idle [m/s]"""
+"""speed below which an engine is idle [m/s]"""
 
 
 def idle_rate(episode: Episode) -> float:
-    """Return the fuel rate of vehicles that stand [l/h]; NaN if none does."""
+    """Return the median fuel rate of standing vehicles [l/h]; NaN if no vehicle stands."""
     speeds = episode.speeds[1 : len(episode.fuel) + 1]
     standing = episode.fuel[speeds < IDLE_SPEED]
     return float(np.median(standing)) / GASOLINE_DENSITY * SECONDS_PER_HOUR / 1000.0 if standing.size else np.nan
@@ -51,26 +50,26 @@ def measure_fuel(road: str, emission_class: str, drivers: Sequence[str], workers
     pairs = product([make_driver(name, scenario.control_step) for name in drivers], held_out_seeds(FUEL_SEEDS))
     tasks = [EpisodeTask(scenario, driver, seed, record_details=True) for driver, seed in pairs]
 
-    def episode_row(number: int, episode: Episode, row: dict[str, Any]) -> dict[str, Any]:
-        metrics = {name: row[name] for name in ("seed", "mean_speed", FUEL_METRIC)}
-        return {"driver": drivers[number // FUEL_SEEDS], **metrics, "idle_rate": idle_rate(episode)}
+    def make_row(index: int, episode: Episode, metrics: dict[str, Any]) -> dict[str, Any]:
+        entries = {name: metrics[name] for name in ("seed", "mean_speed", FUEL_METRIC)}
+        return {"driver": drivers[index // FUEL_SEEDS], **entries, "idle_rate": idle_rate(episode)}
 
-    return measure_tasks(tasks, workers, episode_row)
+    return measure_tasks(tasks, workers, make_row)
 
 
 def fuel_table(road: str, folder: Path) -> pd.DataFrame:
-    """Return the fuel of drivers by model, its difference to the human baseline, and what idling alone would burn."""
+    """Return the fuel of drivers by model, its difference to the human baseline, and the fuel of idling alone."""
     table: dict[str, dict[str, str]] = {}
     for model in EMISSION_CLASSES:
         rows = read_part(folder, f"{road}, {model}")
         rate = float(np.nanmedian([np.nan if row["idle_rate"] is None else row["idle_rate"] for row in rows]))
         by_driver = {name: [row for row in rows if row["driver"] == name] for name in FUEL_DRIVERS[road]}
-        for name, own in by_driver.items():
-            speed = metric_estimate(own, "mean_speed").mean
-            human = by_driver[HUMAN_LABEL]
-            difference = None if own is human else paired_difference(own, human, FUEL_METRIC)
+        human = by_driver[HUMAN_LABEL]
+        for name, episodes in by_driver.items():
+            speed = metric_estimate(episodes, "mean_speed").mean
+            difference = None if episodes is human else paired_difference(episodes, human, FUEL_METRIC)
             cells = table.setdefault(name, {"": name, "mean speed [m/s]": f"{speed:.2f}"})
-            cells[f"{model} [ml/km]"] = f"{metric_estimate(own, FUEL_METRIC).mean:.0f}"
+            cells[f"{model} [ml/km]"] = f"{metric_estimate(episodes, FUEL_METRIC).mean:.0f}"
             cells[f"{model}, difference"] = estimate_text(difference, 0, "+")
             cells[f"{model}, idling at {rate:.1f} l/h"] = f"{rate * 1e6 / SECONDS_PER_HOUR / speed:.0f}"
     return pd.DataFrame(table.values())

@@ -27,7 +27,7 @@ from unjam.worlds.worker_pool import EpisodeTask
 from unjam_paper.do_no_harm import HARM_METRICS
 from unjam_paper.motorway_ensemble import SETTINGS, SETTINGS_PER_HALF, EnsembleSetting
 from unjam_paper.motorway_methods import CANDIDATE_SEED, CANDIDATES_PER_METHOD, METHODS, Candidate
-from unjam_paper.results_file import StudyPart, read_part
+from unjam_paper.results_file import StudyPart, read_part, read_part_or_empty
 from unjam_paper.study import NO_VALUE_TEXT, Study, StudyFolder, Table, group_rows, mean_text, measure_tasks
 
 HUMAN_PART, TUNING_PART, FINAL_PART, TEST_HUMAN_PART, TEST_PART = "human", "tuning", "finals", "test-human", "test"
@@ -349,7 +349,7 @@ def no_harm_table(folder: Path) -> pd.DataFrame:
 
 def sensing_table(folder: Path) -> pd.DataFrame:
     """Return the change of delay against human traffic by the source of the speeds ahead, over the same settings."""
-    if not (sensing := _read_measured(folder, SENSING_PART)):
+    if not (sensing := read_part_or_empty(folder, SENSING_PART)):
         return pd.DataFrame()
     human = list(map(replace_null, read_part(folder, TEST_HUMAN_PART)))
     rows = [row for row in read_part(folder, TEST_PART) if row["driver"] == CONTROLLER]
@@ -368,7 +368,7 @@ def sensing_table(folder: Path) -> pd.DataFrame:
 def sensitivity_table(folder: Path) -> pd.DataFrame:
     """Return the change of travel time with the controller, with one changed assumption in each row."""
     table: Table = []
-    for name, rows in _read_measured(folder, SENSITIVITY_PART).items():
+    for name, rows in read_part_or_empty(folder, SENSITIVITY_PART).items():
         pairs = pair_rows(rows[CONTROLLER], rows[HUMAN_LABEL])
         gains = [own[TIME_METRIC] - each[TIME_METRIC] for own, each in pairs]
         row = {"changed": name, "human traffic [s]": mean_text([each[TIME_METRIC] for _, each in pairs], 0)}
@@ -379,23 +379,16 @@ def sensitivity_table(folder: Path) -> pd.DataFrame:
 def packaged_table(folder: Path) -> pd.DataFrame:
     """Return the change of delay with the packaged law for motorways, by the source of the speeds ahead."""
     human, table = read_part(folder, HUMAN_PART), list[dict[str, str]]()
-    for source, own in group_rows(_read_measured(folder, PACKAGED_PART), "driver").items():
+    for source, own in group_rows(read_part_or_empty(folder, PACKAGED_PART), "driver").items():
         by_rate = group_rows(own, "penetration_rate").items()
         changes = {rate: f"{100 * delay_change(each, human):+.0f} %" for rate, each in by_rate}
         table.append({"source": source} | {f"delay, {100 * rate:g} % CAVs": text for rate, text in changes.items()})
     return pd.DataFrame(table)
 
 
-def _read_measured(folder: Path, part: str) -> Any:
-    try:
-        return read_part(folder, part)
-    except (KeyError, FileNotFoundError):
-        return {}
-
-
 def _test_rows(folder: Path) -> Iterator[tuple[int, float, dict[str, Table]]]:
     """Yield each setting and penetration rate of the test half with the rows of its drivers."""
-    if not (compared := _read_measured(folder, TEST_PART)):
+    if not (compared := read_part_or_empty(folder, TEST_PART)):
         return
     rows = list(map(replace_null, [*read_part(folder, TEST_HUMAN_PART), *compared]))
     for number, rate in product(sorted({row["setting"] for row in rows}), BENCHMARK_RATES):

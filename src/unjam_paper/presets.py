@@ -23,16 +23,16 @@ PAPER: dict[str, Any] = {
     },
     "model": {"k_max": 500, "kappa": 2.0, "model_ratio": 1.0},
 }
-"""settings that the paper reports, Tables B2 to B6 and section 4.1, else those of its authors' code; vehicles obey at
-once"""
+"""settings of Tables B2 to B6 and section 4.1 of the paper, and others from its authors' code; CAVs carry out commands
+at once"""
 PAPER_EXACT = {
     "scenario_options": {"safety": {"active": False}},
     "policy": {"zero_init": False},
     "model": {"members": 1, "fallback_to_base": False, "add_noise": False, "error_estimator": "transitions"},
     "evaluation": {"validation_interval": 0, "convergence_window": 50},
 }
-"""the method as it is printed: no safety filter, one network with its random initialization, its mean as the
-prediction, the last checkpoint instead of the best validated one, and an end when the return stops increasing. Human
-drivers keep Flow's convention: noise of 0.2 m/s2 times the square root of the step"""
+"""additional settings of the method as printed: no safety filter, a randomly initialized policy, a model of one network
+without noise, the last checkpoint instead of the best validated one, and an end when the return stops increasing. The
+noise of human drivers follows Flow: 0.2 m/s2 times the square root of the step"""
 PAPER_PRESETS: dict[str, dict[str, Any]] = {"paper": PAPER, "paper-exact": merge_changes(PAPER, PAPER_EXACT)}
 """changes to the run configuration, by name of the preset"""

@@ -31,15 +31,15 @@ TRAINING_CHANGES: dict[str, Any] = {
 }
 """the best of nine trials in validation, one training each with up to 12,000,000 steps; windows are drawn from the
 training drives"""
-MORE_RECORDINGS = "without model, more recordings"
-MODEL_RATIOS = {"without model": 0.0, "with model": 1.0, MORE_RECORDINGS: 0.0}
+MORE_RECORDINGS_LABEL = "without model, more recordings"
+MODEL_RATIOS = {"without model": 0.0, "with model": 1.0, MORE_RECORDINGS_LABEL: 0.0}
 """model steps for each environment step, by the name of the residual"""
 I24_TASK = "i24"
 OTHER_RECORDINGS: dict[str, dict[str, Any]] = {
     "openacc": {"recordings": "recordings/openacc_astazero_pairs.parquet"},
     "ngsim": {"recordings": "recordings/ngsim_i80_recon_pairs.parquet", "window": 30.0},
 }
-"""leaders behind which `MORE_RECORDINGS` learns besides the training drives and artificial waves: on a test track
+"""leaders behind which `MORE_RECORDINGS_LABEL` learns besides the training drives and artificial waves: on a test track
 (OpenACC, Makridis et al. 2021), and in a jam on I-80 (NGSIM, 30 s and more); all four tasks have equal shares of the
 steps"""
 
@@ -73,7 +73,7 @@ class PlannedResidual:
         ratio = MODEL_RATIOS[self.label]
         changes = {"scenario_options.recordings": self.drives, "expert": self.expert, "seed": self.seed}
         changes |= {"trpo.steps_per_iteration": round(STEPS_PER_ITERATION / (1.0 + ratio)), "model.model_ratio": ratio}
-        if self.label == MORE_RECORDINGS:
+        if self.label == MORE_RECORDINGS_LABEL:
             changes["tasks"] = [
                 {"name": name, "scenario": "recorded", "scenario_options": TASK_OPTIONS | options}
                 for name, options in self._task_options().items()

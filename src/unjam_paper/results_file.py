@@ -1,10 +1,10 @@
 """Measure, write and read the parts of a study, and its results file: one JSON object with its manifest and each part.
 
 A part is measured once, and again if its arguments, or the controllers that they name, have changed. Tables of rows
-with the same keys are stored by columns, `{"columns": {NAME: [VALUES]}}`; what is the same in all rows is stored once,
-`{NAME: VALUE}`, and repeated texts as `{"texts": [TEXTS], "rows": [NUMBERS]}`. Numbers have seven digits. Figures and
-controllers are separate files: NAME-FIGURE.png and NAME-controllers.zip. Names in manifests are those of the commit
-that made the results (CONTRIBUTING.md).
+with the same keys are stored by columns, `{"columns": {NAME: [VALUES]}}`; a value of all rows is stored once,
+`{NAME: VALUE}`, and repeated texts as `{"texts": [TEXTS], "rows": [INDICES]}`. Numbers have seven digits. Figures and
+controllers are separate files: NAME-FIGURE.png and NAME-controllers.zip. Manifests contain names of the commit that
+made the results (CONTRIBUTING.md).
 """
 
 import json
@@ -30,11 +30,11 @@ from unjam.reports.figures import png_bytes
 COLUMNS = "columns"
 """the only key of a table that is stored by columns"""
 TEXTS = "texts"
-"""key of the different texts of a column; `rows` has the number of the text in each row"""
+"""key of the different texts of a column; `rows` has the index of the text in each row"""
 CONTROLLERS = "controllers"
 """subfolder with controllers, in the working folder of a study"""
 StudyPart = tuple[Callable[..., Any], tuple[Any, ...]]
-"""a function of a module and its arguments, without the last: the number of processes; it returns a JSON value"""
+"""a function of a module, which returns a JSON value, and its arguments without the last, the number of processes"""
 
 
 def write_part(folder: Path, name: str, part: Any) -> None:
@@ -51,13 +51,13 @@ def write_results(path: Path, parts: Mapping[str, Any]) -> None:
     """Write a results file, one line for each part; NaN and infinities become null."""
     lines = list[str]()
     for name, part in parts.items():
-        rounded = json.loads(to_json(_by_columns(part)), parse_float=lambda text: float(f"{float(text):.7g}"))
+        rounded = json.loads(to_json(_to_columns(part)), parse_float=lambda text: float(f"{float(text):.7g}"))
         lines.append(f"{json.dumps(name)}: {json.dumps(rounded, separators=(',', ':'))}")
     atomic_write(path, "{\n" + ",\n".join(lines) + "\n}\n")
 
 
 def collect_results(folder: Path) -> Path:
-    """Write the content of the working folder of a study as one file next to it, and return this file.
+    """Write the parts of a study from its working folder into one file next to it, and return this file.
 
     The manifest comes first, then the parts ordered by name. Figures and controllers are copied.
     """
@@ -69,25 +69,32 @@ def collect_results(folder: Path) -> Path:
         atomic_write(folder.with_name(name), figure.read_bytes())
     controllers = sorted((folder / CONTROLLERS).glob("*.unjam"))
     if controllers:
-        atomic_write(folder.with_name(f"{folder.name}-controllers.zip"), _zip_of(controllers))
+        atomic_write(folder.with_name(f"{folder.name}-controllers.zip"), _zip_files(controllers))
     return path
 
 
 def read_part(path: Path, name: str) -> Any:
-    """Return one part of a study, from its results file or its folder; `KeyError` or `FileNotFoundError` without it."""
+    """Return a part of a study from its results file or folder; `KeyError` or `FileNotFoundError` if it is missing."""
     if path.is_dir():
         return json.loads((path / f"{name}.json").read_text(encoding="utf-8"))
-    return _by_rows(json.loads(path.read_text(encoding="utf-8"))[name])
+    return _to_rows(json.loads(path.read_text(encoding="utf-8"))[name])
+
+
+def read_part_or_empty(path: Path, name: str) -> Any:
+    """Return a part of a study as `read_part`; an empty object if it is missing."""
+    with suppress(KeyError, FileNotFoundError):
+        return read_part(path, name)
+    return {}
 
 
 def read_parts(path: Path) -> dict[str, Any]:
-    """Return all parts of a study by name, from its results file or from its working folder."""
+    """Return all parts of a study by name, from its results file or its working folder."""
     if path.is_dir():
         return {file.stem: read_part(path, file.stem) for file in sorted(path.glob("*.json"))}
-    return _by_rows(json.loads(path.read_text(encoding="utf-8")))
+    return _to_rows(json.loads(path.read_text(encoding="utf-8")))
 
 
-def _zip_of(files: list[Path]) -> bytes:
+def _zip_files(files: list[Path]) -> bytes:
     content = BytesIO()
     with ZipFile(content, "w") as archive:
         for file in files:
@@ -95,9 +102,10 @@ def _zip_of(files: list[Path]) -> bytes:
     return content.getvalue()
 
 
-def _by_columns(value: Any) -> Any:
+def _to_columns(value: Any) -> Any:
+    """Return a JSON value with all its tables stored by columns."""
     if isinstance(value, Mapping):
-        return {key: _by_columns(entry) for key, entry in value.items()}
+        return {key: _to_columns(entry) for key, entry in value.items()}
     if not isinstance(value, (list, tuple)):
         return value
     if len(value) > 1 and all(isinstance(row, Mapping) and row for row in value):
@@ -106,103 +114,110 @@ def _by_columns(value: Any) -> Any:
             columns = {name: [row[name] for row in value] for name in names}
             constant = {name for name, entries in columns.items() if _is_constant(entries)}
             if len(constant) < len(names):  # the length of a column is the number of rows
-                values = {name: each[0] if name in constant else _pack_column(each) for name, each in columns.items()}
-                return {COLUMNS: values}
-    return [_by_columns(entry) for entry in value]
+                stored = {
+                    name: entries[0] if name in constant else _pack_column(entries) for name, entries in columns.items()
+                }
+                return {COLUMNS: stored}
+    return [_to_columns(entry) for entry in value]
 
 
 def _pack_column(entries: list[Any]) -> Any:
-    """Return a column as stored: texts that repeat are stored once, and their numbers in each row."""
+    """Return a column as stored: texts that repeat are stored once, with their indices in each row."""
     if not all(isinstance(entry, str) for entry in entries) or len(texts := dict.fromkeys(entries)) > len(entries) / 4:
-        return _by_columns(entries)
-    numbers = {text: number for number, text in enumerate(texts)}
-    return {TEXTS: [*texts], "rows": [numbers[entry] for entry in entries]}
+        return _to_columns(entries)
+    indices = {text: index for index, text in enumerate(texts)}
+    return {TEXTS: [*texts], "rows": [indices[entry] for entry in entries]}
 
 
 def _unpack_column(stored: Any) -> Any:
     if isinstance(stored, dict) and TEXTS in stored:
-        return [stored[TEXTS][number] for number in stored["rows"]]
-    return _by_rows(stored)
+        return [stored[TEXTS][index] for index in stored["rows"]]
+    return _to_rows(stored)
 
 
 def _is_constant(entries: list[Any]) -> bool:
-    """Return whether all rows have the same number or text; 1, 1.0 and true differ."""
+    """Return whether all entries are the same number or text; 1, 1.0 and true differ."""
     is_plain = not isinstance(entries[0], (Mapping, list, tuple))
     return is_plain and len({(type(entry), str(entry)) for entry in entries}) == 1
 
 
-def _by_rows(value: Any) -> Any:
+def _to_rows(value: Any) -> Any:
+    """Return a stored JSON value with all its tables as lists of rows."""
     if isinstance(value, list):
-        return [_by_rows(entry) for entry in value]
+        return [_to_rows(entry) for entry in value]
     if not isinstance(value, dict):
         return value
     if list(value) != [COLUMNS]:
-        return {key: _by_rows(entry) for key, entry in value.items()}
+        return {key: _to_rows(entry) for key, entry in value.items()}
     columns = {name: _unpack_column(entry) for name, entry in value[COLUMNS].items()}
-    rows = max(len(entries) for entries in columns.values() if isinstance(entries, list))
-    full_columns = (entries if isinstance(entries, list) else [entries] * rows for entries in columns.values())
+    row_count = max(len(entries) for entries in columns.values() if isinstance(entries, list))
+    full_columns = (entries if isinstance(entries, list) else [entries] * row_count for entries in columns.values())
     return [dict(zip(columns, row, strict=True)) for row in zip(*full_columns, strict=True)]
 
 
 def measure_parts(folder: Path, parts: Mapping[str, StudyPart], workers: int) -> dict[str, Any]:
-    """Return the results of all parts; those without a current file `folder/NAME.json` are measured and written.
+    """Return the results of all parts; measure and write those without a current file `folder/NAME.json`.
 
-    Parts NAME/ENTRY are returned as one part NAME: their rows if they are lists, else an object by entry.
+    Parts NAME/ENTRY are returned as one part NAME: their rows in one list if they are lists, else an object by entry.
     """
     stamps = {name: _stamp(part) for name, part in parts.items()}
     files = {name: folder / f"{name}.json" for name in parts}
 
-    def stored_part(name: str) -> dict[str, Any]:
+    def read_stored(name: str) -> dict[str, Any]:
         with suppress(InputError):  # a damaged part is measured again
             return read_json_object(files[name]) if files[name].is_file() else {}
         return {}
 
-    def save_part(name: str, result: Any) -> None:
+    def save_result(name: str, result: Any) -> None:
         make_folder(files[name].parent)
         atomic_write(files[name], to_json({"stamp": stamps[name], "result": result}))
 
-    missing = {name: part for name, part in parts.items() if stored_part(name).get("stamp") != stamps[name]}
-    count = max(1, min(workers, len(missing)))
-    if count == 1:
+    missing = {name: part for name, part in parts.items() if read_stored(name).get("stamp") != stamps[name]}
+    processes = max(1, min(workers, len(missing)))
+    if processes == 1:
         for name, (function, arguments) in missing.items():
-            save_part(name, function(*arguments, workers))
+            save_result(name, function(*arguments, workers))
     else:
-        # Spawned processes: a forked one would inherit the locks of torch's threads without the threads.
-        context, share = multiprocessing.get_context("spawn"), max(1, workers // count)
-        absolute = filter(os.path.isabs, sys.path)  # in a notebook it holds the working folder
-        others = set(multiprocessing.active_children())
-        new_pool = ProcessPoolExecutor(count, context, initialize_pool_process, (os.getpid(),))
-        with isolated_start(absolute), new_pool as pool:
+        # Forked processes would inherit the locks of torch's threads without the threads.
+        context, workers_per_part = multiprocessing.get_context("spawn"), max(1, workers // processes)
+        import_folders = filter(os.path.isabs, sys.path)  # without the working folder, which a notebook has there
+        other_children = set(multiprocessing.active_children())
+        new_pool = ProcessPoolExecutor(processes, context, initialize_pool_process, (os.getpid(),))
+        with isolated_start(import_folders), new_pool as pool:
             try:
-                running = {pool.submit(function, *given, share): name for name, (function, given) in missing.items()}
-                for done in as_completed(running):
-                    save_part(running[done], done.result())
+                names = {
+                    pool.submit(function, *arguments, workers_per_part): name
+                    for name, (function, arguments) in missing.items()
+                }
+                for future in as_completed(names):
+                    save_result(names[future], future.result())
             except BaseException:  # the pool would wait for its processes
-                for process in set(multiprocessing.active_children()) - others:
+                for process in set(multiprocessing.active_children()) - other_children:
                     process.terminate()
                 raise
-    measured: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name in parts:
-        (part, _, entry), result = name.partition("/"), stored_part(name)["result"]
+        (part, _, entry), result = name.partition("/"), read_stored(name)["result"]
         if not entry:
-            measured[part] = result
+            results[part] = result
         elif isinstance(result, list):
-            measured.setdefault(part, []).extend(result)
+            results.setdefault(part, []).extend(result)
         else:
-            measured.setdefault(part, {})[entry] = result
-    return measured
+            results.setdefault(part, {})[entry] = result
+    return results
 
 
 def _stamp(part: StudyPart) -> str:
-    """Return a text that changes with the arguments of a part, and with the controllers that they name."""
+    """Return a hash of the function and arguments of a part, and of the controllers that these name."""
     return sha256_of(repr(_describe(part)).encode())[:12]
 
 
 def _describe(value: Any) -> Any:
+    """Return a value whose text is the same in each process, with a hash for each controller."""
     if isinstance(value, str | Path):
         return str(value), controller_hash(str(value))
     if isinstance(value, Mapping):
         return [(key, _describe(entry)) for key, entry in value.items()]
     if isinstance(value, list | tuple):
         return list(map(_describe, value))
-    return value.__qualname__ if callable(value) else value  # the text of a function has its address
+    return value.__qualname__ if callable(value) else value  # repr(function) contains an address

@@ -50,7 +50,7 @@ UNFILTERED_STUDIES = {
     "theory-unfiltered": theory_study(f"{THEORY_TITLE}, without the safety filter", RING, (RING, FIGURE_EIGHT)),
     "figure-10-unfiltered": FIGURE_10_UNFILTERED,
 }
-"""the tables and figures of the paper without the safety filter, which it does not have; merges never have it"""
+"""studies of the tables and figures without the safety filter, as in the paper; merges never have a filter"""
 PAPER_EXACT_STUDIES = {
     **{f"to-the-letter-{road}": paper_exact_study(UNFILTERED_ROADS.get(road, road)) for road in PAPER_ROADS},
     **{f"to-the-letter-{road}-filtered": paper_exact_study(road) for road in ("ring", "figure-eight")},
@@ -140,4 +140,4 @@ STUDY_GROUPS: dict[str, tuple[str, ...]] = {
     "unfiltered": tuple(UNFILTERED_STUDIES),
     "all": tuple(STUDIES),
 }
-"""names for one study or several; a figure is drawn with the table of the same trainings"""
+"""names of groups of studies, and other names of a study; figures 4 and 7 are drawn with tables 1 and 2"""

@@ -36,7 +36,7 @@ from unjam_paper.results_file import CONTROLLERS, StudyPart, measure_parts, writ
 from unjam_paper.variants import VARIANTS
 
 IDEAL_CAVS: dict[str, Any] = {"scenario_options.actuator": NO_LATENCY}
-"""as in the paper, CAVs obey at once"""
+"""settings of CAVs that carry out commands at once, as in the paper"""
 STUDY_ROADS: dict[str, dict[str, Any]] = {
     **{name: {"scenario": name, **IDEAL_CAVS} for name in ("ring", "ring-jammed", "figure-eight", "merge")},
     "on-ramp": {"scenario": "on-ramp", "scenario_options.penetration_rate": 0.05},
@@ -45,18 +45,19 @@ STUDY_ROADS: dict[str, dict[str, Any]] = {
     "ring-11": {"scenario": "ring", "scenario_options.vehicles": 11, **IDEAL_CAVS},
     "ring-5": {"scenario": "ring", "scenario_options.vehicles": 5, **IDEAL_CAVS},
 }
+"""changes to the default run configuration, by name of the road"""
 UNFILTERED_ROADS = {road: f"{road}-unfiltered" for road in ("ring", "figure-eight", "ring-11", "ring-5")}
-"""roads as in the paper, without the safety filter, by the road with it; the merge never has one"""
+"""roads without the safety filter, as in the paper, by the name of the road with it; the merge has no filter"""
 UNSCALED_NOISE_ROAD = "ring-unfiltered-unscaled-noise"
-"""... and with the noise of Table B1 in each step, not times the square root of the step as in Flow"""
+"""the same ring with the noise of Table B1 in each step; Flow multiplies it by the square root of the step"""
 NO_FILTER = {"scenario_options.safety.active": False}
 STUDY_ROADS |= {name: STUDY_ROADS[road] | NO_FILTER for road, name in UNFILTERED_ROADS.items()}
 STUDY_ROADS[UNSCALED_NOISE_ROAD] = {**STUDY_ROADS[UNFILTERED_ROADS["ring"]], "scenario_options.noise_scaling": "none"}
-ORIGINAL_ROADS = {**{each: road for road, each in UNFILTERED_ROADS.items()}, UNSCALED_NOISE_ROAD: "ring"}
-"""the road with the filter, by its version without"""
+FILTERED_ROADS = {**{unfiltered: road for road, unfiltered in UNFILTERED_ROADS.items()}, UNSCALED_NOISE_ROAD: "ring"}
+"""roads with the safety filter, by the name of the road without it"""
 PAPER_ROADS = ("ring", "figure-eight", "merge")
 FINAL_SHARE = 0.1
-"""share of the iterations at the end of a training, over which the convention of the paper averages"""
+"""share of the iterations, at the end of a training, over which the paper averages"""
 NO_VALUE_TEXT = "–"
 
 Table = list[dict[str, Any]]
@@ -82,7 +83,7 @@ class PlannedRun:
 
     @cached_property
     def config(self) -> RunConfig:
-        """Configuration with one worker and without baselines, which would be the same in all trainings."""
+        """Run configuration with one worker, without baselines: these would be the same in all trainings."""
         variant = VARIANTS[self.variant]
         changes = {**STUDY_ROADS[self.road], "seed": self.seed, "workers": 1, "evaluation.baselines": []}
         steps = {} if variant.steps is None else {"steps": variant.steps}
@@ -104,9 +105,9 @@ class TrainedRun:
     """metrics of the trained controller, deterministic, on test seeds"""
 
     def final_training_mean(self, name: str) -> float:
-        """Return the mean of a number of the training batches, exploration included, over the last tenth of them."""
-        last = self.progress[-ceil(FINAL_SHARE * len(self.progress)) :]
-        return float(np.mean([row[name] for row in last]))
+        """Return the mean of an entry of the progress, with exploration, over the last tenth of the iterations."""
+        last_rows = self.progress[-ceil(FINAL_SHARE * len(self.progress)) :]
+        return float(np.mean([row[name] for row in last_rows]))
 
     @property
     def seconds(self) -> float:
@@ -125,18 +126,18 @@ class StudyFolder:
         return self.folder / "runs" / run.name
 
     def controller_folder(self, run: PlannedRun) -> Path:
-        """Return the folder of its controller: that of the first road where one network drives several."""
+        """Return the folder of the controller of a training, or of its controller for the first of several roads."""
         return self.run_folder(run) / next(iter(run.config.task_configs()))
 
-    def copy_controllers(self, runs: Iterable[PlannedRun], study: Path) -> None:
+    def copy_controllers(self, runs: Iterable[PlannedRun], folder: Path) -> None:
         """Copy the controllers of trainings into the folder of a study, as controllers/VARIANT-SEED.unjam."""
         controllers = {f"{run.variant}-{run.seed}.unjam": self.controller_folder(run) / CONTROLLER_FILE for run in runs}
-        make_folder(study / CONTROLLERS)
-        for file in (study / CONTROLLERS).glob("*.unjam"):
+        make_folder(folder / CONTROLLERS)
+        for file in (folder / CONTROLLERS).glob("*.unjam"):
             if file.name not in controllers:  # more trainings were in the study before
                 remove(file)
         for name, controller in controllers.items():
-            atomic_write(study / CONTROLLERS / name, controller.read_bytes())
+            atomic_write(folder / CONTROLLERS / name, controller.read_bytes())
 
     def reference_folder(self, road: str) -> Path:
         """Return the folder with the evaluation of the reference drivers on a road."""
@@ -145,7 +146,7 @@ class StudyFolder:
     def is_finished(self, run: PlannedRun) -> bool:
         """Return whether a training with these settings is finished, and its controller is evaluated.
 
-        Raise `InputError` if its progress is cut, or if a controller is not the one that it trained.
+        Raise `InputError` if its progress has missing rows, or if a controller is not the one that it trained.
         """
         folder = self.run_folder(run)
         evaluated = [folder / road for road in run.config.task_configs()]
@@ -170,27 +171,27 @@ class StudyFolder:
 
 @dataclass(frozen=True)
 class Study:
-    """A study: which trainings it needs, what it measures and writes, and the tables of its page."""
+    """A study: the trainings that it needs, the parts that it measures, and the tables and figures of its page."""
 
     title: str
     make_runs: Callable[[int], list[PlannedRun]] = lambda seeds: []
     """returns the trainings for a number of seeds"""
     make_parts: Callable[[StudyFolder, int], dict[str, StudyPart]] = lambda study_folder, seeds: {}
-    """returns what can be measured with the results so far, by name of the part, or as PART/ENTRY; arguments: folder of
-    all studies, seeds"""
+    """returns the parts that can be measured with the results so far, by their name PART or PART/ENTRY; arguments:
+    folder of all studies, number of seeds"""
     write: Callable[[StudyFolder, int, Path], None] = lambda study_folder, seeds, folder: None
-    """writes parts that need no measurement, and figures of trainings; the last argument is the folder of this study"""
+    """writes parts that need no measurement, and figures of trainings; the last argument is the folder of the study"""
     roads: tuple[str, ...] = ()
     """roads on which the reference drivers are evaluated"""
     minutes: float = 0.0
-    """duration of `run` on two cores"""
+    """duration of `run` on two cores [min]"""
     tables: Mapping[str, Callable[[Path], pd.DataFrame]] = field(default_factory=dict)
     """tables of its page by name, made from its results"""
     figures: Mapping[str, Callable[[Path], Figure]] = field(default_factory=dict)
     """figures of its page by name, made from its results"""
 
     def run(self, study_folder: StudyFolder, seeds: int, folder: Path, workers: int) -> None:
-        """Measure parts without current results until there are no more, and write everything into `folder`."""
+        """Measure all parts without current results, some after others, and write parts, tables and figures."""
         parts: dict[str, StudyPart] = {}
         while (planned := self.make_parts(study_folder, seeds)) != parts:
             parts = planned
@@ -213,35 +214,35 @@ def _has_evaluation(folder: Path, config: RunConfig) -> bool:
 
 
 def write_manifest(folder: Path, **metadata: Any) -> None:
-    """Write the manifest of a study: that of its first call with this `metadata`, and all resumptions."""
+    """Write the manifest of a study with `metadata`; later calls keep the first manifest and add a resumption."""
     make_folder(folder)
-    about, file = manifest(), folder / "manifest.json"
-    about["command"] = strip_folders(about["command"])
+    content, file = manifest(), folder / "manifest.json"
+    content["command"] = strip_folders(content["command"])
     if file.is_file():
-        resumption = {name: about[name] for name in ("commit", "started")}
-        about = read_json_object(file)
-        about["resumptions"] = [*about.get("resumptions", []), resumption]
-    write_part(folder, "manifest", {**about, **metadata})
+        resumption = {key: content[key] for key in ("commit", "started")}
+        content = read_json_object(file)
+        content["resumptions"] = [*content.get("resumptions", []), resumption]
+    write_part(folder, "manifest", {**content, **metadata})
 
 
 def measure_tasks(
     tasks: Sequence[EpisodeTask], workers: int, make_row: Callable[[int, Episode, dict[str, Any]], dict[str, Any]]
 ) -> Table:
-    """Return a row for each task, made from its number, episode and metrics; raise the first failure."""
+    """Return a row for each task, made from its index, episode and metrics; raise the error of the first failed one."""
 
-    def measured_row(number: int, episode: Episode) -> dict[str, Any]:
+    def measure_row(index: int, episode: Episode) -> dict[str, Any]:
         metrics = measure(episode)
         raise_failure([metrics])
-        return make_row(number, episode, metrics)
+        return make_row(index, episode, metrics)
 
     with WorkerPool(workers) as pool:
-        return pool.run_and_map(tasks, measured_row)
+        return pool.run_and_map(tasks, measure_row)
 
 
 def evaluate_drivers(
     scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, workers: int
 ) -> dict[str, Table]:
-    """Return the rows of drivers on the same test seeds, by label."""
+    """Return the metrics of drivers on the same test seeds, by label."""
     with WorkerPool(workers) as pool:
         evaluation = evaluate(scenario, make_drivers(scenario, drivers), held_out_seeds(seeds), pool)
     raise_failures(evaluation)
@@ -259,42 +260,42 @@ def make_drivers(scenario: Scenario, drivers: Mapping[str, DriverSource]) -> dic
 def evaluate_metrics(
     scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, metrics: Sequence[str], workers: int
 ) -> dict[str, Any]:
-    """Return the verdict on each driver, relative to `human`, and these metrics of its episodes on test seeds."""
-    return _metrics_of(evaluate_drivers(scenario, drivers, seeds, workers), metrics)
+    """Return the feasibility of each driver, relative to `human`, and metrics of its episodes on test seeds."""
+    return _results_by_driver(evaluate_drivers(scenario, drivers, seeds, workers), metrics)
 
 
 def evaluate_in_batches(
     scenario: Scenario, drivers: Mapping[str, DriverSource], seeds: int, metrics: Sequence[str], workers: int
 ) -> dict[str, Any]:
-    """Return the result of `evaluate_metrics` without fuel, from batches: their episodes equal those of SUMO."""
+    """Return the same as `evaluate_metrics`, except fuel, from batches: their episodes equal those of SUMO."""
     test_seeds = held_out_seeds(seeds)
     rows = {
         label: [*map(measure, run_batches([EpisodeTask(scenario, driver, seed) for seed in test_seeds]))]
         for label, driver in make_drivers(scenario, drivers).items()
     }
-    return _metrics_of(rows, metrics)
+    return _results_by_driver(rows, metrics)
 
 
-def _metrics_of(rows: dict[str, Table], metrics: Sequence[str]) -> dict[str, Any]:
+def _results_by_driver(rows: dict[str, Table], metrics: Sequence[str]) -> dict[str, Any]:
     verdicts = feasibility_by_driver(rows)
     return {
-        label: {"feasibility": verdicts[label], "episodes": [{name: row[name] for name in metrics} for row in own]}
-        for label, own in rows.items()
+        label: {"feasibility": verdicts[label], "episodes": [{name: row[name] for name in metrics} for row in episodes]}
+        for label, episodes in rows.items()
     }
 
 
 @dataclass(frozen=True)
 class DriverComparison:
-    """What `evaluate_metrics` returned for the same drivers on one or several roads."""
+    """Results of the same drivers on one or several roads, each as `evaluate_metrics` returns them."""
 
     roads: Sequence[Mapping[str, Any]]
 
     def groups(self, trainings: Mapping[str, str]) -> dict[str, list[str]]:
-        """Return the drivers of each row of a table: all `trainings`, PREFIX SEED, in one with a name, others alone."""
+        """Return the drivers by table row: drivers PREFIX SEED share one, which `trainings` names by the prefix."""
         groups = {label: [label] for label in self.roads[0] if label.rpartition(" ")[0] not in trainings}
         for prefix, name in trainings.items():
-            own = [label for label in self.roads[0] if label.rpartition(" ")[0] == prefix]
-            groups |= {f"{name}, {len(own)} trainings": own} if own else {}
+            labels = [label for label in self.roads[0] if label.rpartition(" ")[0] == prefix]
+            groups |= {f"{name}, {len(labels)} trainings": labels} if labels else {}
         return groups
 
     def values(self, labels: Sequence[str], metric: str) -> Floats:
@@ -315,12 +316,12 @@ class DriverComparison:
         return estimate_text(estimate_on_shared_seeds(values), digits, "+")
 
     def min_time_gap(self, labels: Sequence[str]) -> str:
-        """Return the minimum time gap of all episodes; a dash if no vehicle was faster than 1 m/s."""
+        """Return the minimum time gap of all episodes as text; a dash if no vehicle was faster than 1 m/s."""
         minimum = np.nanmin(self.values(labels, "min_time_gap"), initial=inf)
         return NO_VALUE_TEXT if minimum == inf else f"{minimum:.2f}"
 
     def verdicts(self, labels: Sequence[str]) -> list[str]:
-        """Return the verdicts on drivers on all roads."""
+        """Return the feasibility of drivers on all roads."""
         return [road[label]["feasibility"] for label in labels for road in self.roads]
 
     def feasibility(self, labels: Sequence[str]) -> str:
@@ -330,36 +331,36 @@ class DriverComparison:
 
 
 def group_rows(rows: Table, name: str) -> dict[Any, Table]:
-    """Return the rows by the value of an entry."""
+    """Return the rows grouped by the value of their entry `name`."""
     groups: dict[Any, Table] = {}
     for row in rows:
         groups.setdefault(row[name], []).append(row)
     return groups
 
 
-def estimate_text(found: Estimate | None, digits: int, sign: str = "") -> str:
-    """Return a mean with its 95 % CI or range; a dash without values."""
-    return NO_VALUE_TEXT if found is None else str(estimate_cell(found, digits, sign=sign))
+def estimate_text(value: Estimate | None, digits: int, sign: str = "") -> str:
+    """Return a mean with its 95 % CI or range as text; a dash for None."""
+    return NO_VALUE_TEXT if value is None else str(estimate_cell(value, digits, sign=sign))
 
 
 def mean_text(values: Sequence[float] | Floats, digits: int, sign: str = "") -> str:
-    """Return the mean of independent values with its 95 % CI."""
+    """Return the mean of independent values with its 95 % CI as text."""
     return estimate_text(estimate(np.ravel(values).tolist()), digits, sign)
 
 
 def trainings_text(values: Sequence[float] | Floats, digits: int, sign: str = "") -> str:
-    """Return the mean of one number per training with its 95 % CI or range; a dash without values."""
+    """Return the mean of one value per training with its 95 % CI or range as text; a dash without values."""
     return estimate_text(estimate_over_trainings(list(values)), digits, sign)
 
 
 def number_text(value: float | None, digits: int, sign: str = "") -> str:
-    """Return a number as pages show it; a dash where there is none."""
+    """Return a number as text; a dash for None."""
     return NO_VALUE_TEXT if value is None else f"{value:{sign}.{digits}f}"
 
 
 def interval_text(entries: Mapping[str, Any], digits: int, sign: str = "") -> str:
-    """Return an estimate of a results file as pages show it: with its 95 % CI, else with the range if it is known."""
+    """Return a stored estimate as text, with its 95 % CI, or with its range if it has no CI."""
     values: dict[str, Any] = {name: nan if value is None else value for name, value in entries.items()}
-    known = Estimate(**{each.name: values[each.name] for each in fields(Estimate) if each.name in values})
-    ci = format_ci(known, f"{sign}.{digits}f")
-    return with_no_break_spaces(f"{number_text(known.mean, digits, sign)} {ci}".strip())
+    stored = Estimate(**{field.name: values[field.name] for field in fields(Estimate) if field.name in values})
+    ci = format_ci(stored, f"{sign}.{digits}f")
+    return with_no_break_spaces(f"{number_text(stored.mean, digits, sign)} {ci}".strip())

@@ -6,25 +6,25 @@ from typing import Any
 from unjam.models.settings import ModelSettings
 
 STEP_BUDGET, MILLION_STEPS, PAPER_STEP_BUDGET = 300_000, 1_000_000, 4_000_000
-"""environment steps of a training; the larger budget where it takes less than an hour; those of the paper"""
+"""environment steps of a training: usually, where a million takes less than an hour, and in the authors' code"""
 RINGS_EXPERT, SHARED_RINGS_EXPERT = "unjam:rings-tuned", "unjam:shared-rings-tuned"
 """best experts for all rings of the family, and for rings that several CAVs share"""
 JAMMED_IDEAL: dict[str, Any] = {
     "expert": "unjam:ring-jammed-tuned-ideal",
     **{"policy.exploration_std": 0.013, "trpo.target_kl": 0.0086},
 }
-"""expert and exploration for ideal cars on the jammed ring, as changes to `best`, which has those for usual cars"""
+"""changes to the preset `best`, which is for usual cars, for ideal cars on the jammed ring"""
 ON_RAMP_JAM_AHEAD = (
     "jam-ahead:first_section=3,last_section=4,speed_margin=-1.536,margin_by_penetration=19.83,min_speed=2.568,"
     "max_deceleration=1.106,time_constant=1.681"
 )
 """result of `unjam tune on-ramp --expert jam-ahead --set penetration_rate=0.05 --steps 4608000`, mostly in batches;
-with 710,400 steps, all in SUMO, it is `unjam:on-ramp-tuned`"""
+the result of 710,400 steps, all in SUMO, is `unjam:on-ramp-tuned`"""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A way to train, as changes to a preset."""
+    """A variant of training: a preset, and changes to it."""
 
     label: str
     preset: str
@@ -32,17 +32,18 @@ class Variant:
     steps: int | None = STEP_BUDGET
     """None: the steps of the preset"""
     paper_variant: str = ""
-    """the variant with the numbers of the paper, if it has another name here"""
+    """name of the variant in the tables of the paper; empty: the name of this variant"""
 
 
 def reduced_step_variants(
     prefix: str, batch_steps: int, steps: int, horizon: int = 3000, **common: Any
 ) -> dict[str, Variant]:
-    """Return `best` with an eighth of the steps of a road: alone, with twice as many, and with a model of the road.
+    """Return variants of `best` with few steps, with twice as many, and with few steps and a model of the road.
 
-    With the model, seven eighths of each iteration are episodes of `horizon` control steps in it.
+    With the model, seven eighths of each iteration are model steps, in episodes of `horizon` control steps.
     """
-    few, double = ({"backend": "batch", **common, "trpo.steps_per_iteration": times * batch_steps} for times in (1, 2))
+    few = {"backend": "batch", **common, "trpo.steps_per_iteration": batch_steps}
+    double = {**few, "trpo.steps_per_iteration": 2 * batch_steps}
     model = {"model.model_ratio": 7.0, "model.kind": "road", "model.rollout_starts": "first", "model.k_max": horizon}
     return {
         f"{prefix}-few": Variant("unjam residual, few steps", "best", few, steps),
@@ -58,20 +59,20 @@ WRONG_BASES: dict[str, tuple[str, dict[str, Any]]] = {
     "ovm": ("OVM", {"model.base": "ovm"}),
     "no-base": ("nothing", {"model.base": "none"}),
 }
-"""bases of the model of the whole ring that are not the simulator's human drivers, which keep 1 s and accelerate with
-1 m/s2, with labels; with the other parameters no waves arise"""
+"""labels and settings of bases of the road model that differ from the human drivers of the simulator, which have a time
+headway of 1 s and accelerate with 1 m/s2; with the other IDM parameters no waves arise"""
 NO_MODEL = {
     **{f"model.{name}": getattr(ModelSettings, name) for name in ("kind", "rollout_starts", "k_max", "update_mode")},
     "model.model_ratio": 0.0,
 }
 WEAK_EXPERT = {"expert": "jam-ahead:speed_margin=2,margin_by_penetration=0", "backend": "sumo"}
-"""an expert without effect on the on-ramp: the tuned one leaves little to learn"""
+"""changes for an expert without effect on the on-ramp, since the tuned one leaves little to learn"""
 ON_RAMP_VARIANTS = reduced_step_variants("ramp", 9_600, 86_400, horizon=2400, **WEAK_EXPERT, **NO_MODEL)
 SMALL_ITERATIONS = {
     **ON_RAMP_VARIANTS["ramp-few"].changes,
     **{"trpo.steps_per_iteration": 4_800, "evaluation.validation_interval": 6},
 }
-"""twice as many updates from the same steps: as many as alternating updates make with three times their steps"""
+"""changes for twice as many updates with the same steps; alternating updates need three times the steps for them"""
 LONG_TRAINING = {
     **{"expert": ON_RAMP_JAM_AHEAD, "backend": "batch", "trpo.steps_per_iteration": 153_600, **NO_MODEL},
     **{"evaluation.validation_interval": 10, "evaluation.validation_episodes": 128},
@@ -79,7 +80,7 @@ LONG_TRAINING = {
 NO_EXPERT = {"expert": "none", "model.model_ratio": 0.0}
 NO_EARLY_STOPPING = {"evaluation.convergence_window": 0}
 TWO_EPISODES_PER_ROAD = {"evaluation.episodes": 2}
-"""the studies themselves evaluate on all roads, training roads and unseen roads"""
+"""few, since the studies evaluate the controllers again, on training roads and unseen roads"""
 FROM_SCRATCH = {
     **{"expert": "none", "policy.exploration_std": 0.5, **TWO_EPISODES_PER_ROAD},
     **{f"{agent}.steps_per_iteration": 60_000 for agent in ("trpo", "ppo")},
@@ -87,11 +88,12 @@ FROM_SCRATCH = {
     **{"trpo.target_kl": 0.01, "ppo.epochs": 20},
     **{"evaluation.validation_interval": 5, "evaluation.validation_episodes": 4},
 }
-"""learning without an expert on many roads: with the small exploration noise of a residual, CAVs learn to stand"""
+"""changes for learning without an expert on many roads; with the exploration of a residual, CAVs learn to stand"""
 EXACT_VERSIONS: tuple[tuple[str, dict[str, Any], int], ...] = (
     *(("", {}, PAPER_STEP_BUDGET), ("-filtered", {"scenario_options.safety.active": True}, PAPER_STEP_BUDGET)),
     ("-million", {}, MILLION_STEPS),
 )
+"""variants with the exact settings of the paper: suffix of the name, changes and environment steps"""
 EXACT_TRPO = {**NO_EXPERT, **NO_EARLY_STOPPING}
 PPO_AGENT, SAC_AGENT = {"agent": "ppo"}, {"agent": "sac"}
 VARIANTS: dict[str, Variant] = {
@@ -109,9 +111,9 @@ VARIANTS: dict[str, Variant] = {
     "proposed-eq16": Variant("proposed, Eq. 16 as meant", "paper", {"reward": "eq16"}),
     "proposed-as-printed": Variant("proposed, Eq. 16 as printed", "paper", {"reward": "eq16-as-printed"}),
     **{
-        f"{name}-exact{suffix}": Variant(label, "paper-exact", {**own, **filtered}, steps, name)
-        for suffix, filtered, steps in EXACT_VERSIONS
-        for name, label, own in (("trpo", "TRPO", EXACT_TRPO), ("proposed", "proposed", NO_EARLY_STOPPING))
+        f"{name}-exact{suffix}": Variant(label, "paper-exact", {**changes, **filter_changes}, steps, name)
+        for suffix, filter_changes, steps in EXACT_VERSIONS
+        for name, label, changes in (("trpo", "TRPO", EXACT_TRPO), ("proposed", "proposed", NO_EARLY_STOPPING))
     },
     "ours": Variant("unjam residual", "quick", {}),
     "ours-without-model": Variant("unjam residual without model", "quick", {"model.model_ratio": 0.0}),
@@ -148,7 +150,7 @@ REFERENCE_DRIVERS: dict[str, str] = {
     "jam absorber": "jam-absorber",
     "closing jam absorber": "jam-absorber:gap_gain=0,extra_acceleration=0.9,speed_gain=0.8",
 }
-"""drivers of all roads: label, and name as in `unjam drive`; the last one is the best expert on the merge"""
+"""drivers for all roads: names as in `unjam drive`, by label; the last one is the best expert on the merge"""
 TUNED_REFERENCES: dict[str, dict[str, str]] = {
     "ring": {"tuned PI": "unjam:ring-tuned", "tuned gap PI": "unjam:ring-gap-tuned"},
     "ring-jammed": {"tuned gap PI": "unjam:ring-jammed-tuned-ideal"},

@@ -11,7 +11,7 @@ from unjam.road_family import FAMILY
 from unjam_paper.all_roads import (
     FAMILY_DRIVERS,
     SINGLE_CONTROLLERS,
-    TWO_LAWS_LABEL,
+    TWO_FORMULAS_LABEL,
     UNSEEN_PARTS,
     all_drivers_table,
     all_roads_figure,
@@ -39,7 +39,7 @@ def test_each_road_has_a_row_followed_by_mean_and_worst() -> None:
 def test_each_driver_has_mean_gains_and_the_difference_to_the_first() -> None:
     table = all_drivers_table(RESULTS).set_index("")
     first, *others = FAMILY_DRIVERS
-    assert list(table.index) == [first, TWO_LAWS_LABEL, *others]
+    assert list(table.index) == [first, TWO_FORMULAS_LABEL, *others]
     for heading, parts in {"training": ("training",), "unseen": UNSEEN_PARTS}.items():
         by_road = all_roads_table(parts, RESULTS).set_index("road")
         for label in SINGLE_CONTROLLERS:
@@ -58,7 +58,7 @@ def test_the_combination_of_two_controllers_has_the_gain_of_each_on_its_road_typ
         own["jam-ahead, tuned on all roads" if name.startswith("on-ramp") else "PI, tuned on all roads"].mean()
         for name, own in gains.items()
     ) / len(gains)
-    assert float(table.loc[TWO_LAWS_LABEL, "training"].split()[0]) == pytest.approx(mean, abs=0.005)
+    assert float(table.loc[TWO_FORMULAS_LABEL, "training"].split()[0]) == pytest.approx(mean, abs=0.005)
 
 
 def test_the_gain_of_the_best_expert_is_one() -> None:

@@ -122,7 +122,7 @@ def certify_command(
     if settings and not is_packaged:
         raise invalid_value("set", settings[0], "a packaged controller, or a file of unjam export --set")
     changes = parse_settings(settings)
-    controller = _read_with_filter(str(file), changes) if is_packaged else read_controller(file)
+    controller = _read_packaged_for_car(str(file), changes) if is_packaged else read_controller(file)
     check_controller(file, "certify")
     file = controller_file(file)
     target = out or (Path(file.name) if is_packaged else file).with_suffix(".html")
@@ -159,7 +159,7 @@ def certify_command(
     err_console.print(f"page: {target}")
 
 
-def _read_with_filter(name: str, settings: dict[str, Any]) -> Controller:
+def _read_packaged_for_car(name: str, settings: dict[str, Any]) -> Controller:
     """Return a packaged controller with the safety filter of its road, for the car of this road, and a sample of it."""
     controller = read_controller(Path(name))
     recipe = controller.manifest.get("scenario")

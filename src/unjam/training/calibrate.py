@@ -302,12 +302,12 @@ def calibrate(
         study.tell(proposal, trial.score, state=TrialState.FAIL if trial.score is None else None)
         text = trial.failure if trial.score is None else f"{trial.score:.4g}"
         on_message(f"{number} of {trials}: {_factor_text(trial.factors)}: {text}")
-    ranked = sorted((trial for trial in results if trial.score is not None), key=_ranking_score)
+    ranked = sorted((trial for trial in results if trial.score is not None), key=_score_or_infinity)
     finalists = [
         score_factors(trial.factors, seeds_per_trial, 2 * seeds_per_trial)
         for trial in (*ranked[:CALIBRATION_FINALISTS], original_trial)
     ]
-    best = min(finalists, key=_ranking_score).factors
+    best = min(finalists, key=_score_or_infinity).factors
     on_message(f"evaluating on {CALIBRATION_TEST_SEEDS} test seeds: {_factor_text(best)}")
     test_seeds = held_out_seeds(CALIBRATION_TEST_SEEDS)
     original_rows, calibrated_rows = (simulate(factors, test_seeds) for factors in (original, best))
@@ -339,7 +339,8 @@ def calibration_document(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def _ranking_score(trial: CalibrationTrial) -> float:
+def _score_or_infinity(trial: CalibrationTrial) -> float:
+    """Return the score of a trial, of which smaller ones are better; infinity for a failed trial."""
     return inf if trial.score is None else trial.score
 
 

@@ -220,8 +220,8 @@ def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
 def resume_run_folder(folder: Path, config: RunConfig) -> None:
     """Write the steps and workers of `config` into the run in `folder`.
 
-    Raise `InputError` if another setting differs, if the steps are not possible, for the folder of a task, or if the run
-    has lost its checkpoints.
+    Raise `InputError` if another setting differs, if the steps are not possible, for the folder of a task, or if the
+    run has lost its checkpoints.
     """
     parent = folder.absolute().parent
     if folder.name in _task_names(parent):

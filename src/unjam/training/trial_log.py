@@ -19,7 +19,7 @@ FILES_PREFIX = "files."  # of the keys of hashes of files in a flat request
 VERSIONED_PACKAGES = ("eclipse-sumo", "libsumo")
 """packages of which, as of unjam, all rows of a log have the same version"""
 
-TrialVerdict = tuple[float | None, str]
+TrialScore = tuple[float | None, str]
 """score and reason; no score if the trial does not count"""
 
 
@@ -87,7 +87,7 @@ class TrialLog(RowLog):
     def __init__(self, folder: Path, request: dict[str, Any]) -> None:
         """Begin or resume as `RowLog`."""
         super().__init__(folder, request, TRIALS_FILE)
-        self.verdicts: dict[tuple[int, str], TrialVerdict] = {}
+        self.verdicts: dict[tuple[int, str], TrialScore] = {}
         """verdicts by first seed and driver, without damaged rows"""
         for row in self.rows:
             with suppress(KeyError, TypeError):
@@ -96,7 +96,7 @@ class TrialLog(RowLog):
                 if (score is None or is_number) and isinstance(verdict, str):
                     self.verdicts[row["first_seed"], row["driver"]] = score, verdict
 
-    def add(self, first_seed: int, driver: str, verdict: TrialVerdict) -> None:
+    def add(self, first_seed: int, driver: str, verdict: TrialScore) -> None:
         """Add a verdict; it is on the disk when this returns."""
         self.verdicts[first_seed, driver] = verdict
         self.append({"first_seed": first_seed, "driver": driver, "score": verdict[0], "verdict": verdict[1]})

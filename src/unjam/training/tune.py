@@ -34,7 +34,7 @@ from unjam.training.fingerprint import file_hashes
 from unjam.training.run_folder import controller_origin
 from unjam.training.search_space import SearchSpace, tunable_parameters
 from unjam.training.string_limit import find_operating_points
-from unjam.training.trial_log import TrialLog, TrialVerdict, TuningTrial
+from unjam.training.trial_log import TrialLog, TrialScore, TuningTrial
 from unjam.worlds.backend import check_support, open_backend
 from unjam.worlds.batch.run import run_batch, run_batches
 from unjam.worlds.batch.support import required_batch_kind, statistically_unsupported_reason, unsupported_reason
@@ -209,7 +209,7 @@ def tune(
         settings: list[dict[str, Any]], first: int, count: int, runners: Mapping[str, TuningRunner]
     ) -> list[TuningTrial]:
         drivers = [label_with_parameters(expert, values) for values in settings]
-        scores: dict[str, TrialVerdict] = {each: (None, why) for each in drivers if (why := invalid_reason(each))}
+        scores: dict[str, TrialScore] = {each: (None, why) for each in drivers if (why := invalid_reason(each))}
         new = [each for each in drivers if each not in scores and (first, each) not in log.verdicts]
         new = list(dict.fromkeys(new))
         for driver, rows in zip(new, _run_drivers(roads, new, first, count, (reward, backend), runners), strict=True):
@@ -315,7 +315,7 @@ def _run_in_batch(tasks: list[list[EpisodeTask]]) -> list[EpisodeRows]:
     return [[measure(next(episodes)) for _ in each] for each in tasks]
 
 
-def _score_rows(rows_by_road: Mapping[str, EpisodeRows], human_rows: Mapping[str, EpisodeRows]) -> TrialVerdict:
+def _score_rows(rows_by_road: Mapping[str, EpisodeRows], human_rows: Mapping[str, EpisodeRows]) -> TrialScore:
     if human_rows:
         gains = {
             road: normalized_gain(rows, human_rows[road], [performance_bound(row) for row in human_rows[road]]).mean
