@@ -30,7 +30,7 @@ KERNEL_SETTINGS = {
 }
 """NumPy's products and their cores, its functions, torch's functions, its products and long functions"""
 OLD_NUMPY_FEATURES = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
-"""the same for NumPy before 2.4"""
+"""names of these features in NumPy before 2.4"""
 KERNEL_LIBRARIES = ("numpy", "torch")
 
 

@@ -25,7 +25,7 @@ ReduceMean ReduceMin ReduceSum Relu Reshape Round ScatterElements Selu Shape Sig
 Softsign Split Sqrt Squeeze Sub Sum Tan Tanh ThresholdedRelu Transpose Unsqueeze Where
 """
 ALLOWED_OPERATORS = set(_OPERATORS.split())  # arithmetic, without subgraphs
-VALUE_FIELDS = {"INT": "i", "FLOAT": "f", "STRING": "s", "TENSOR": "t", "INTS": "ints"}  # by type of attribute
+VALUE_FIELDS = {"INT": "i", "FLOAT": "f", "STRING": "s", "TENSOR": "t", "INTS": "ints"}  # by attribute type
 REFUSED_ATTRIBUTES = {"value_string", "value_ints", "saturate", "round_mode"}  # no policy needs them
 TENSOR_KINDS = "double", "float", "int32", "int64"
 ALLOWED_FIELDS = {
@@ -47,9 +47,9 @@ TEXT_FIELDS = {"doc_string", "metadata_props", "model_version", "producer_name",
 EXPORT_NOTE = "the first axis is the row of the CAV"
 """part of the note in a graph that `unjam export` writes"""
 MAX_MODEL_BYTES = 64 * 2**20
-MAX_TENSOR_NUMBERS = MAX_MODEL_BYTES // 4  # of a constant
-MAX_TRIAL_SECONDS = 10.0  # of all trial runs of a model; a network of the usual size needs milliseconds
-MAX_RUN_BYTES = 256 * 2**20  # of all running models of this process
+MAX_TENSOR_NUMBERS = MAX_MODEL_BYTES // 4  # numbers in a constant
+MAX_TRIAL_SECONDS = 10.0  # duration of all trial runs of a model; usual networks need milliseconds
+MAX_RUN_BYTES = 256 * 2**20  # memory of all models that run in this process
 
 
 def parse_model(content: bytes) -> Any:

@@ -55,7 +55,7 @@ def _without_tuples(options: dict[str, Any]) -> dict[str, Any]:
 Options = Annotated[dict[str, Any], AfterValidator(_without_tuples)]  # arguments of a class, by name
 NumberOrRange = BeforeValidator(as_range)  # allows a single number for a parameter that is a range
 MAX_INTEGER_BITS, MAX_KEY_PARTS = 63, 100  # of an absolute value, and of a key between its dots
-CERTAIN_SIMILARITY = 0.8  # from which on a name in the body of a class is taken for a misspelt field
+CERTAIN_SIMILARITY = 0.8  # similarity from which a name in a class counts as a misspelt field
 _KEY_PART = r"""(?:[\w-]++|"(?:[^"\\\n]++|\\.)*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?<![\w\\-])(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS}}}")
 """without backtracking, and not from within a word, so that the time is proportional to the length of a text"""

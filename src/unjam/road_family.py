@@ -22,7 +22,7 @@ NGSIM_IDM = {
 }
 """the common IDM of the 325 drivers of the NGSIM pairs, results/field.json"""
 NO_LATENCY, LATENCY, LONG_LATENCY = {"lag": 0.0, "delay": 0.0}, {"lag": 0.3, "delay": 0.2}, {"lag": 0.5, "delay": 0.5}
-"""of actuators [s]: ideal vehicles, usual cars, slow ones"""
+"""lag and delay of actuators [s]: of ideal vehicles, usual cars and slow cars"""
 IDEAL_VEHICLES: dict[str, Any] = {"actuator": NO_LATENCY}
 """vehicles that obey at once: roads of the family keep them, except those with `delayed` or `delay` in their name"""
 SENSOR_ERRORS = {"gap_error": 0.5, "speed_error": 0.3}
@@ -95,7 +95,7 @@ FAMILY: dict[str, FamilyRoad] = {
         "on-ramp", {"penetration_rate": 0.1, "inflow": 2200.0, "ramps.0.inflow": 350.0, **ASTAZERO_DRIVERS}, "axis"
     ),
 }
-FAMILY_SCENARIOS = {f"{FAMILY_PREFIX}{name}": road for name, road in FAMILY.items()}  # by scenario
+FAMILY_SCENARIOS = {f"{FAMILY_PREFIX}{name}": road for name, road in FAMILY.items()}  # roads by name of their scenario
 GROUP_BY_SCENARIO = {"ring": "rings", "figure-eight": "figure-eights", "on-ramp": "motorways", "on-ramp-1": "motorways"}
 """group of roads of each scenario, for which one expert exists"""
 SHARED_RINGS_GROUP, ALL_ROADS_GROUP = "shared-rings", "all-roads"  # rings with several CAVs; all roads

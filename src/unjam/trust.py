@@ -19,7 +19,7 @@ TRUSTED_VARIABLE = "UNJAM_TRUSTED"  # keys of trusted code, in addition to the r
 TRUST_ALL = "all"
 TRUST_CODE_OPTION = "--trust-code"
 EXPECTED_CODE_VARIABLE = "UNJAM_EXPECTED_CODE"  # files and hashes of code at the check of a child's configuration
-MAX_NAMED_FILES = 1000  # that a text can name, whatever its separators mean
+MAX_NAMED_FILES = 1000  # files that a text can name, whatever its separators mean
 _lock = threading.Lock()
 _saved_values: list[str | None] = []
 """value of the variable before the first of the running blocks of `trusting_code`, for each of them"""

@@ -25,9 +25,9 @@ ISO_MEAN_SECONDS, LEADER_STOP_SECONDS = 2.0, 20.0
 """averaging time of accelerations in ISO 15622; simulated time after the start of a leader's emergency stop [s]"""
 ATTACK_SECONDS, ATTACK_STEP_SECONDS = 40.0, 1.0  # of an adversarial maneuver, and of each of its accelerations
 ATTACK_POPULATION, ATTACK_GENERATIONS, ATTACK_ELITES = 128, 16, 12  # of the cross-entropy method
-MAX_LEADER_ACCELERATION = 3.0  # of an adversarial leader [m/s2]
-MAX_SPEED = 100.0  # of a state [m/s]
-MAX_LOOP_LENGTH = 1e7  # of a state on a closed road, where a gap can be nearly as long [m]
+MAX_LEADER_ACCELERATION = 3.0  # largest acceleration of an adversarial leader [m/s2]
+MAX_SPEED = 100.0  # largest speed in a state [m/s]
+MAX_LOOP_LENGTH = 1e7  # length of a closed road: gaps can be nearly as long [m]
 MIN_MOVING_SPEED = 1.0  # speed above which time gaps are evaluated [m/s]
 
 

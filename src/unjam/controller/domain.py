@@ -19,8 +19,8 @@ from unjam.worlds.record import Episode
 IRRELEVANT_PARAMETERS = {
     *("horizon", "emission_class", "remember_warmup", "population", "recordings", "begin", "window", "platoon")
 }  # scenario parameters that do not make it another scenario
-KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")  # for descriptions
-MAX_LISTED_PARAMETERS = 3  # in a note
+KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")  # of scenarios, in descriptions
+MAX_LISTED_PARAMETERS = 3  # parameters that a note names
 SB3_SUFFIX = ".zip"  # end of the names of models of Stable-Baselines3
 OUTSIDE_DOMAIN_THRESHOLD = 0.05  # share of control steps from which a note reports it
 

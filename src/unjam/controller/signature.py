@@ -21,7 +21,7 @@ try:
 except ImportError as error:
     raise missing_package_error(error, "cryptography") from None
 
-MAX_KEY_BYTES = 10_000  # of a key file
+MAX_KEY_BYTES = 10_000  # largest size of a key file
 FIELD_PRIME = 2**255 - 19
 GROUP_ORDER = 2**252 + 27742317777372353535851937790883648493
 _ORDER_8 = 0x05FC536D880238B13933C6D305ACDFD5F098EFF289F4C345B027B2C28F95E826

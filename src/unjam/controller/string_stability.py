@@ -12,12 +12,14 @@ from unjam.physics.idm import IDMParameters, equilibrium_gap, idm_acceleration
 from unjam.worlds.drive import drive_world
 from unjam.worlds.world import CarFollowingWorld
 
-OSCILLATION_FREQUENCIES = np.geomspace(0.001, 1.0, 25)  # of leaders [Hz]: from waves of 17 minutes to sways of a second
-OSCILLATION_AMPLITUDE = 0.05  # as a share of the mean speed; small, so that the response is nearly linear
+OSCILLATION_FREQUENCIES = np.geomspace(
+    0.001, 1.0, 25
+)  # [Hz]: the leader's speed has periods from 17 minutes to a second
+OSCILLATION_AMPLITUDE = 0.05  # share of the mean speed; the response to such a small change is nearly linear
 SETTLING_SECONDS = 300.0  # time behind a leader with constant speed, before the oscillations start
 GAIN_TOLERANCE = 0.02  # a vehicle counts as string stable with gains up to one plus this tolerance
 OPERATING_SPEED_RATIOS = (0.5, 1.0, 1.5)  # shares of the mean speed of CAVs on their road
-MIN_OPERATING_SPEED = 1.0  # [m/s]
+MIN_OPERATING_SPEED = 1.0  # smallest speed of an operating point [m/s]
 MIN_SPEED_SHARE = 0.975
 """mean speed as a share of the leader's, below which a vehicle does not follow, but falls behind"""
 MAX_FOLLOWERS = 60  # human drivers behind a CAV

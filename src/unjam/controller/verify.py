@@ -27,10 +27,10 @@ from unjam.tree import leaves
 REPLAY_TOLERANCE = 1e-9  # allowed difference between recorded accelerations and those on this machine [m/s2]
 CERTIFICATE_TOLERANCE = 1e-6  # allowed difference between the numbers of a certificate and those on this machine
 GRAPH_TOLERANCE = 1e-6  # allowed difference between graph and driver [m/s2]
-BATCH_TOLERANCE = 1e-9  # between equal rows [m/s2]: rounding of matrix products depends on their size
+BATCH_TOLERANCE = 1e-9  # difference allowed between equal rows [m/s2]: matrix products round by their size
 ONNX_OPSET, ONNX_IR_VERSIONS = 20, range(10, 14)  # of graphs: version of the operators, versions of the format
 MAX_GRAPH_ROWS = 50  # CAVs in one run of a graph
-RANDOM_STATE_COUNT = 200  # to compare graph and driver, in addition to the maker's sample
+RANDOM_STATE_COUNT = 200  # random states on which graph and driver are compared, besides the maker's sample
 
 CheckStatus = Literal["checked", "absent", "stated", "not checked"]
 

@@ -99,7 +99,7 @@ class BCM(FormulaDriver):
     desired_speed_gain: NonNegative = 1.0
     """k_c [1/s]"""
     desired_speed: NonNegative = 8.0
-    """[m/s]"""
+    """speed on a free road [m/s]"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the bilateral acceleration."""
@@ -253,7 +253,7 @@ class Constant(FormulaDriver):
     name: ClassVar[str] = "constant"
 
     acceleration: float = 0.0
-    """[m/s2]"""
+    """commanded acceleration [m/s2]"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the constant."""

@@ -52,7 +52,7 @@ class Driver(Subclassable):
     name: ClassVar[str] = ""
     """name for `--driver`; empty for drivers without one"""
     own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True, needs_numpy=True)
-    """what it needs, without the drivers that it contains"""
+    """requirements of the class, without those of drivers that an object contains"""
     own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = ()
     """description of its own `memory_features`, in order"""
     portable_form: ClassVar[str] = "path.py:name, your class in a file"

@@ -61,9 +61,9 @@ class Feature:
     compute: Callable[[FeatureInputs], Array | None]
     """returns them, about unit size, shape (n, m); a tuple of m for plain numbers; None if there are none"""
     inputs: tuple[ScaledInput, ...] | None
-    """their description, in order; None: `Driver.memory_inputs` of the expert describes them"""
+    """descriptions of the columns, in order; None: `Driver.memory_inputs` of the expert describes them"""
     requirements: Requirements = NO_REQUIREMENTS
-    """what it needs of a road, and whether it takes plain numbers"""
+    """requirements of the feature on a road and on the type of its inputs"""
 
 
 def local_observation(state: LocalState) -> Array:
@@ -117,7 +117,7 @@ RELATIVE_SPEEDS = {"leader_relative_speed": "leader_speed", "follower_relative_s
 OPTIONAL_QUANTITIES = ("loop_length", "route_position")
 """quantities that are NaN on roads that do not have them"""
 UNIT_FACTORS = {"m/s": {"m/s": 1.0, "km/h": 3.6}}
-"""by SI unit, the allowed units with the number of them in one SI unit; otherwise only the SI unit itself"""
+"""allowed units by SI unit, each with its number in one SI unit; for others, only the SI unit is allowed"""
 
 
 def unit_factor(unit: str, si_unit: str) -> float:
@@ -148,7 +148,7 @@ class PolicyInput:
     """km/h instead of m/s; empty: the SI unit"""
     scale: Scale = 1.0
     offset: Number = 0.0
-    """in the unit"""
+    """value that is added, in the unit"""
     optional: bool = False
     """whether roads without it are allowed, where it is NaN: only for `loop_length` and `route_position`"""
     tensor: str = ""

@@ -35,7 +35,7 @@ class OnnxPolicy:
     columns: dict[str, tuple[int, ...]]  # columns of the observation, by input
     output: str
     memory: tuple[PolicyMemory, ...]
-    tensors: dict[str, Tensor]  # its inputs
+    tensors: dict[str, Tensor]  # inputs of the graph by name
     is_batched: bool  # whether the graph takes any number of rows; otherwise it runs once for each CAV
 
     def initial_memory(self, n: int) -> Memory:

@@ -37,7 +37,7 @@ class PolicyOutput:
     """km/h instead of m/s; empty: the SI unit"""
     scale: Scale = 1.0
     offset: Number = 0.0
-    """in the unit"""
+    """value that is added, in the unit"""
     limits: tuple[Number, Number] | None = None
     """lowest and highest value in the unit; those of an acceleration also limit the expert's and the sum"""
     tensor: str = ""

@@ -20,7 +20,7 @@ class RoadInterface(NamedTuple):
     provided_fields: frozenset[str]
     """optional fields of a `LocalState`"""
     control_step: float
-    """[s]"""
+    """time between two commands [s]"""
 
 
 class Requirements(NamedTuple):

@@ -211,7 +211,7 @@ class AdvisorySpeed(FormulaDriver):
     )
 
     advised_speed: Positive = 19.4
-    """[m/s]"""
+    """speed that is advised to all CAVs [m/s]"""
     first_distance: NonNegative = 1500.0
     """distance upstream of the merging section at which the section begins [m]"""
     last_distance: NonNegative = 0.0

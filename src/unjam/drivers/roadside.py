@@ -117,7 +117,7 @@ class MeasuredVehicles(NamedTuple):
     positions: Floats
     """along the road [m]"""
     speeds: Floats
-    """[m/s]"""
+    """mean speeds of the sections [m/s]"""
     are_cavs: NDArray[np.bool_]
     roads: Any = 0
     """index of the road"""

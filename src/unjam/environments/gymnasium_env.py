@@ -133,7 +133,7 @@ class RoadStepper:
             made = make_scenario(scenario, changes)
         self._base, self._changes = scenario, changes
         self.scenario = self.episode_scenario = made
-        """that of the constructor; `episode_scenario` is that of the last reset, with its options"""
+        """scenario of the constructor; `episode_scenario` is the scenario of the last reset, with its options"""
         self._watch = watch_files([made], scenario, backend)
         reward = reward or self.scenario.reward
         self.reward, self.has_user_reward = make_reward(reward), not is_packaged_reward(reward)

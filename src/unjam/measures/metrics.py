@@ -412,7 +412,7 @@ RECORDED_ROAD_METRICS = (
     *("min_time_gap", "time_behind_leader", "outflow_veh_per_h"),
     *("amplification", "amplification_long", "amplification_medium", "amplification_short"),
 )
-"""what environments measure of an episode behind a recorded vehicle"""
+"""metrics that environments report for an episode behind a recorded vehicle"""
 
 
 def measure(episode: Episode) -> dict[str, Any]:

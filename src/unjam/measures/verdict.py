@@ -51,7 +51,7 @@ RECORDED_ROAD = RoadMetrics(
     (POWER_FUEL_METRIC, FLOW_METRIC, LAG_METRIC),
 )
 PRICES = {FLOW_METRIC: "less flow", FUEL_METRIC: "more fuel by emission model"}
-"""what a verdict adds if it is shown besides a better metric; the second one where fuel by power decides"""
+"""worse metrics that a verdict names besides a better one; fuel by emission model only where fuel by power decides"""
 COMMON_METRICS = ("min_time_gap", "cav_max_braking", "human_max_braking", "collisions")
 
 

@@ -154,7 +154,7 @@ class OneStepErrors(NamedTuple):
     predictions: Floats
     """prediction of these errors by each member of the ensemble, shape (members, R, 6)"""
     change: Floats
-    """what is predicted: the change in the step, and the reward, shape (R, 6)"""
+    """targets of the prediction: the change in the step, and the reward, shape (R, 6)"""
 
     @property
     def model(self) -> Floats:

@@ -62,7 +62,7 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
         """the road with the IDM parameters of the base, which are calibrated if the settings ask for it"""
         self.data = EnvironmentData(settings.buffer_size, task.scenario.actuator, task.scenario.control_step)
         self.samples: list[EpisodeSamplesT] = []
-        """of the episodes in D_a, oldest first"""
+        """samples of the episodes in D_a, oldest first"""
         self.first_new_episode, self.new_steps = 0, 0
         """number of the first of the newest episodes, and control steps of all CAVs in them"""
         self.ensemble = self.new_ensemble()

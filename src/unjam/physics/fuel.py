@@ -15,7 +15,7 @@ JOULES_PER_KWH = 3.6e6
 class Car(NamedTuple):
     """What the fuel of a car depends on."""
 
-    mass: float = 1500.0  # with driver [kg]
+    mass: float = 1500.0  # mass with driver [kg]
     rolling_resistance: float = 0.015
     drag_area: float = 0.65  # drag coefficient times frontal area [m2]
     base_power: float = 3000.0  # power of engine and accessories at idle [W]: 0.9 l/h

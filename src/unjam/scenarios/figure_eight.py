@@ -14,7 +14,7 @@ from unjam.scenarios.road import ClosedRoad, Connection, Edge, Node, Polyline, R
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Horizon, HumanControl
 
 Radius = Annotated[int, Field(ge=15, le=10_000_000)]
-"""[m]"""
+"""radius of a figure eight [m]"""
 CROSSING_RADIUS = 3.1
 """radius of the node at the crossing [m], as in Flow"""
 CROSSING_LINK = 9.4

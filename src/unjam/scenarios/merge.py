@@ -29,7 +29,7 @@ ENTRANCE_LENGTH = 0.1
 HIGHWAY_ENTRY_SPEED, MERGE_RAMP_ENTRY_SPEED = 10.0, 7.5
 """speed of vehicles that enter [m/s]"""
 RAMP_ANGLE = pi / 4
-"""between ramp and highway [rad]"""
+"""angle between ramp and highway [rad]"""
 MAX_FREE_FLOW_SECONDS = 3600.0
 """longest time in which a vehicle passes the highway in free flow [s]"""
 PLATOON_SIZE = 30

@@ -37,7 +37,7 @@ class Ramp(Subclassable):
     """An on-ramp of a motorway, with its demand."""
 
     position: Positive
-    """where its acceleration lane begins, from the entrance of the motorway [m]"""
+    """distance from the entrance of the motorway to the begin of the acceleration lane [m]"""
     merging_length: Section = 300.0
     """length of the acceleration lane, along which vehicles merge [m]"""
     length: Section = 400.0
@@ -73,11 +73,11 @@ class Motorway(Scenario):
     is_closed: ClassVar[bool] = False
 
     length: Section = 3000.0
-    """[m]"""
+    """length of the motorway [m]"""
     lanes: Annotated[int, Field(ge=1, le=MAX_LANES)] = 2
     """number of lanes, without acceleration lanes"""
     speed_limit: Positive = 27.78
-    """[m/s]"""
+    """speed limit of the motorway [m/s]"""
     ramps: tuple[Ramp, ...] = ()
     """the on-ramps, from upstream to downstream"""
     inflow: Positive = 3200.0
@@ -85,7 +85,7 @@ class Motorway(Scenario):
     off_peak_inflow: NonNegative = 1800.0
     """demand at the entrance before and after the peak [veh/h]"""
     peak: motorway_vehicles.Interval = (300.0, 1500.0)
-    """its begin and end [s]"""
+    """begin and end of the peak of demand [s]"""
     peak_rise: Annotated[float, Field(ge=0, le=86_400)] = 0.0
     """time in which demand rises before the peak, and falls after it, in steps of a minute [s]"""
     min_entry_headway: NonNegative = 1.1
@@ -97,17 +97,17 @@ class Motorway(Scenario):
     car_following: Literal["EIDM", "IDM"] = "EIDM"
     """SUMO's car-following model of human drivers"""
     time_headways: motorway_vehicles.Interval = (1.0, 1.8)
-    """range among human drivers [s]"""
+    """range of the time headways of human drivers [s]"""
     accelerations: motorway_vehicles.Interval = (1.0, 1.5)
-    """range among human drivers [m/s2]"""
+    """range of the maximum accelerations of human drivers [m/s2]"""
     decelerations: motorway_vehicles.Interval = (1.5, 2.0)
     """range of comfortable decelerations among human drivers [m/s2]"""
     minimum_gaps: motorway_vehicles.Interval = (2.0, 2.5)
-    """range among human drivers, in a standing queue [m]"""
+    """range of the gaps of human drivers in a standing queue [m]"""
     speed_factor_std: NonNegative = 0.1
     """standard deviation of desired speed / speed limit, with mean 1; at most 0.2 from the mean"""
     vehicle_length: Positive = 4.8
-    """of cars [m]"""
+    """length of cars [m]"""
     lane_changing: motorway_vehicles.LaneChanging = field(default_factory=motorway_vehicles.LaneChanging)
     """how human drivers change lanes"""
     trucks: motorway_vehicles.Trucks = field(default_factory=motorway_vehicles.Trucks)
@@ -128,7 +128,7 @@ class Motorway(Scenario):
     safety: SafetyFilter = field(default_factory=lambda: SafetyFilter(active=False))
     """inactive: the CAV's own ACC keeps its distance"""
     noise: Annotated[float, Field(ge=0, le=0)] = 0.0
-    """none: the car-following model has its own"""
+    """always 0: the car-following model has its own noise"""
     emission_class: str = "HBEFA4/PC_petrol_Euro-6d"
 
     @model_validator(mode="after")

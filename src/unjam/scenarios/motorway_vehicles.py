@@ -48,7 +48,7 @@ class LaneChanging(Subclassable):
     cooperation: tuple[Cooperation, Cooperation] | None = None
     """willingness to change lanes for others, and to slow down for them, 0 to 1; default 1"""
     speed_cooperation: tuple[Cooperation, Cooperation] | None = None
-    """how much of the advised slowing down is done, 0 to 1; default: `cooperation`"""
+    """share of the advised slowing down that is done, 0 to 1; None: `cooperation`"""
     assertiveness: tuple[Positive, Positive] | None = None
     """the required gaps are divided by it; default 1"""
     speed_gain: tuple[NonNegative, NonNegative] | None = None
@@ -84,11 +84,11 @@ class Trucks(Subclassable):
     share: Share = 0.0
     """share of all vehicles"""
     length: Positive = 16.0
-    """[m]"""
+    """length of trucks [m]"""
     desired_speeds: Interval = (22.8, 24.7)
-    """range among drivers [m/s]; in the European Union, limiters allow 25 m/s"""
+    """range of the desired speeds of drivers [m/s]; in the European Union, limiters allow 25 m/s"""
     time_headways: Interval = (1.5, 2.2)
-    """range among drivers [s]"""
+    """range of the time headways of drivers [s]"""
     accelerations: Interval = (0.5, 0.8)
     """range [m/s2]"""
     decelerations: Interval = (1.5, 2.0)
@@ -127,9 +127,9 @@ class OrdinaryACC(Subclassable):
     share: Share = 0.0
     """share of all vehicles"""
     time_gap: Positive = 1.6
-    """[s]"""
+    """time gap behind the leader [s]"""
     acceleration: Positive = 1.0
-    """[m/s2]"""
+    """maximum acceleration [m/s2]"""
     deceleration: Positive = 2.0
     """comfortable [m/s2]"""
 

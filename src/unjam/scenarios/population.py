@@ -30,7 +30,7 @@ from unjam.processes import lock_file
 PACKAGED_POPULATIONS = Path(str(files("unjam") / "scenarios/populations"))
 """folder of the packaged populations, in which each driver has five individual parameters"""
 POPULATION_FORMAT = 1
-WEIGHTS_SUFFIX = ".safetensors"  # of the file with the residual of a population, next to it
+WEIGHTS_SUFFIX = ".safetensors"  # suffix of the file with the residual networks of a population, next to it
 RESIDUAL_INPUTS = ("speed", "leader's speed minus own", "gap")
 """inputs of the residual [m/s, m/s, m]"""
 MAX_POPULATION_BYTES = 64 * 2**20

@@ -29,7 +29,7 @@ from unjam.text import format_count, shorten_list
 LEADER_ID = "leader"
 EDGE_NAME = "road"
 MAX_RECORDED_SPEED = 70.0
-"""[m/s]"""
+"""largest recorded speed [m/s]"""
 ROAD_LENGTH_STEP = 5000.0
 """lengths of roads are multiples of it, so that few networks are made [m]"""
 MAX_FREE_SPEED_SHARE = 0.95
@@ -79,7 +79,7 @@ class Recorded(Scenario):
             desired_speed=45.0, max_acceleration=1.3, comfortable_deceleration=2.0, time_headway=1.0
         )
     )
-    """as in the source of this road"""
+    """human drivers of the source of this road"""
     noise: NonNegative = 0.3
 
     @model_validator(mode="after")

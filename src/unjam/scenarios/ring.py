@@ -43,7 +43,7 @@ class LoopScenario(Scenario):
     size_parameter: ClassVar[str]
     """the parameter that is drawn, uniformly among the integers of its range [m]"""
     description: ClassVar[str]
-    """of the road, with braces for the sizes"""
+    """description of the road, with braces for the sizes"""
     limit_description: ClassVar[str]
     """definition of its limit speed"""
     road_model: ClassVar[str] = "closed"

@@ -30,7 +30,7 @@ class Node(NamedTuple):
     has_priority: bool = False
     """whether the priorities of the edges decide the right of way"""
     radius: float | None = None
-    """of its junction [m]; None: the simulator's default"""
+    """radius of the junction at the node [m]; None: the simulator's default"""
 
 
 class Edge(NamedTuple):
@@ -46,7 +46,7 @@ class Edge(NamedTuple):
     """empty: straight"""
     lanes: int = 1
     speed_limit: float | None = None
-    """None: that of the network"""
+    """speed limit of the edge [m/s]; None: that of the network"""
 
 
 class Connection(NamedTuple):
@@ -65,7 +65,7 @@ class RoadNetwork:
     nodes: tuple[Node, ...]
     edges: tuple[Edge, ...]
     speed_limit: float
-    """of all edges without their own [m/s]"""
+    """speed limit of all edges without their own [m/s]"""
     has_internal_links: bool = True
     """whether the lanes across junctions have a length of their own"""
     connections: tuple[Connection, ...] = ()
@@ -86,11 +86,11 @@ class Entry(NamedTuple):
     name: str
     route: str
     position: float
-    """of its front bumper on the first edge [m]"""
+    """position of the front bumper on the first edge [m]"""
     speed: float | Literal["last"] = 0.0
-    """[m/s]; `last`: that of the vehicle that entered before"""
+    """speed at entry [m/s]; `last`: the speed of the vehicle that entered before"""
     time: float = 0.0
-    """[s]"""
+    """time at which the vehicle wants to enter [s]"""
     lane: int = 0
     vehicle_type: str = ""
     """one of the road's `vehicle_types`; empty: a human driver as the scenario says"""
@@ -126,7 +126,7 @@ class BuiltRoad(Road):
     network: RoadNetwork
     routes: tuple[Route, ...]
     entries: tuple[Entry, ...]
-    """in order of time"""
+    """vehicles that want to enter, ordered by time"""
     has_entry_checks: bool = True
     """whether SUMO inserts a vehicle only where its gap is safe"""
 
@@ -191,16 +191,16 @@ class VehicleType(NamedTuple):
     deceleration: float
     """comfortable"""
     minimum_gap: float
-    """to a standing leader"""
+    """gap to a standing leader [m]"""
     speed_factor: float
     """desired speed divided by the speed limit"""
     length: float
     max_speed: float | None = None
-    """None: none below the desired speed"""
+    """maximum speed of the vehicle [m/s]; None: no limit below the desired speed"""
     vehicle_class: str | None = None
     """one of SUMO's vehicle classes; None: passenger cars"""
     emission_class: str | None = None
-    """None: that of the scenario"""
+    """SUMO's emission class; None: that of the scenario"""
     parameters: tuple[tuple[str, float], ...] = ()
     """parameters of lane changing by SUMO's names; SUMO's defaults for others"""
 
@@ -219,7 +219,7 @@ class Origin(NamedTuple):
     branch: int
     """0: the main road; 1: the ramp"""
     position: float
-    """of its front bumper [m], negative upstream of the merge point"""
+    """position of the front bumper [m], negative upstream of the merge point"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +227,7 @@ class MergeRoad(BuiltRoad, OpenRoad):
     """A main road that a ramp joins, with one lane each."""
 
     origins: dict[str, Origin]
-    """of all vehicles that can enter"""
+    """origins of all vehicles that can enter, by vehicle id"""
     junction_lengths: tuple[float, float]
     """lengths of the lanes across the junction up to the merge point, of main road and ramp [m]; on them SUMO itself
     drives commanded human drivers"""

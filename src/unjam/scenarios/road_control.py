@@ -19,13 +19,13 @@ class SpeedLimitControl(Subclassable):
 
     active: bool = False
     target_density: Positive = 24.0
-    """[veh/km per lane]"""
+    """density that the limits aim at [veh/km per lane]"""
     gain: NonNegative = 0.02
     """change of limit / unlimited speed in each interval, per veh/km of deviation"""
     min_limit: Positive = 11.12
-    """[m/s]"""
+    """smallest speed limit that is shown [m/s]"""
     interval: Positive = 30.0
-    """[s]"""
+    """time between two changes of the limits [s]"""
     length: Positive = 1500.0
     """length of the road with the limit [m]"""
     acceleration_length: NonNegative = 500.0
@@ -50,13 +50,13 @@ class RampMeter(Subclassable):
 
     active: bool = False
     target_density: Positive = 24.0
-    """[veh/km per lane]"""
+    """density that the meters aim at [veh/km per lane]"""
     gain: NonNegative = 20.0
     """change of the rate in each interval, per veh/km of deviation [veh/h]"""
     rates: tuple[Positive, Positive] = (240.0, 1200.0)
     """lowest and highest rate [veh/h]"""
     interval: Positive = 30.0
-    """[s]"""
+    """time between two changes of the metered flow [s]"""
     distance_to_merge: Positive = 100.0
     """distance from the stop line to the merging section [m]"""
 

@@ -38,7 +38,7 @@ from unjam.text import format_count
 UNLIMITED_ACCELERATION = 20.0
 """acceleration limit of a CAV's vehicle type in SUMO [m/s2]: far above any command, so that only safety clips"""
 VEHICLE_LENGTH = 5.0
-"""[m], of every vehicle"""
+"""length of every vehicle [m]"""
 SUMO_ACCELERATION = 2.6
 """acceleration limit of commanded human drivers and of cars [m/s2], SUMO's default"""
 MIN_CAV_GAP = 0.5
@@ -67,13 +67,13 @@ class CruiseControl(Subclassable):
     """
 
     time_gap: Positive = 1.1
-    """[s]"""
+    """time gap behind the leader [s]"""
     acceleration: Positive | None = 2.5
-    """[m/s2]; None, on a user network: that of the vehicle that the CAV replaces"""
+    """maximum acceleration [m/s2]; None, on a user network: that of the vehicle that the CAV replaces"""
     deceleration: Positive | None = 2.0
-    """comfortable [m/s2]; None likewise"""
+    """comfortable deceleration [m/s2]; None, on a user network: that of the vehicle that the CAV replaces"""
     minimum_gap: Positive = 2.0
-    """to a standing leader [m]"""
+    """gap to a standing leader [m]"""
     keep_right: NonNegative | None = None
     """eagerness to keep right; None: that of the vehicle, mostly 1; 0: none"""
     speed_gain: NonNegative | None = None
@@ -150,7 +150,7 @@ class Scenario(Subclassable):
     is_closed: ClassVar[bool] = True
     """whether the road is a loop"""
     road_model: ClassVar[str] = ""
-    """its world model of whole roads, a key of `unjam.models.registry`; empty: none"""
+    """world model of the whole road, a key of `unjam.models.registry`; empty: none"""
     has_coordinate: ClassVar[bool] = True
     """whether vehicles have a position along the road"""
     has_vehicle_types: ClassVar[bool] = False
@@ -192,13 +192,13 @@ class Scenario(Subclassable):
     population: str = ""
     """calibrated human drivers: a file of `unjam fit-drivers`, `unjam:ngsim` or `unjam:astazero`; empty: `humans`"""
     human_control: HumanControl = "native"
-    """what computes the motion of human drivers: `native` SUMO's own IDM plus noise on its speeds; `commanded`
+    """computation of the motion of human drivers: `native` SUMO's own IDM plus noise on its speeds; `commanded`
     the same IDM and noise as a speed command in every step, as in Flow, on top of a quicker model of SUMO that keeps
     vehicles safe and obeys the right of way. SUMO's IDM with the paper's parameters is too timid where roads cross"""
     right_of_way: bool = True
     """whether vehicles obey the right of way where roads meet; if not, SUMO only prevents collisions"""
     impatience: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """how readily vehicles that must yield accept a gap in crossing traffic (SUMO's `impatience`)"""
+    """readiness of vehicles that must yield to accept a gap in crossing traffic (SUMO's `impatience`)"""
     noise: NonNegative = 0.2
     """standard deviation of the acceleration noise of human drivers [m/s2]"""
     noise_scaling: Literal["sqrt-step", "none"] = "sqrt-step"

@@ -96,7 +96,7 @@ class UserNetwork(Scenario):
     roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
     """latency and smoothing of the speeds ahead that CAVs receive"""
     noise: Annotated[float, Field(ge=0, le=0)] = 0.0
-    """none: human drivers drive as their vehicle types say"""
+    """always 0: human drivers drive as their vehicle types say"""
 
     @model_validator(mode="after")
     def _check_settings(self) -> Self:

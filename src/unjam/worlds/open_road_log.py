@@ -228,9 +228,9 @@ class MultiLaneLog(OpenRoadLog):
         super().__init__(scenario, names, speeds)
         self._tracked_leaders = tracked_leaders
         self._following: dict[str, tuple[str, int, bool, FollowingState]] = {}
-        """of each CAV: its leader and since which step, whether it recovers from the change, and the last state"""
+        """state of each CAV: leader, its first step, whether the CAV recovers from the change of leader, last state"""
         self._steady_following = array("d")
-        """of CAVs long behind the same leader, in each simulation step: speed, leader speed, gap, and recovery"""
+        """steps of CAVs long behind the same leader: speed, leader speed, gap, and recovery"""
         self._step_count = 0
 
     def _driver_kinds(self) -> NDArray[np.uint8]:

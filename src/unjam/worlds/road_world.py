@@ -36,11 +36,11 @@ class RoadWorld(World[Episode], Protocol):
     """A world of one road with its inspecting part, for environments and pictures; `World` is the driving part."""
 
     road: Road
-    """as the scenario has drawn it"""
+    """road that the scenario has drawn"""
     cav_ids: Sequence[str]
     """the CAVs on the road now, in order of entry: the rows of states and commands"""
     speeds: Sequence[float] | Floats
-    """of all vehicles on the road now [m/s]"""
+    """speeds of all vehicles on the road [m/s]"""
     control_steps: int
     """number of control steps made"""
     has_crashed: bool

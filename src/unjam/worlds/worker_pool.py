@@ -33,7 +33,7 @@ MAX_EPISODE_ATTEMPTS = 3
 WORKER_TIMEOUT = 30.0
 """seconds without a message, except those of waiting for a processor, after which a worker counts as hung"""
 MIN_PROCESSOR_WAIT = 0.1
-"""[s]"""
+"""a silent worker that has waited less than this for a processor counts as hung [s]"""
 
 ResultT = TypeVar("ResultT")
 Message = tuple[dict[str, Any], Arrays]

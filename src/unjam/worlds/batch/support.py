@@ -24,7 +24,7 @@ MAX_SIMULATION_STEP = 0.37
 MOTORWAY_STEP = 0.5
 """simulation step of motorways, which SUMO's EIDM divides into two [s]"""
 MAX_BATCH_LANES = 2
-"""of a motorway: from each lane a batch considers one change"""
+"""lanes of a motorway in a batch, which considers one lane change from each lane"""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ class CarFollowingModels:
     def __init__(self, scenario: Scenario, vehicle_count: int, cav_indices: list[int], to_array: ArrayFactory) -> None:
         self._cav_indices, self._cav_braking = cav_indices, scenario.cav_max_braking
         self.speed_limit, self._step = scenario.top_speed, scenario.simulation_step
-        """of the road [m/s]"""
+        """speed limit of the road [m/s]"""
         self._humans = IDMParameters(
             desired_speed=scenario.top_speed,
             time_headway=1.0,

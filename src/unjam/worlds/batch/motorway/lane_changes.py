@@ -36,7 +36,7 @@ MIN_REFERENCE_SPEED = 10.0
 RIGHT_SPEED_TOLERANCE = 5.0 / 3.6
 """speed difference up to which the right lane counts as equally fast [m/s]"""
 KEEP_RIGHT_ACCEPTANCE_TIME, KEEP_RIGHT_TIME = 7.0, 5.0
-"""[s]"""
+"""times that scale the obligation to keep right, as in SUMO's LC2013 [s]"""
 MIN_REMAINING_TIME = 20.0
 """time for which the other lane must continue for an optional change [s]"""
 OVERTAKING_LOOK_AHEAD = 8.0

@@ -44,7 +44,7 @@ class WarmUpState(NamedTuple):
     has_crashed: bool
     noise: NoiseState
     history: LocalState | None
-    """what the CAVs observed in the last minute, shape (CAVs, moments); None if it is not remembered"""
+    """states that the CAVs observed in the last minute, shape (CAVs, moments); None without memory of the warm-up"""
     crossing_memory: CrossingMemory | None = None
 
 
