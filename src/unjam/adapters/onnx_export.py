@@ -82,4 +82,4 @@ def _check_shapes(network: "nn.Module", observations: "Tensor") -> None:
 
 
 def _as_table(value: PolicyInput | PolicyOutput) -> dict[str, Any]:
-    return {name: each for name, each in asdict(value).items() if each is not None}
+    return {name: entry for name, entry in asdict(value).items() if entry is not None}

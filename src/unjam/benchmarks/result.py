@@ -79,22 +79,22 @@ class BenchmarkResult:
     @np.errstate(over="ignore", invalid="ignore")  # a file may have any finite numbers
     def _gains(self) -> dict[str, tuple[Estimate, Floats, str]]:
         """For each road the gain, the gain by seed, and the verdict of the feasibility check."""
-        found: dict[str, tuple[Estimate, Floats, str]] = {}
+        gains: dict[str, tuple[Estimate, Floats, str]] = {}
         for name, road in self.roads.items():
             baseline, reference = _rows(road.baseline), references()[name]["performance"]
             rows = _rows(road.driver) if road.driver else baseline
             verdict = overall_feasibility(rows, baseline) if road.driver else f"not driven: {road.note}"
             arguments = rows, baseline, reference
-            found[name] = gain.normalized_gain(*arguments), gain.gain_by_seed(*arguments), verdict
-        return found
+            gains[name] = gain.normalized_gain(*arguments), gain.gain_by_seed(*arguments), verdict
+        return gains
 
     @np.errstate(over="ignore", invalid="ignore")
     def mean_gain(self, part: str = "all roads") -> Estimate:
         """Return the mean gain over the finished roads of one of `PARTS`, with its 95 % CI over roads and seeds."""
         if not isinstance(part, str) or part not in PARTS:
             raise unknown_name("part", part, PARTS)
-        own = [seeds for name, (_, seeds, _) in self._gains.items() if FAMILY[name].part in PARTS[part]]
-        return estimate_crossed(own, allows_bimodal=True)
+        part_seeds = [seeds for name, (_, seeds, _) in self._gains.items() if FAMILY[name].part in PARTS[part]]
+        return estimate_crossed(part_seeds, allows_bimodal=True)
 
     @property
     def worst_road(self) -> tuple[str, float]:
@@ -108,14 +108,14 @@ class BenchmarkResult:
 
     def gains(self) -> dict[str, float]:
         """Return the gain by finished road."""
-        return {name: each.mean for name, (each, *_) in self._gains.items()}
+        return {name: estimate.mean for name, (estimate, *_) in self._gains.items()}
 
     def road_rows(self) -> list[dict[str, Any]]:
         """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend; then the means."""
         rows: list[dict[str, Any]] = [
-            {"road": name, "part": FAMILY[name].part, **_interval(each), "feasible": verdict}
+            {"road": name, "part": FAMILY[name].part, **_interval(estimate), "feasible": verdict}
             | {"backend": self.roads[name].backend, "expert": references()[name]["expert"]}
-            for name, (each, _, verdict) in self._gains.items()
+            for name, (estimate, _, verdict) in self._gains.items()
         ]
         empty = {"part": "", "feasible": "", "backend": "", "expert": ""}
         parts = () if self.missing_roads else PARTS
@@ -143,8 +143,8 @@ class BenchmarkResult:
             count, first = len(self.missing_roads), self.missing_roads[0]
             raise InputError(f"roads: {count} are missing ({first}, ...); allowed: a finished benchmark")
         for name, road in self.roads.items():
-            found = [gain.performance(row) for row in _rows(road.baseline)]
-            for value, expected in zip(found, references()[name]["baseline"], strict=True):
+            performances = [gain.performance(row) for row in _rows(road.baseline)]
+            for value, expected in zip(performances, references()[name]["baseline"], strict=True):
                 if not isclose(value, expected, rel_tol=MAX_RELATIVE_DIFFERENCE):
                     versions = f"unjam {self.manifest.get('unjam')!s:.20}, backend {road.backend:.40}"
                     reason = f"performance of the human baseline ({versions})"
@@ -163,7 +163,9 @@ def to_columns(rows: gain.EpisodeRows) -> dict[str, list[Any]]:
 def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
     seeds, values = iter(FAMILY_TEST_SEEDS), zip(*columns.values(), strict=True)
     rows = (dict(zip(columns, row, strict=True)) for row in values)
-    return [{"seed": next(seeds)} | {name: nan if each is None else each for name, each in row.items()} for row in rows]
+    return [
+        {"seed": next(seeds)} | {name: nan if value is None else value for name, value in row.items()} for row in rows
+    ]
 
 
 def _interval(value: Estimate) -> dict[str, float]:
@@ -203,9 +205,9 @@ def read_result(path: Path) -> BenchmarkResult:
             raise InputError(f"seeds: they are not those of {result.suite}")
         expected = None if result.missing_roads else parse_json(to_json(result.summary()))
         if difference := first_difference(expected, summary, MAX_RELATIVE_DIFFERENCE):
-            name, computed, found = difference
+            name, computed, stored = difference
             allowed = f"{short_text(computed)}, which follows from the rows"
-            raise InputError(f"summary.{name}: {short_text(found)} is not allowed; allowed: {allowed}")
+            raise InputError(f"summary.{name}: {short_text(stored)} is not allowed; allowed: {allowed}")
         return result
 
 

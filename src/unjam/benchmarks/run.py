@@ -127,8 +127,8 @@ def benchmark(
             scenario = scenarios[name]
             human = make_driver(HUMAN_LABEL, scenario.control_step)
             used, rows = human_used, baseline = _drive_road(scenario, human, backend, pool)
-            if (own := drivers.get(name)) != human:
-                used, rows = _drive_road(scenario, own, backend, pool) if own else (human_used, [])
+            if (road_driver := drivers.get(name)) != human:
+                used, rows = _drive_road(scenario, road_driver, backend, pool) if road_driver else (human_used, [])
             record = RoadRecord(used, to_columns(baseline), to_columns(rows), one_line(reasons.get(name, "")))
             result = replace(result, roads={**result.roads, name: record})
             if path is not None:
@@ -157,9 +157,9 @@ def _make_drivers(
     for name, road in roads.items():
         try:
             step = road.control_step
-            made = make_driver(driver, step) if isinstance(driver, str) else as_driver(driver, step)
-            check_can_drive(made, road)
-            drivers[name] = made
+            road_driver = make_driver(driver, step) if isinstance(driver, str) else as_driver(driver, step)
+            check_can_drive(road_driver, road)
+            drivers[name] = road_driver
         except InputError as error:
             reasons[name] = error
     if not drivers:
@@ -175,7 +175,7 @@ def _drive_road(scenario: Scenario, driver: Driver, backend: str, pool: WorkerPo
     # Code of users may compute with all rows at once, which are CAVs of different roads in a batch.
     can_batch = is_exact and not unsupported_reason(scenario) and is_serializable(driver)
     if can_batch and not user_code_recipes(driver_recipe(driver)[0]):
-        return "batch", [_measure_episode(*each) for each in enumerate(run_batches(tasks))]
+        return "batch", [_measure_episode(*numbered_episode) for numbered_episode in enumerate(run_batches(tasks))]
     if tasks[0].is_serializable:
         return simulator, pool.run_and_map(tasks, _measure_episode)
     return simulator, [_measure_episode(0, run_episode(**vars(task))) for task in tasks]
@@ -199,13 +199,13 @@ def drive_by_label(
 
     With `in_batches`, episodes run in batches if these support the scenario.
     """
-    made = {label: make_driver(name, scenario.control_step) for label, name in drivers.items()}
-    tasks = {label: make_tasks(scenario, driver, seeds) for label, driver in made.items()}
+    drivers_by_label = {label: make_driver(name, scenario.control_step) for label, name in drivers.items()}
+    tasks = {label: make_tasks(scenario, driver, seeds) for label, driver in drivers_by_label.items()}
     if in_batches and not unsupported_reason(scenario):
-        return {label: list(map(_family_metrics, run_batches(own))) for label, own in tasks.items()}
+        return {label: list(map(_family_metrics, run_batches(road_tasks))) for label, road_tasks in tasks.items()}
     # A whole motorway episode takes 80 MB.
     rows = iter(workers.run_and_map([*chain(*tasks.values())], lambda index, episode: _family_metrics(episode)))
-    return {label: [next(rows) for _ in own] for label, own in tasks.items()}
+    return {label: [next(rows) for _ in road_tasks] for label, road_tasks in tasks.items()}
 
 
 def _family_metrics(episode: Episode) -> dict[str, Any]:
@@ -215,8 +215,8 @@ def _family_metrics(episode: Episode) -> dict[str, Any]:
 
 def _driver_hash(label: str, driver: Driver) -> str | None:
     """Return the SHA-256 of a file of the driver, else of recipe, code and weights; None for a Python object."""
-    if found := label and controller_hash(label):
-        return found
+    if sha256 := label and controller_hash(label):
+        return sha256
     if not is_serializable(driver):
         file, parameters = split_parameters(label)  # of a policy
         if not file or not Path(file).is_file():
@@ -243,16 +243,18 @@ def _stored_result(path: Path, new: BenchmarkResult) -> BenchmarkResult:
     stored = read_result(path)
 
     def identity(result: BenchmarkResult) -> dict[str, Any]:
-        made = result.manifest
-        sumo = (made.get("packages") or {}).get("eclipse-sumo")
+        origin = result.manifest
+        sumo = (origin.get("packages") or {}).get("eclipse-sumo")
         names = {"suite": result.suite, "driver": result.driver, "hash of the driver": result.sha256}
-        names |= {"training steps": result.training_steps, "backend": made.get("backend")}
-        names |= {"hash of the backend": made.get("backend_sha256")}
-        return names | {"unjam": made.get("unjam"), "SUMO": sumo}
+        names |= {"training steps": result.training_steps, "backend": origin.get("backend")}
+        names |= {"hash of the backend": origin.get("backend_sha256")}
+        return names | {"unjam": origin.get("unjam"), "SUMO": sumo}
 
     if new.sha256 is None:
         raise invalid_value("out", str(path), "a new file: it is unknown whether a Python object has changed")
-    for (key, expected), found in zip(identity(new).items(), identity(stored).values(), strict=True):
-        if found != expected:
-            raise InputError(f"out: {path} has {key} {found!r}, not {expected!r}; allowed: the same, or a new file")
+    for (key, expected), stored_value in zip(identity(new).items(), identity(stored).values(), strict=True):
+        if stored_value != expected:
+            raise InputError(
+                f"out: {path} has {key} {stored_value!r}, not {expected!r}; allowed: the same, or a new file"
+            )
     return replace(stored, manifest=stored.manifest | {"command": new.manifest["command"]})

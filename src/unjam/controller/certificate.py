@@ -196,8 +196,8 @@ def _worst_cases(simulate: FollowingSimulator, states: FollowingState, driver: F
 def _comfort(speeds: Floats, step: float) -> Comfort:
     steps = _steps_of_mean(step)
     means = (speeds[steps:] - speeds[:-steps]) / (steps * step)
-    before = speeds[: len(means)]
-    max_braking, max_acceleration = (np.interp(before, [5.0, 20.0], ends) for ends in ([5.0, 3.5], [4.0, 2.0]))
+    earlier_speeds = speeds[: len(means)]
+    max_braking, max_acceleration = (np.interp(earlier_speeds, [5.0, 20.0], ends) for ends in ([5.0, 3.5], [4.0, 2.0]))
     accelerations = np.diff(speeds) / step
     return Comfort(
         rms_acceleration=float(np.sqrt((accelerations**2).mean())),
@@ -224,4 +224,4 @@ def _search_attacks(
         elites = maneuvers[order[:ATTACK_ELITES]]
         mean, spread = elites.mean(0), elites.std(0) + 0.2
     steps = ATTACK_GENERATIONS * ATTACK_POPULATION * pieces * repeats
-    return *min(worst, key=lambda each: each[0].gap.min()), steps
+    return *min(worst, key=lambda outcome: outcome[0].gap.min()), steps

@@ -50,9 +50,9 @@ def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[
 
 def control_step_note(name: str, steps: Iterable[float]) -> str:
     """Return the note for a model of Stable-Baselines3 on roads with these control steps [s]."""
-    found = " or ".join(f"{step:g}" for step in sorted(set(steps)))
+    step_text = " or ".join(f"{step:g}" for step in sorted(set(steps)))
     other = f"{name}:policy_time_step=1.0"
-    return f"{name} does not contain its control step: here it acts every {found} s; {other} sets another"
+    return f"{name} does not contain its control step: here it acts every {step_text} s; {other} sets another"
 
 
 def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
@@ -60,18 +60,18 @@ def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
     trained = manifest.get("scenario")
     if not isinstance(trained, dict):
         return ""
-    made = "tuned" if "tuning" in manifest else "trained"
+    verb = "tuned" if "tuning" in manifest else "trained"
     if trained.get("kind") != road["kind"]:
-        return f"was {made} on the {_value_text(trained.get('kind'))} road, not on the {road['kind']} road"
-    before, now = map(_flatten_recipe, (trained, road))
-    known = [name for name in now if name in before and name not in IRRELEVANT_PARAMETERS]
-    differ = [name for name in known if not _is_within(before[name], now[name])]
+        return f"was {verb} on the {_value_text(trained.get('kind'))} road, not on the {road['kind']} road"
+    trained_values, road_values = map(_flatten_recipe, (trained, road))
+    known = [name for name in road_values if name in trained_values and name not in IRRELEVANT_PARAMETERS]
+    differ = [name for name in known if not _is_within(trained_values[name], road_values[name])]
     if not differ:
         return ""
     listed = differ[:MAX_LISTED_PARAMETERS]
-    words = [f"{name} {_value_text(now[name])} (there {_value_text(before[name])})" for name in listed]
+    words = [f"{name} {_value_text(road_values[name])} (there {_value_text(trained_values[name])})" for name in listed]
     more = [f"{len(differ) - len(listed)} more"] if len(differ) > len(listed) else []
-    return f"was {made} on the {road['kind']} road with other parameters: {', '.join(words + more)}"
+    return f"was {verb} on the {road['kind']} road with other parameters: {', '.join(words + more)}"
 
 
 def _flatten_recipe(recipe: dict[str, Any]) -> dict[str, Any]:

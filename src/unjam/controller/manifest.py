@@ -59,11 +59,11 @@ def read_manifest(name: str, part: bytes) -> JsonObject:
     manifest = parse_json(part)
     if not isinstance(manifest, dict):
         raise InputError(f"controller {name}: manifest: {short_text(manifest)} is not allowed; allowed: a table")
-    found = manifest.get("format")
-    if type(found) is int and found != MANIFEST_FORMAT:
+    version = manifest.get("format")
+    if type(version) is int and version != MANIFEST_FORMAT:
         allowed = f"format {MANIFEST_FORMAT}, which unjam {__version__} writes: export or train it again"
         maker = f"unjam {short_text(manifest.get('unjam'))}"
-        raise InputError(f"controller {name}: format {found}, written by {maker}, is not allowed; allowed: {allowed}")
+        raise InputError(f"controller {name}: format {version}, written by {maker}, is not allowed; allowed: {allowed}")
     build_dataclass(Manifest, manifest, f"controller {name}: manifest")
     road = manifest.get("scenario", {})
     step, steps, limit = (road.get(key) for key in ("simulation_step", "steps_per_control_step", "action_limit"))
@@ -131,10 +131,10 @@ def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
 
 def _network_inputs(driver: Driver, prefix: str = "") -> dict[str, list[JsonObject]]:
     inputs = driver.network_inputs
-    found = {} if inputs is None else {prefix: [entry._asdict() for entry in inputs]}
+    entries = {} if inputs is None else {prefix: [entry._asdict() for entry in inputs]}
     for name, inner in driver.inner_drivers.items():
-        found |= _network_inputs(inner, f"{prefix}{name}.")
-    return found
+        entries |= _network_inputs(inner, f"{prefix}{name}.")
+    return entries
 
 
 def _memory_entry(name: str, value: Any) -> JsonObject:

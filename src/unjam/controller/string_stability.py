@@ -49,16 +49,16 @@ def measure_string_stability(
     driver: FilteredDriver, speeds: Sequence[float], humans: IDMParameters, loop_length: float = np.nan
 ) -> tuple[StringStability, ...]:
     """Return the response of a vehicle at each speed [m/s], with `humans` behind it on a road of this length [m]."""
-    frequencies, found = OSCILLATION_FREQUENCIES, list[StringStability]()
+    frequencies, results = OSCILLATION_FREQUENCIES, list[StringStability]()
     for speed, gains in zip(speeds, string_gains(driver, speeds, humans, loop_length), strict=True):
         amplified = frequencies[gains > 1.0 + GAIN_TOLERANCE]
         human_gains = human_gain(frequencies, speed, humans)
         stable = [n for n in range(MAX_FOLLOWERS + 1) if (gains * human_gains**n).max() <= 1.0 + GAIN_TOLERANCE]
-        tested, own, human = (tuple(values.tolist()) for values in (frequencies, gains, human_gains))
+        tested, own_gains, human = (tuple(values.tolist()) for values in (frequencies, gains, human_gains))
         band = (float(amplified[0]), float(amplified[-1])) if len(amplified) else ()
         peak_frequency = float(frequencies[int(np.argmax(gains))])
-        found.append(StringStability(speed, tested, own, human, peak_frequency, band, max(stable, default=0)))
-    return tuple(found)
+        results.append(StringStability(speed, tested, own_gains, human, peak_frequency, band, max(stable, default=0)))
+    return tuple(results)
 
 
 def string_gains(
@@ -81,7 +81,10 @@ def string_gains(
     world = CarFollowingWorld(start, np.diff(leaders, axis=0) / step, driver.limits, step, loop_length, driver.actuator)
     responses = drive_world(world, driver).speed.reshape(len(times), len(speeds), count)
     amplitudes = [
-        [_amplitude(response, times, each) for response, each in zip(rows, OSCILLATION_FREQUENCIES, strict=True)]
+        [
+            _amplitude(response, times, frequency)
+            for response, frequency in zip(rows, OSCILLATION_FREQUENCIES, strict=True)
+        ]
         for rows in responses.transpose(1, 2, 0)
     ]
     settled = responses[times > SETTLING_SECONDS].mean(0)  # one period of the slowest oscillation

@@ -172,9 +172,9 @@ def check_graph(part: bytes, driver: Driver) -> None:
     model = parse_model(part)
     check_model(model, len(part), range(ONNX_OPSET, ONNX_OPSET + 1), ONNX_IR_VERSIONS)
     graph, expected = model.graph, graph_names(driver)
-    found = [value.name for value in graph.input], [value.name for value in graph.output]
-    if found != expected:
-        raise InputError(f"graph: inputs and outputs {found} are not allowed; allowed: {expected}")
+    actual_names = [value.name for value in graph.input], [value.name for value in graph.output]
+    if actual_names != expected:
+        raise InputError(f"graph: inputs and outputs {actual_names} are not allowed; allowed: {expected}")
     kinds = {value.type.tensor_type.elem_type for value in (*graph.input, *graph.output)}
     if kinds != {import_optional("onnx").TensorProto.DOUBLE}:
         raise InputError("graph: inputs and outputs of another type are not allowed; allowed: float64")
@@ -189,8 +189,8 @@ def run_graph(part: bytes, driver: Driver, states: LocalState, rows: int = 1) ->
     (inputs, _), session, answers = graph_names(driver), open_session(part), list[Floats]()
     fields, memory = driver.requirements().input_fields, [each for _, each in leaves(driver.initial_memory(rows))]
     for step in range(len(states.speed)):
-        now = states.select(np.full(rows, step))
-        values = [*(getattr(now, name) for name in fields), *memory]
+        current_states = states.select(np.full(rows, step))
+        values = [*(getattr(current_states, name) for name in fields), *memory]
         acceleration, *memory = run_session(session, None, dict(zip(inputs, values, strict=True)))
         answers.append(acceleration)
     if any(answer.shape != (rows,) or not (np.abs(answer - answer[0]) <= BATCH_TOLERANCE).all() for answer in answers):
@@ -213,8 +213,8 @@ def _check_certificate(controller: Controller) -> PartCheck:
     stated = parse_json(controller.parts[archive.CERTIFICATE_PART])  # before the simulations, in case it is damaged
     actual = parse_json(to_json(make_certificate(controller)))
     _require_same("certificate", first_difference(stated, actual, CERTIFICATE_TOLERANCE))
-    found = describe_worst_cases(actual, cast(FilteredDriver, controller.driver))
-    return PartCheck("certificate", "checked", f"{found}: the same in repeated simulations")
+    worst_cases = describe_worst_cases(actual, cast(FilteredDriver, controller.driver))
+    return PartCheck("certificate", "checked", f"{worst_cases}: the same in repeated simulations")
 
 
 def _action_limit(controller: Controller) -> float:
@@ -232,11 +232,11 @@ def _require_same(part: str, difference: tuple[str, Any, Any] | None) -> None:
         raise InputError(f"controller: its {part} says of {name or 'itself'}: {allowed}")
 
 
-def _max_error(form: str, actual: Floats, recorded: Floats, tolerance: float, place: str) -> float:
+def _max_error(form: str, actual: Floats, recorded: Floats, tolerance: float, location: str) -> float:
     """Return the largest difference of accelerations [m/s2]; raise `InputError` if it exceeds the tolerance."""
     errors = np.abs(actual - recorded)
     if not (errors <= tolerance).all():  # also for NaN
         step = int(np.argmax(~(errors <= tolerance)))
-        found, allowed = f"{form} answers {actual[step]:.9g} m/s2", f"{recorded[step]:.9g} to {tolerance:g}"
-        raise InputError(f"controller: {place.format(step)}: {found}; allowed: {allowed}")
+        answer_text, allowed = f"{form} answers {actual[step]:.9g} m/s2", f"{recorded[step]:.9g} to {tolerance:g}"
+        raise InputError(f"controller: {location.format(step)}: {answer_text}; allowed: {allowed}")
     return float(errors.max())

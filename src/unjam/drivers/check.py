@@ -36,10 +36,10 @@ def check_driver(
     for step in range(steps):
         state = random_state(generator, rows, optional_fields)
         memory_copy, state_copy = map_leaves(np.array, memory), state.map(np.array)
-        acceleration, after = _call_act(driver, state, memory, step)
+        acceleration, new_memory = _call_act(driver, state, memory, step)
         acceleration = check_acceleration(acceleration, rows, f"step {step}")
-        for name, given, copy in (("memory", memory, memory_copy), ("state", state._asdict(), state_copy._asdict())):
-            if not _is_same_tree(given, copy):
+        for name, values, copy in (("memory", memory, memory_copy), ("state", state._asdict(), state_copy._asdict())):
+            if not _is_same_tree(values, copy):
                 raise InputError(f"driver: step {step}: act() changed the {name} that it was given")
         repeated, _ = _call_act(driver, state, memory_copy, step)
         if not np.array_equal(acceleration, repeated):
@@ -52,9 +52,9 @@ def check_driver(
             answer, single[row] = _call_act(driver, state.select(slice(row, row + 1)), single[row], step)
             alone, among = float(np.asarray(answer)[0]), float(acceleration[row])
             if not abs(alone - among) <= tolerance:
-                found = f"row {row} gave {alone!r} alone and {among!r} among {rows} rows"
-                raise InputError(f"driver: step {step}: {found}")
-        memory = after
+                difference = f"row {row} gave {alone!r} alone and {among!r} among {rows} rows"
+                raise InputError(f"driver: step {step}: {difference}")
+        memory = new_memory
 
 
 def check_row_independence(compute: Callable[[slice], Any], label: str, unit: str = "CAVs") -> None:
@@ -70,8 +70,8 @@ def probe_state(fields: Collection[str] = LocalState._fields) -> LocalState:
     """Return random rows for `check_row_independence`, with the given optional fields."""
     state = random_state(np.random.default_rng(0), PROBE_ROWS, optional_fields=True)
     filled = {name: values for name, values in state._asdict().items() if values is not None}
-    others = {name: None for name in LocalState._fields if name not in (*COMMON_FIELDS, *fields)}
-    return state_of_ones(LocalState._fields, np.ones, PROBE_ROWS)._replace(**filled | others)
+    unused_fields = {name: None for name in LocalState._fields if name not in (*COMMON_FIELDS, *fields)}
+    return state_of_ones(LocalState._fields, np.ones, PROBE_ROWS)._replace(**filled | unused_fields)
 
 
 def _call_act(driver: Driver, state: LocalState, memory: Memory, step: int) -> tuple[Any, Memory]:
@@ -108,6 +108,11 @@ def random_state(generator: np.random.Generator, rows: int, optional_fields: boo
 
 
 def _is_same_tree(tree: Any, other: Any) -> bool:
-    found, before = ({path: values for path, values in leaves(state) if values is not None} for state in (tree, other))
-    is_same = (np.array_equal(np.asarray(found[path]), before[path], equal_nan=True) for path in found)
-    return found.keys() == before.keys() and all(is_same)
+    current_leaves, previous_leaves = (
+        {path: values for path, values in leaves(state) if values is not None} for state in (tree, other)
+    )
+    is_same = (
+        np.array_equal(np.asarray(current_leaves[path]), previous_leaves[path], equal_nan=True)
+        for path in current_leaves
+    )
+    return current_leaves.keys() == previous_leaves.keys() and all(is_same)

@@ -64,10 +64,10 @@ def answer_as_array(
 
 def batch_commanded_accelerations(command: Command | None, limits: Limits, rows: int, step: int) -> Array:
     """Return the commands within the limits, shape (rows,) [m/s2]; `InputError` unless they are finite, one a row."""
-    found: Any = () if command is None else command.acceleration
-    if np.shape(found) != (rows,) or not bool(namespace(found).isfinite(found).all()):
+    values: Any = () if command is None else command.acceleration
+    if np.shape(values) != (rows,) or not bool(namespace(values).isfinite(values).all()):
         raise InputError(f"driver: step {step}: not {rows} accelerations that are finite")
-    return limits.clip(found)
+    return limits.clip(values)
 
 
 def commanded_accelerations(command: Command | None, limits: Limits, names: Sequence[str], step: int) -> list[float]:
@@ -95,10 +95,10 @@ def commanded_time_gaps(command: Command | None, min_time_gap: float, names: Seq
     if command is None or command.time_gap is None:
         return [min_time_gap] * len(names)
     context = f"driver: step {step}"
-    found = np.fmax(answer_as_array(command.time_gap, len(names), context, "time gap"), min_time_gap)  # drops NaN
-    if not np.isfinite(found).all():
-        _raise_not_finite(found, names, f"{context}: time gap", "finite, or NaN")
-    return found.tolist()
+    time_gaps = np.fmax(answer_as_array(command.time_gap, len(names), context, "time gap"), min_time_gap)  # drops NaN
+    if not np.isfinite(time_gaps).all():
+        _raise_not_finite(time_gaps, names, f"{context}: time gap", "finite, or NaN")
+    return time_gaps.tolist()
 
 
 def _raise_not_finite(values: Floats, names: Sequence[str], quantity: str, allowed: str) -> None:

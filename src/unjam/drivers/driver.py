@@ -76,8 +76,8 @@ class Driver(Subclassable):
 
     def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
         """Return the decision with its components; with `noise`, learned parts explore."""
-        acceleration, after = self.act(state, memory)
-        return Decision(Command(acceleration, self.time_gaps(state, memory)), acceleration, 0.0, None, after)
+        acceleration, new_memory = self.act(state, memory)
+        return Decision(Command(acceleration, self.time_gaps(state, memory)), acceleration, 0.0, None, new_memory)
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time gaps for the CAVs' own ACCs, as in `Command`."""
@@ -121,8 +121,8 @@ class Driver(Subclassable):
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
         """Return what it and its inner drivers need, on `road` only those that drive there; with its `time_step`."""
         step = getattr(self, "time_step", None)
-        own = self.own_requirements._replace(time_steps=frozenset(() if step is None else (step,)))
-        return merge_requirements(own, *(driver.requirements(road) for driver in self.active_drivers(road)))
+        requirements = self.own_requirements._replace(time_steps=frozenset(() if step is None else (step,)))
+        return merge_requirements(requirements, *(driver.requirements(road) for driver in self.active_drivers(road)))
 
     def active_drivers(self, road: RoadInterface | None) -> Iterable["Driver"]:
         """Return the drivers that it contains and that drive on a road; None: on any."""
@@ -149,9 +149,9 @@ def check_memory(memory: Any, rows: int, context: str) -> Memory:
         raise InputError(f"{context} returns the memory {memory!r:.60}; allowed: a dict of arrays")
     for name, values in leaves(memory):
         if (shape := getattr(values, "shape", ()))[:1] != (rows,):
-            found = f"an array of shape {shape}" if shape else f"{values!r:.60}"
+            answer_text = f"an array of shape {shape}" if shape else f"{values!r:.60}"
             allowed = f"allowed: arrays of shape ({rows}, ...), one row for each CAV"
-            raise InputError(f"{context} returns {found} as {name!r} of the memory; {allowed}")
+            raise InputError(f"{context} returns {answer_text} as {name!r} of the memory; {allowed}")
     return memory
 
 

@@ -78,8 +78,8 @@ class Network:
         else:
             mean, log_std = self._outputs_on_tensors(observation).T
         xp = np if isinstance(observation, tuple) else namespace(observation)
-        found = self.authority * xp.tanh(mean + xp.exp(log_std.clip(*LOG_STD_RANGE)) * noise)
-        return float(found) if isinstance(observation, tuple) else found
+        action = self.authority * xp.tanh(mean + xp.exp(log_std.clip(*LOG_STD_RANGE)) * noise)
+        return float(action) if isinstance(observation, tuple) else action
 
     def _outputs_on_tensors(self, observation: Array) -> Array:
         hidden = self._hidden_units_of_tensors(observation)

@@ -286,8 +286,8 @@ def feature(name: NetworkInput) -> Feature:
 
 def load_feature(file: FileReference) -> tuple[Feature, FileReference]:
     """Return a user's feature, and its reference with the hash of the code; `InputError` as `load_object_once`."""
-    found, file = file.load_object_once()
-    return _user_feature(UserFunction.from_object(found, "a LocalState", file)), file
+    loaded, file = file.load_object_once()
+    return _user_feature(UserFunction.from_object(loaded, "a LocalState", file)), file
 
 
 def _user_feature(function: UserFunction) -> Feature:
@@ -314,11 +314,11 @@ def _user_feature(function: UserFunction) -> Feature:
 
 
 def _feature_columns(function: UserFunction, state: LocalState, size: int | None = None) -> Floats:
-    rows, found = len(state.speed), as_numbers(function(state), f"{function.label}: feature")
-    columns = found[:, None] if found.ndim == 1 else found
+    rows, values = len(state.speed), as_numbers(function(state), f"{function.label}: feature")
+    columns = values[:, None] if values.ndim == 1 else values
     if columns.ndim != 2 or columns.shape != (rows, columns.shape[1] if size is None else size):
         allowed = f"({rows},) or ({rows}, m)" if size is None else f"({rows}, {size})" + f" or ({rows},)" * (size == 1)
-        shape = f"{found.shape} for {format_count(rows, 'CAV')}"
+        shape = f"{values.shape} for {format_count(rows, 'CAV')}"
         raise InputError(f"{function.label}: feature has shape {shape}; allowed: {allowed}")
     return columns
 
@@ -332,8 +332,10 @@ def observation_inputs(names: Sequence[NetworkInput], expert: Driver) -> tuple[S
     """Return the descriptions of a network's inputs with this expert, in the order of `compute_observation`."""
     described = sum(len(feature(name).inputs or ()) for name in names)
     remaining = range(observation_size(names, expert) - described)
-    own = expert.memory_inputs or tuple(ScaledInput(f"expert memory {number}", 1.0, "") for number in remaining)
-    return tuple(entry for name in names for entry in (feature(name).inputs or own))
+    expert_inputs = expert.memory_inputs or tuple(
+        ScaledInput(f"expert memory {number}", 1.0, "") for number in remaining
+    )
+    return tuple(entry for name in names for entry in (feature(name).inputs or expert_inputs))
 
 
 def observation_size(names: Sequence[NetworkInput], expert: Driver) -> int:

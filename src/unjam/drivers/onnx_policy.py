@@ -54,13 +54,13 @@ class OnnxPolicy:
         outputs = [self.output, *(entry.output for entry in self.memory)]
         session = _cached_session(self.graph)
         if self.is_batched:
-            found = run_session(session, outputs, values)
+            answers = run_session(session, outputs, values)
         else:
             rows = range(len(observation))
             single = [run_session(session, outputs, {k: v[row : row + 1] for k, v in values.items()}) for row in rows]
-            found = [np.concatenate(parts) for parts in zip(*single, strict=True)]
-        numbers, *after = found
-        return numbers, dict(zip(memory, after, strict=True))
+            answers = [np.concatenate(parts) for parts in zip(*single, strict=True)]
+        numbers, *new_values = answers
+        return numbers, dict(zip(memory, new_values, strict=True))
 
     def _as_input(self, name: str, columns: NDArray[np.float64]) -> NDArray[Any]:
         tensor = self.tensors[name]
@@ -106,8 +106,8 @@ def _read_policy(content: bytes, description: PolicyDescription, expert: Driver)
     columns = _assign_columns(description, expert, [name for name in inputs if name not in remembered])
     for name, positions in columns.items():
         _check_columns(name, inputs[name].shape, len(positions))
-    others = {entry.output for entry in description.memory}
-    names = [name for name in outputs if name not in others]
+    memory_outputs = {entry.output for entry in description.memory}
+    names = [name for name in outputs if name not in memory_outputs]
     output = description.output.tensor
     if output not in names and (output or len(names) != 1):
         raise unknown_name("output.tensor", output, names)
@@ -157,15 +157,15 @@ def _check_columns(name: str, shape: tuple[int, ...] | None, count: int) -> None
 def _check_memory(memory: PolicyMemory, inputs: dict[str, Tensor], outputs: dict[str, Tensor]) -> None:
     if memory.output not in outputs:
         raise unknown_name("memory.output", memory.output, outputs)
-    given, returned = inputs[memory.input], outputs[memory.output]
-    shape = given.shape
+    received, returned = inputs[memory.input], outputs[memory.output]
+    shape = received.shape
     if shape is None or shape[:1] not in ((0,), (1,)) or 0 in shape[1:] or np.prod(shape[1:]) > MAX_MEMORY_NUMBERS:
         allowed = f"(n, fixed lengths), at most {MAX_MEMORY_NUMBERS:,} numbers"
         raise InputError(f"memory {memory.input!r}: shape {_shape_text(shape)} is not allowed; allowed: {allowed}")
-    if returned.type != given.type:
+    if returned.type != received.type:
         raise InputError(f"memory {memory.output!r}: the type of {memory.input!r} is not allowed; allowed: the same")
     try:
-        np.broadcast_to(np.array(memory.initial, given.type), shape[1:])
+        np.broadcast_to(np.array(memory.initial, received.type), shape[1:])
     except (TypeError, ValueError):
         allowed = f"a number, or numbers of shape {shape[1:]}"
         raise InputError(f"memory {memory.input!r}: initial value is not allowed; allowed: {allowed}") from None
@@ -180,10 +180,10 @@ def _probe(driver: OnnxDriver) -> None:
     size = observation_size(driver.features, driver.expert)
     observation = np.random.default_rng(0).uniform(0.0, 1.0, (PROBE_ROWS, size))
     initial = driver.policy_memory(PROBE_ROWS)
-    _, after = driver.evaluate(observation, initial)
+    _, new_memory = driver.evaluate(observation, initial)
     for name, rows in initial.items():
-        if np.shape(after[name]) != rows.shape:
-            raise InputError(f"memory {name!r}: returns shape {np.shape(after[name])}; allowed: {rows.shape}")
+        if np.shape(new_memory[name]) != rows.shape:
+            raise InputError(f"memory {name!r}: returns shape {np.shape(new_memory[name])}; allowed: {rows.shape}")
     check_row_independence(
         lambda rows: driver.evaluate(observation[rows], driver.policy_memory(len(observation[rows])))[0], "graph"
     )

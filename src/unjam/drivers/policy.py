@@ -146,21 +146,21 @@ class PolicyDriver(ExpertWrapper):
         self, observation: Any, state: LocalState, memory: Memory, noise: NoiseSampler | None
     ) -> tuple[Array, Memory]:
         """Return the output of the policy as acceleration, and its new memory."""
-        numbers, after = self.evaluate(observation, memory[POLICY_KEY])
+        numbers, new_memory = self.evaluate(observation, memory[POLICY_KEY])
         step = self.action_repeat * (self.time_step or 0.0)
-        return self.description.output.acceleration(numbers, state, step), {POLICY_KEY: after}
+        return self.description.output.acceleration(numbers, state, step), {POLICY_KEY: new_memory}
 
     def evaluate(self, observation: Any, memory: Memory) -> tuple[Array, Memory]:
         """Return the numbers of the policy, shape (n,), and its new memory; `InputError` unless they are finite."""
         rows, xp = len(observation), namespace(observation)
-        answer, after = self.policy(observation, memory)
+        answer, new_memory = self.policy(observation, memory)
         numbers = np.asarray(answer) if xp is np else xp.as_tensor(answer)
         if numbers.shape not in ((rows,), (rows, 1)):
-            found = f"returns shape {numbers.shape} for {format_count(rows, 'CAV')}"
-            raise InputError(f"driver {self.label}: {found}; allowed: ({rows},) or ({rows}, 1)")
+            problem = f"returns shape {numbers.shape} for {format_count(rows, 'CAV')}"
+            raise InputError(f"driver {self.label}: {problem}; allowed: ({rows},) or ({rows}, 1)")
         if not (is_finite := xp.isfinite(numbers)).all():
             raise InputError(f"driver {self.label}: returns {numbers[~is_finite][0]}; allowed: finite")
-        return numbers.reshape(rows), after
+        return numbers.reshape(rows), new_memory
 
     def describe(self) -> str:
         """Return the name of the policy, after the expert's description if there is one."""

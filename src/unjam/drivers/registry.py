@@ -115,9 +115,9 @@ def user_code_recipes(recipe: Any) -> list[Recipe]:
     files = [part for part in parts if part["kind"] == "file"]
     for residual in (part for part in parts if part["kind"] == "residual"):
         listed = residual.get("files", [])
-        if not listed and (own := [name for name in residual.get("inputs", []) if name not in FEATURES]):
+        if not listed and (user_features := [name for name in residual.get("inputs", []) if name not in FEATURES]):
             allowed = "features whose files the recipe lists with their hashes"
-            raise invalid_value("driver recipe: input", own[0], allowed)
+            raise invalid_value("driver recipe: input", user_features[0], allowed)
         files += listed
     return files
 

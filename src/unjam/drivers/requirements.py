@@ -63,8 +63,12 @@ class Requirements(NamedTuple):
             return f"it needs {', '.join(missing)}"
         if self.needs_coordinate and not road.has_coordinate:
             return "it needs positions along the road"
-        others = self.other_time_steps(road.control_step)
-        return f"its time_step is {others[0]:g} s; allowed: {road.control_step:g} s, the control step" if others else ""
+        other_steps = self.other_time_steps(road.control_step)
+        return (
+            f"its time_step is {other_steps[0]:g} s; allowed: {road.control_step:g} s, the control step"
+            if other_steps
+            else ""
+        )
 
     def other_time_steps(self, control_step: float) -> list[float]:
         """Return the control steps that its formulas assume and that differ from `control_step` [s], in order."""

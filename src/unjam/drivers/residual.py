@@ -55,8 +55,8 @@ class ExpertWrapper(DriverWrapper):
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of the expert and, with an action repeat, the residual and its age."""
-        own = {} if self.action_repeat == 1 else {RESIDUAL_KEY: np.zeros(n), RESIDUAL_AGE_KEY: np.zeros(n)}
-        return {**super().initial_memory(n), **own}
+        own_memory = {} if self.action_repeat == 1 else {RESIDUAL_KEY: np.zeros(n), RESIDUAL_AGE_KEY: np.zeros(n)}
+        return {**super().initial_memory(n), **own_memory}
 
     def residual(
         self, observation: Any, state: LocalState, memory: Memory, noise: NoiseSampler | None
@@ -67,23 +67,23 @@ class ExpertWrapper(DriverWrapper):
     def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
         """Return the decision with its components; with `noise`, the residual explores."""
         acceleration, expert_memory = self.expert.act(state, memory[EXPERT_KEY])
-        limits, repeat, after = self.limits, self.action_repeat, {}
+        limits, repeat, new_memory = self.limits, self.action_repeat, {}
         expert = acceleration if limits is None else limits.clip(acceleration)
         is_due: Any = True if repeat == 1 else memory[RESIDUAL_AGE_KEY] % repeat == 0
         if is_due is False:  # only for plain numbers: the residual is not computed
             observation, residual = (), memory[RESIDUAL_KEY]
         else:
             observation = compute_observation(self.features, FeatureInputs(state, expert, self.expert, expert_memory))
-            residual, after = self.residual(observation, state, memory, noise)
+            residual, new_memory = self.residual(observation, state, memory, noise)
             if is_due is not True:
                 residual = namespace(residual).where(is_due, residual, memory[RESIDUAL_KEY])
-                after = map_leaves(partial(select_rows, is_due), after, memory)
-        after = {**memory, EXPERT_KEY: expert_memory, **after}
+                new_memory = map_leaves(partial(select_rows, is_due), new_memory, memory)
+        new_memory = {**memory, EXPERT_KEY: expert_memory, **new_memory}
         if repeat > 1:
-            after |= {RESIDUAL_KEY: residual, RESIDUAL_AGE_KEY: memory[RESIDUAL_AGE_KEY] + 1.0}
+            new_memory |= {RESIDUAL_KEY: residual, RESIDUAL_AGE_KEY: memory[RESIDUAL_AGE_KEY] + 1.0}
         total = expert + residual
         command = Command(total if limits is None else limits.clip(total), self.time_gaps(state, memory))
-        return Decision(command, expert, residual, observation, after)
+        return Decision(command, expert, residual, observation, new_memory)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the deterministic acceleration, clip(expert + residual), and the new memory."""
@@ -111,13 +111,13 @@ class ResidualDriver(ExpertWrapper):
     def __post_init__(self) -> None:
         if self.network.authority > (highest := MAX_AUTHORITY * self.action_limit):
             raise invalid_value("network: authority", self.network.authority, f"at most {highest} m/s2")
-        own = [FileReference.parse(name) for name in self.inputs if name not in FEATURES]
-        files = self.files or own  # those of a recipe have absolute paths, and hashes
-        if list(map(str, own)) != list(map(str, files)):
-            raise invalid_value("files", list(map(str, files)), f"{list(map(str, own))}, as in inputs")
+        references = [FileReference.parse(name) for name in self.inputs if name not in FEATURES]
+        files = self.files or references  # those of a recipe have absolute paths, and hashes
+        if list(map(str, references)) != list(map(str, files)):
+            raise invalid_value("files", list(map(str, files)), f"{list(map(str, references))}, as in inputs")
         loaded = list(map(load_feature, files))
-        found = iter(loaded)
-        features = tuple(FEATURES.get(name) or next(found)[0] for name in self.inputs)
+        next_loaded = iter(loaded)
+        features = tuple(FEATURES.get(name) or next(next_loaded)[0] for name in self.inputs)
         object.__setattr__(self, "features", features)
         object.__setattr__(self, "files", tuple(file for _, file in loaded))
 
@@ -139,8 +139,8 @@ class ResidualDriver(ExpertWrapper):
 
     def observation(self, state: LocalState, memory: Memory) -> Array:
         """Return the current input of the network, also while its residual is repeated."""
-        acceleration, after = self.expert.act(state, memory[EXPERT_KEY])
-        inputs = FeatureInputs(state, self.limits.clip(acceleration), self.expert, after)
+        acceleration, new_memory = self.expert.act(state, memory[EXPERT_KEY])
+        inputs = FeatureInputs(state, self.limits.clip(acceleration), self.expert, new_memory)
         return compute_observation(self.features, inputs)
 
     def describe(self) -> str:

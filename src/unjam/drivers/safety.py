@@ -152,13 +152,13 @@ class SafetyFilter(Subclassable):
 
     @model_validator(mode="after")
     def _check_braking(self) -> "SafetyFilter":
-        own, leader, time_gap = self.braking, self.leader_braking, self.time_gap_braking
-        if leader < own:  # else the gap may be smallest before both stand
-            raise ValueError(f"leader_braking: {leader:g} is not allowed; allowed: >= braking, {own:g}")
+        own_braking, leader, time_gap = self.braking, self.leader_braking, self.time_gap_braking
+        if leader < own_braking:  # else the gap may be smallest before both stand
+            raise ValueError(f"leader_braking: {leader:g} is not allowed; allowed: >= braking, {own_braking:g}")
         if leader > MAX_LEADER_BRAKING:
             raise ValueError(f"leader_braking: {leader:g} is not allowed; allowed: <= {MAX_LEADER_BRAKING:g}")
-        if not MIN_TIME_GAP_BRAKING <= time_gap <= own:
-            allowed = f"{MIN_TIME_GAP_BRAKING:g} to braking, {own:g}"
+        if not MIN_TIME_GAP_BRAKING <= time_gap <= own_braking:
+            allowed = f"{MIN_TIME_GAP_BRAKING:g} to braking, {own_braking:g}"
             raise ValueError(f"time_gap_braking: {time_gap:g} is not allowed; allowed: {allowed}")
         return self
 
@@ -278,17 +278,17 @@ class SafetyFilter(Subclassable):
             return acceleration
         limited = np.array(acceleration)
         pending = tuple(command[rows] for command in actuator_state.pending)
-        own = actuator, ActuatorState(actuator_state.acceleration[rows], pending)
+        selected = actuator, ActuatorState(actuator_state.acceleration[rows], pending)
         near = FollowingState(*(values[rows] for values in state))
-        limited[rows] = np.minimum(limited[rows], self.max_acceleration(near, step, own))
+        limited[rows] = np.minimum(limited[rows], self.max_acceleration(near, step, selected))
         return limited
 
     def _is_clearly_safe(self, speed: float, leader: float, gap: float, step: float) -> bool:
         """Return whether simple bounds prove that braking from a speed keeps both gaps."""
         # Stopping distances are at least v (v / b - h) / 2, and at most b h h / 8 more.
         half, square, leader_square = (leader - speed) * step / 2.0, speed * speed / 2.0, leader * leader / 2.0
-        braking, own, error = self.time_gap_braking, self.braking, step * step / 8.0
-        at_end = leader_square / self.leader_braking - square / own - half - own * error
+        braking, own_braking, error = self.time_gap_braking, self.braking, step * step / 8.0
+        at_end = leader_square / self.leader_braking - square / own_braking - half - own_braking * error
         with_time_gap = min((leader_square - square) / braking - half - braking * error, 0.0)
         return gap + at_end >= 0.0 and gap + with_time_gap >= self.time_gap * speed
 
@@ -345,8 +345,8 @@ class CAVActuation:
     def apply(self, name: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
         """Return the filtered command for a desired acceleration, and the acceleration in this simulation step."""
         actuator, step = self._actuator, self._step
-        before = self._states.get(name) or actuator.initial_state(state.speed, step)
-        command, after = actuate(self._safety, actuator, acceleration, state, before, step)
+        previous_state = self._states.get(name) or actuator.initial_state(state.speed, step)
+        command, new_state = actuate(self._safety, actuator, acceleration, state, previous_state, step)
         if self._has_lag:
-            self._states[name] = after
-        return command, after.acceleration
+            self._states[name] = new_state
+        return command, new_state.acceleration

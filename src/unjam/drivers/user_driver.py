@@ -194,8 +194,8 @@ class UserDriver(Driver):
         if isinstance(self.implementation, Driver):
             steps = self.implementation.requirements(road).time_steps
         else:
-            own = getattr(self.implementation, "time_step", None)
-            steps = frozenset({float(own)} if isinstance(own, int | float) else ())
+            declared_step = getattr(self.implementation, "time_step", None)
+            steps = frozenset({float(declared_step)} if isinstance(declared_step, int | float) else ())
         return self.own_requirements._replace(reads_any_field=True, time_steps=steps)
 
     def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -215,25 +215,25 @@ class UserDriver(Driver):
         """Return the memory of the user's driver after the warm-up, if it has `recall`."""
         if not hasattr(self.implementation, "recall"):
             return memory
-        found = self._call_method("recall", memory, history)
-        return check_memory(found, len(history.speed), f"{self.describe()}: recall()")
+        answer = self._call_method("recall", memory, history)
+        return check_memory(answer, len(history.speed), f"{self.describe()}: recall()")
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the user's acceleration and memory; raise `InputError` if the user's code fails, or one is invalid."""
         rows, label = np.size(state.speed), self.describe()
         if rows == 0:  # the user's code may need a row: the minimum of an empty array is an error
             return np.zeros(0), memory
-        found = self._call_method("act", state, memory)
-        if not (isinstance(found, tuple) and len(found) == 2):
-            raise InputError(f"{label}: act() returns {found!r:.60}; allowed: (accelerations, memory)")
-        numbers, after = answer_as_array(found[0], rows, label), check_memory(found[1], rows, f"{label}: act()")
-        is_single = getattr(found[0], "dtype", None) == np.float32  # stays so: rows may differ by its rounding
-        return numbers.astype(np.float32) if is_single else numbers, after
+        answer = self._call_method("act", state, memory)
+        if not (isinstance(answer, tuple) and len(answer) == 2):
+            raise InputError(f"{label}: act() returns {answer!r:.60}; allowed: (accelerations, memory)")
+        numbers, new_memory = answer_as_array(answer[0], rows, label), check_memory(answer[1], rows, f"{label}: act()")
+        is_single = getattr(answer[0], "dtype", None) == np.float32  # stays so: rows may differ by its rounding
+        return numbers.astype(np.float32) if is_single else numbers, new_memory
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time gaps of the user's driver, if it has `time_gaps`."""
-        found, rows = self._call_method("time_gaps", state, memory) if np.size(state.speed) else None, len(state.speed)
-        return None if found is None else answer_as_array(found, rows, self.describe(), "time gap")
+        answer, rows = self._call_method("time_gaps", state, memory) if np.size(state.speed) else None, len(state.speed)
+        return None if answer is None else answer_as_array(answer, rows, self.describe(), "time gap")
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the memory features of the user's driver, if it has `memory_features`."""
@@ -251,8 +251,8 @@ class FileDriver(FileReference, UserDriver):
     def __post_init__(self) -> None:
         object.__setattr__(self, "path", resolve_code_path(str(self.path)))
         code = self.read_code()
-        made = _make_implementation(self.load_object(code), self.time_step, str(self), self.parameters)
-        object.__setattr__(self, "implementation", made)
+        implementation = _make_implementation(self.load_object(code), self.time_step, str(self), self.parameters)
+        object.__setattr__(self, "implementation", implementation)
         object.__setattr__(self, "sha256", code.sha256)
 
     def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -261,10 +261,10 @@ class FileDriver(FileReference, UserDriver):
 
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
         """Return those of the user's driver; a class without `time_step` assumes the argument that it received."""
-        found = super().requirements(road)
-        if found.time_steps or not _takes_time_step(type(self.implementation)):
-            return found
-        return found._replace(time_steps=frozenset({self.parameters.get("time_step", self.time_step)}))
+        requirements = super().requirements(road)
+        if requirements.time_steps or not _takes_time_step(type(self.implementation)):
+            return requirements
+        return requirements._replace(time_steps=frozenset({self.parameters.get("time_step", self.time_step)}))
 
     def describe(self) -> str:
         """Return the names of file and driver, and the given parameters."""

@@ -55,7 +55,7 @@ class CompositeDriver(Driver):
     def inner_drivers(self) -> dict[str, Driver]:
         """The drivers in its fields, in order."""
         parts = (named_parts(self) or {}).items()
-        return {INNER_KEY if name == "driver" else name: each for name, each in parts if isinstance(each, Driver)}
+        return {INNER_KEY if name == "driver" else name: part for name, part in parts if isinstance(part, Driver)}
 
 
 class DriverWrapper(CompositeDriver):
@@ -101,21 +101,23 @@ class MixedDriver(CompositeDriver):
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration by the driver of each CAV, and the new memory."""
         answers = {key: driver.act(state, memory[key]) for key, driver in self.inner_drivers.items()}
-        after = {key: new_memory for key, (_, new_memory) in answers.items()}
-        return self._select(memory, (acceleration for acceleration, _ in answers.values())), {**memory, **after}
+        new_memories = {key: new_memory for key, (_, new_memory) in answers.items()}
+        return self._select(memory, (acceleration for acceleration, _ in answers.values())), {**memory, **new_memories}
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time gap by the driver of each CAV."""
-        return self._select(memory, (each.time_gaps(state, memory[key]) for key, each in self.inner_drivers.items()))
+        return self._select(
+            memory, (driver.time_gaps(state, memory[key]) for key, driver in self.inner_drivers.items())
+        )
 
     def _select(self, memory: Memory, answers: Iterable[Array | None]) -> Array | None:
         """Return the answer by the driver of each CAV, NaN for those without; None if there is no answer."""
-        chosen = None
+        selected = None
         for number, answer in enumerate(answers):
             if answer is not None:
-                others = answer * nan if chosen is None else chosen
-                chosen = namespace(answer).where(memory[DRIVER_INDEX_KEY] == number, answer, others)
-        return chosen
+                previous = answer * nan if selected is None else selected
+                selected = namespace(answer).where(memory[DRIVER_INDEX_KEY] == number, answer, previous)
+        return selected
 
     def describe(self) -> str:
         """Return all of them, joined by +."""
@@ -148,9 +150,9 @@ class ImpairedDriver(DriverWrapper):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration of the inner driver from `delay` ago, and store the current one."""
-        acceleration, after = self.driver.act(self._add_gap_noise(state, memory["step"]), memory[INNER_KEY])
+        acceleration, new_memory = self.driver.act(self._add_gap_noise(state, memory["step"]), memory[INNER_KEY])
         pending = np.concatenate([memory["pending"], np.asarray(acceleration)[:, None]], axis=1)
-        return pending[:, 0], {INNER_KEY: after, "step": memory["step"] + 1.0, "pending": pending[:, 1:]}
+        return pending[:, 0], {INNER_KEY: new_memory, "step": memory["step"] + 1.0, "pending": pending[:, 1:]}
 
     def _add_gap_noise(self, state: LocalState, step: Array) -> LocalState:
         if self.gap_noise == 0.0 or not len(step):
@@ -210,12 +212,12 @@ class FilteredDriver(DriverWrapper):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the filtered acceleration of the inner driver, and the new memory."""
-        acceleration, after = self.driver.act(state, memory[INNER_KEY])
+        acceleration, new_memory = self.driver.act(state, memory[INNER_KEY])
         acceleration = clip(acceleration, -self.action_limit, self.action_limit)
         following, actuator, step = FollowingState(*state[:3]), self.actuator, self.time_step
-        before = ActuatorState(memory.get("acceleration"), tuple(memory[key] for key in self._pending_keys))
-        command, responding = actuate(self.safety, actuator, acceleration, following, before, step)
-        return command, {INNER_KEY: after, **self._actuator_memory(responding)}
+        previous_state = ActuatorState(memory.get("acceleration"), tuple(memory[key] for key in self._pending_keys))
+        command, responding = actuate(self.safety, actuator, acceleration, following, previous_state, step)
+        return command, {INNER_KEY: new_memory, **self._actuator_memory(responding)}
 
     @cached_property
     def _pending_keys(self) -> tuple[str, ...]:
@@ -246,8 +248,8 @@ class HistoryDriver(DriverWrapper):
         """Those of the inner driver, and its own."""
         kinds = (("mean own speed", SPEED_SCALE, "m/s"), ("standard deviation of own speed", SPEED_STD_SCALE, "m/s"))
         entries = [(time, *kind) for time in AVERAGING_TIMES for kind in (*kinds, ("mean gap", MEAN_GAP_SCALE, "m"))]
-        own = (ScaledInput(f"{name} over {time:g} s", scale, unit) for time, name, scale, unit in entries)
-        return (*self.driver.memory_inputs, *own)
+        own_inputs = (ScaledInput(f"{name} over {time:g} s", scale, unit) for time, name, scale, unit in entries)
+        return (*self.driver.memory_inputs, *own_inputs)
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of the inner driver, and means over no steps."""
@@ -263,20 +265,20 @@ class HistoryDriver(DriverWrapper):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration of the inner driver, and the new memory."""
-        acceleration, after = self.driver.act(state, memory[INNER_KEY])
-        return acceleration, {**self._update_means(memory, state.speed, state.leader_gap), INNER_KEY: after}
+        acceleration, new_memory = self.driver.act(state, memory[INNER_KEY])
+        return acceleration, {**self._update_means(memory, state.speed, state.leader_gap), INNER_KEY: new_memory}
 
     def _update_means(self, memory: Memory, speed: Array, gap: Array) -> Memory:
-        xp, after = namespace(speed), dict(memory)
-        after["steps"] = memory["steps"] + 1.0
-        early_weight = 1.0 / after["steps"]
+        xp, new_memory = namespace(speed), dict(memory)
+        new_memory["steps"] = memory["steps"] + 1.0
+        early_weight = 1.0 / new_memory["steps"]
         for time in AVERAGING_TIMES:
             late_weight = 1.0 - exp(-self.time_step / time)
             weight = xp.where(early_weight > late_weight, early_weight, early_weight * 0.0 + late_weight)
             for name, value in zip(MEAN_KEYS, (speed, speed * speed, gap), strict=True):
                 mean = memory[f"{name}_{time:g}"]
-                after[f"{name}_{time:g}"] = mean + weight * (value - mean)
-        return after
+                new_memory[f"{name}_{time:g}"] = mean + weight * (value - mean)
+        return new_memory
 
     def memory_features(self, memory: Memory) -> Array:
         """Return those of the inner driver; mean and standard deviation of speed and mean gap by averaging time."""
@@ -285,9 +287,9 @@ class HistoryDriver(DriverWrapper):
             speed, square, gap = (memory[f"{name}_{time:g}"] for name in MEAN_KEYS)
             deviation = square_root(clamp_min(square - speed * speed, 0.0) + 1e-9)  # never the root of zero
             columns += [speed / SPEED_SCALE, deviation / SPEED_STD_SCALE, gap / MEAN_GAP_SCALE]
-        own = stack_columns(tuple(columns))
-        others = self.driver.memory_features(memory[INNER_KEY])
-        return own if others is None else join_columns([others, own])
+        own_columns = stack_columns(tuple(columns))
+        inner_columns = self.driver.memory_features(memory[INNER_KEY])
+        return own_columns if inner_columns is None else join_columns([inner_columns, own_columns])
 
     def describe(self) -> str:
         """Return the inner driver, and that it has a history."""
@@ -311,30 +313,30 @@ class QueueFallback(CompositeDriver):
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memories of both, without elapsed time [s], queue and switch."""
-        own = {key: np.zeros(n) for key in ("elapsed", "has_gathered", "gave_up")}
-        return {**super().initial_memory(n), **own}
+        own_memory = {key: np.zeros(n) for key in ("elapsed", "has_gathered", "gave_up")}
+        return {**super().initial_memory(n), **own_memory}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration by the active driver, and the new memory; that of the fallback starts with it."""
-        after = self._update_memory(state, memory)
-        gave_up = after["gave_up"]
+        new_memory = self._update_memory(state, memory)
+        gave_up = new_memory["gave_up"]
         if type(gave_up) is float:
             key, driver = ("fallback", self.fallback) if gave_up else ("primary", self.primary)
-            acceleration, after[key] = driver.act(state, memory[key])
-            return acceleration, after
-        acceleration, after["primary"] = self.primary.act(state, memory["primary"])
+            acceleration, new_memory[key] = driver.act(state, memory[key])
+            return acceleration, new_memory
+        acceleration, new_memory["primary"] = self.primary.act(state, memory["primary"])
         fallback_acceleration, fallback_memory = self.fallback.act(state, memory["fallback"])
         select = partial(select_rows, gave_up > 0.0)
-        after["fallback"] = map_leaves(select, fallback_memory, memory["fallback"])
-        return select(fallback_acceleration, acceleration), after
+        new_memory["fallback"] = map_leaves(select, fallback_memory, memory["fallback"])
+        return select(fallback_acceleration, acceleration), new_memory
 
     def _update_memory(self, state: LocalState, memory: Memory) -> Memory:
         free, elapsed = state.leader_gap / state.loop_length, memory["elapsed"] + self.time_step
-        xp, one = namespace(free), memory["has_gathered"] * 0.0 + 1.0
-        gathered = xp.where(free >= GATHERED_LAP_FRACTION, one, memory["has_gathered"])
+        xp, ones = namespace(free), memory["has_gathered"] * 0.0 + 1.0
+        gathered = xp.where(free >= GATHERED_LAP_FRACTION, ones, memory["has_gathered"])
         is_broken = (gathered > 0.0) & (free < BROKEN_LAP_FRACTION)
         failed = is_broken | ((gathered == 0.0) & (elapsed > MAX_GATHERING_TIME))
-        gave_up = xp.where(failed, one, memory["gave_up"])
+        gave_up = xp.where(failed, ones, memory["gave_up"])
         return {**memory, "elapsed": elapsed, "has_gathered": gathered, "gave_up": gave_up}
 
     def describe(self) -> str:
@@ -376,8 +378,8 @@ class RoadTypeSwitch(CompositeDriver):
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration by the driver for this road type, and the new memory."""
         name = self._road_type(state)
-        acceleration, after = self.inner_drivers[name].act(state, memory[name])
-        return acceleration, {**memory, name: after}
+        acceleration, new_memory = self.inner_drivers[name].act(state, memory[name])
+        return acceleration, {**memory, name: new_memory}
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return those of the driver for this road type."""

@@ -36,9 +36,9 @@ class ExternalDriver(Driver):
 
     def observation(self, state: LocalState, memory: Memory) -> Any:
         """Return the external observation as `compute_observation`, and store the expert's acceleration."""
-        acceleration, after = self.expert.act(state, memory[INNER_KEY])
-        self._expert_acceleration, self._next_memory = self._limits.clip(acceleration), {INNER_KEY: after}
-        inputs = FeatureInputs(state, self._expert_acceleration, self.expert, after)
+        acceleration, new_memory = self.expert.act(state, memory[INNER_KEY])
+        self._expert_acceleration, self._next_memory = self._limits.clip(acceleration), {INNER_KEY: new_memory}
+        inputs = FeatureInputs(state, self._expert_acceleration, self.expert, new_memory)
         return compute_observation(self.features, inputs)
 
     def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:

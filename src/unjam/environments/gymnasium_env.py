@@ -217,7 +217,7 @@ class RoadStepper:
 
     def step(self, actions: Any) -> RoadStepResult:
         """Advance one control step with `actions` [m/s2], (CAVs,), and on without CAVs until the next one enters."""
-        world, before, last_observations = self.world, list(self.world.cav_ids), self._observations
+        world, previous_ids, last_observations = self.world, list(self.world.cav_ids), self._observations
         self._driver.actions = float(actions[0]) if world.is_scalar else np.asarray(actions, np.float64)
         if next(self._control_steps, None) is None:
             raise UnjamError("step: the episode is over; allowed: reset")
@@ -225,7 +225,7 @@ class RoadStepper:
         departed = {}
         if rows is not None:
             accelerations = accelerations[list(rows)]
-            departed = {name: last_observations[row] for row, name in enumerate(before) if row not in rows}
+            departed = {name: last_observations[row] for row, name in enumerate(previous_ids) if row not in rows}
         time_gaps, speed = time_gap(state.leader_gap, state.speed), state.speed
         if not world.is_scalar:
             time_gaps, speed = time_gaps[: len(accelerations)], np.array(speed[: len(accelerations)])
@@ -271,12 +271,12 @@ class RoadStepper:
         return self._world
 
     def _observe(self) -> Observations:
-        found = self._drive_loop.observe()
+        observed = self._drive_loop.observe()
         low, high = -MAX_OBSERVATION, MAX_OBSERVATION
         if self.world.is_scalar:  # a call of NumPy would take longer than those for the floats
-            self._observations = np.array([[clip(value, low, high) for value in found]], np.float32)
+            self._observations = np.array([[clip(value, low, high) for value in observed]], np.float32)
         else:
-            self._observations = clip(found, low, high).astype(np.float32)
+            self._observations = clip(observed, low, high).astype(np.float32)
         return self._observations
 
     def end_episode(self) -> None:

@@ -90,20 +90,20 @@ class SlottedRoadEnv(RoadAgents):
             raise InputError(f"step: no action for {', '.join(missing)}; allowed: one for each occupied slot")
         if unknown := actions.keys() - set(self.possible_agents):
             raise unknown_name("step: slot", min(unknown, key=str), self.possible_agents)
-        before = self._cavs
+        previous_cavs = self._cavs
         commands = dict.fromkeys(self._environment.agents, 0.0)
-        commands |= {name: as_action(actions[slot], slot) for slot, name in before.items()}
+        commands |= {name: as_action(actions[slot], slot) for slot, name in previous_cavs.items()}
         observations, rewards, terminations, _, infos = self._environment.step(commands)
         present, is_terminated = set(self._environment.agents), any(terminations.values())
         has_ended = not present
-        left = {} if has_ended else {slot: name for slot, name in before.items() if name not in present}
-        self._cavs = {slot: name for slot, name in before.items() if slot not in left}
-        self._assign_slots([slot for slot in self.possible_agents if slot not in before])
+        left = {} if has_ended else {slot: name for slot, name in previous_cavs.items() if name not in present}
+        self._cavs = {slot: name for slot, name in previous_cavs.items() if slot not in left}
+        self._assign_slots([slot for slot in self.possible_agents if slot not in previous_cavs])
         slots, shown = self.possible_agents, self._cavs | left
         self.agents = [] if has_ended else list(slots)
         return (
             self._observe(observations, shown),
-            {slot: rewards[before[slot]] if slot in before else 0.0 for slot in slots},
+            {slot: rewards[previous_cavs[slot]] if slot in previous_cavs else 0.0 for slot in slots},
             dict.fromkeys(slots, is_terminated),
             dict.fromkeys(slots, has_ended and not is_terminated),
             self._infos(infos, shown, left),
@@ -121,11 +121,11 @@ class SlottedRoadEnv(RoadAgents):
         return {slot: observations[shown[slot]] if slot in shown else empty.copy() for slot in self.possible_agents}
 
     def _infos(self, infos: dict[str, Any], shown: dict[str, str], left: dict[str, str]) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        entries: dict[str, Any] = {}
         # At the end all slots have the metrics: the CAVs that are there may have none.
         metrics = [info["episode_metrics"] for info in infos.values() if "episode_metrics" in info]
         final = {"episode_metrics": metrics[0]} if metrics else {}
         for slot in self.possible_agents:
             state = {"is_occupied": slot in self._cavs, "has_left": slot in left, "vehicle": shown.get(slot, "")}
-            found[slot] = final | infos.get(state["vehicle"], {}) | state
-        return found
+            entries[slot] = final | infos.get(state["vehicle"], {}) | state
+        return entries

@@ -89,8 +89,8 @@ class Episodes:
     def observe(self) -> None:
         """Let the driver observe the current state, once in each control step."""
         self._state = self.world.local_state()
-        found = self._driver.observation(self._state, self._memory)
-        self.observations = clip(found, -MAX_OBSERVATION, MAX_OBSERVATION)
+        observation = self._driver.observation(self._state, self._memory)
+        self.observations = clip(observation, -MAX_OBSERVATION, MAX_OBSERVATION)
 
     def detach(self) -> None:
         """Let no gradients flow through earlier steps."""
@@ -214,11 +214,11 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         rows, seeds = self._rows_to_reset({} if options is None else options), self._seeds_of_environments(seed)
         warn_of_reserved_seed(*seeds)
         for row in rows:
-            given = seeds[row]
-            if given is None and self._seeds[row] is None:
-                given = int(self.np_random.integers(2**31))
-            if given is not None:
-                self._seeds[row], self._episode_counts[row] = given, 0
+            row_seed = seeds[row]
+            if row_seed is None and self._seeds[row] is None:
+                row_seed = int(self.np_random.integers(2**31))
+            if row_seed is not None:
+                self._seeds[row], self._episode_counts[row] = row_seed, 0
                 self._prepared.pop(row, None)
         if len(rows) == self.num_envs and not self._prepared:
             self._kind = self._make_array_kind((self._seeds[0] or 0, self._episode_counts[0]))
@@ -250,8 +250,8 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
             super().reset(seed=as_seed(seed)[0])
             return list(range(int(seed), int(seed) + self.num_envs))
         try:
-            given = [None] * self.num_envs if seed is None else seed
-            seeds = [None if seed is None else as_seed(index(seed))[0] for seed in given]
+            seeds_or_none = [None] * self.num_envs if seed is None else seed
+            seeds = [None if seed is None else as_seed(index(seed))[0] for seed in seeds_or_none]
         except TypeError:
             raise invalid_value("seed", seed, "an integer, or one for each environment") from None
         if len(seeds) != self.num_envs:
@@ -350,15 +350,15 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
     def _as_actions(self, actions: Any) -> Array:
         shape = self._actions_shape
         allowed = f"finite numbers of shape {shape}"
-        found = as_numbers(actions, "step: actions", allowed, self._kind.to_array)
-        if tuple(found.shape) not in (shape, shape[:-1]):
-            raise InputError(f"step: actions of shape {tuple(found.shape)} are not allowed; allowed: {shape}")
-        found = self._without_ignored(found.reshape(shape[:-1]))
-        if not bool((is_finite := namespace(found).isfinite(found)).all()):
+        values = as_numbers(actions, "step: actions", allowed, self._kind.to_array)
+        if tuple(values.shape) not in (shape, shape[:-1]):
+            raise InputError(f"step: actions of shape {tuple(values.shape)} are not allowed; allowed: {shape}")
+        values = self._without_ignored(values.reshape(shape[:-1]))
+        if not bool((is_finite := namespace(values).isfinite(values)).all()):
             index = tuple(np.argwhere(as_numpy(is_finite) == 0.0)[0])
-            reason = f"{float(found[index])} of environment {index[0]} is not allowed"
+            reason = f"{float(values[index])} of environment {index[0]} is not allowed"
             raise InputError(f"step: actions: {reason}; allowed: {allowed}")
-        return found
+        return values
 
     def _without_ignored(self, actions: Array) -> Array:
         """Return actions with zeros in place of those that are ignored: those of episodes that have ended."""

@@ -260,9 +260,9 @@ def _minimize_on_grid(errors: Callable[[Floats], Floats], grid: Floats, group_co
     if len(inner):
         bracket = tuple(grid[best[inner] + shift] for shift in (-1, 0, 1))
         tolerances = {"xatol": CALIBRATION_TOLERANCE}
-        found = elementwise.find_minimum(refined_errors, bracket, args=(inner,), tolerances=tolerances)
-        is_better = found.f_x <= grid_errors.min(0)[inner]
-        values[inner[is_better]] = found.x[is_better]
+        minimum = elementwise.find_minimum(refined_errors, bracket, args=(inner,), tolerances=tolerances)
+        is_better = minimum.f_x <= grid_errors.min(0)[inner]
+        values[inner[is_better]] = minimum.x[is_better]
     return values
 
 

@@ -87,9 +87,9 @@ class FittedDrivers:
         if collisions:
             lines.append(f"in the simulation, {format_count(collisions, 'driver')} had a collision with the leader")
         if "residual_gap_errors" in fit:
-            before, best = fit["residual_gap_errors"][0], min(fit["residual_gap_errors"])
+            first_error, best = fit["residual_gap_errors"][0], min(fit["residual_gap_errors"])
             use = "used" if fit["residual_is_better"] else "not used, because it is not better"
-            lines.append(f"residual: {use}: {before:.2f} m without, {best:.2f} m with it, on validation drivers")
+            lines.append(f"residual: {use}: {first_error:.2f} m without, {best:.2f} m with it, on validation drivers")
         return lines
 
 
@@ -205,11 +205,11 @@ def _calibrate_in_rounds(
             ]
             typical = calibrate_idm(trajectories, settings.calibration, factors).parameters
         arguments = typical, settings.individual, settings.calibration
-        own = calibrate_groups(groups, *arguments, lambda done: on_progress(done, len(names)))
-        calibrated = dict(zip(names, own, strict=True))
+        fits = calibrate_groups(groups, *arguments, lambda done: on_progress(done, len(names)))
+        calibrated = dict(zip(names, fits, strict=True))
     if has_own_headways:  # until now only the products of common headway and factors mattered
-        (one,) = calibrate_groups([trajectories], typical, ["time_headway"], settings.calibration)
-        typical = one.parameters
+        (common_fit,) = calibrate_groups([trajectories], typical, ["time_headway"], settings.calibration)
+        typical = common_fit.parameters
     return typical, calibrated
 
 

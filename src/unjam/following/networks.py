@@ -196,12 +196,12 @@ def fit_multi_step(
     torch.set_num_threads(1)
     network = FollowingNetwork(settings, following_samples(training.trajectories), seed, zero_init=True)
     segments = make_segments(training.trajectories, settings.segment_seconds)
-    whole = make_segments(validation.trajectories)
-    base = validation.model(whole.trajectory_index, limits)
+    whole_segments = make_segments(validation.trajectories)
+    base = validation.model(whole_segments.trajectory_index, limits)
 
     def gap_error() -> float:
         model = leader_replay.add_residual(base, batched_network(network.to_numpy_network()), limits)
-        return float(np.sqrt(leader_replay.simulate_followers(model, whole).gap_mse).mean())
+        return float(np.sqrt(leader_replay.simulate_followers(model, whole_segments).gap_mse).mean())
 
     optimizer = Adam(network.parameters(), lr=settings.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.gradient_steps)

@@ -74,9 +74,12 @@ def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
         raise InputError(f"detectors: {str(path)!r} cannot be read: {reason}") from None
     if not lines:
         raise InputError(f"{path.name}: has no rows; allowed: one measurement at least")
-    in_order = sorted(lines, key=lambda each: (each[1].place, each[1].position, each[1].begin, each[0]))
-    for (first, before), (line, row) in pairwise(in_order):
-        if (row.place, row.position) == (before.place, before.position) and row.begin < before.end - TIME_TOLERANCE:
+    in_order = sorted(lines, key=lambda entry: (entry[1].place, entry[1].position, entry[1].begin, entry[0]))
+    for (first, previous_row), (line, row) in pairwise(in_order):
+        if (row.place, row.position) == (
+            previous_row.place,
+            previous_row.position,
+        ) and row.begin < previous_row.end - TIME_TOLERANCE:
             allowed = "intervals of a detector that do not overlap"
             raise InputError(f"{path.name}: line {line}: overlaps the interval of line {first}; allowed: {allowed}")
     return kinds[0], [row for _, row in lines]
@@ -141,7 +144,7 @@ def _unique_passages(passages: Sequence[DetectorPassage]) -> Floats:
     """
     last_passages: dict[str, tuple[float, int]] = {}
     rows: list[tuple[float, float]] = []
-    for passage in sorted(passages, key=lambda one: one.time):
+    for passage in sorted(passages, key=lambda entry: entry.time):
         last_time, row = last_passages.get(passage.vehicle, (-np.inf, len(rows)))
         if passage.time - last_time > SAME_PASSAGE_SECONDS:
             row = len(rows)

@@ -84,7 +84,7 @@ def overall_feasibility(rows: EpisodeRows, baseline: EpisodeRows = ()) -> str:
     verdicts = list(map(feasibility, own_rows))
     violating = [row for row, verdict in zip(own_rows, verdicts, strict=True) if verdict not in ("", FEASIBLE)]
     if violating:
-        worst = [min(_violations(row, None), key=lambda each: each[0]) for row in violating]
+        worst = [min(_violations(row, None), key=lambda violation: violation[0]) for row in violating]
         _, _, reason = min(worst, key=lambda each: (each[0], -each[1]))
         return f"{reason} ({len(violating)} of {len(rows)})"
     pairs = zip(rows, verdicts, strict=True)

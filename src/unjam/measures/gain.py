@@ -37,8 +37,8 @@ def performance_bound(row: dict[str, Any]) -> float:
 
 def is_gain_negligible(baseline: EpisodeRows, reference: Sequence[float]) -> bool:
     """Return whether the reference is hardly better than the human baseline, so that there is nothing to gain."""
-    before = float(np.mean([performance(row) for row in baseline]))
-    return float(np.mean(reference)) - before < MIN_REFERENCE_GAIN * abs(before)
+    baseline_mean = float(np.mean([performance(row) for row in baseline]))
+    return float(np.mean(reference)) - baseline_mean < MIN_REFERENCE_GAIN * abs(baseline_mean)
 
 
 def normalized_differences(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> Floats:

@@ -101,9 +101,9 @@ def metric_table(
         if name in CAV_METRICS and not has_cavs:
             continue
         estimates = [(metric_estimate(rows, name), len(rows)) for rows in rows_by_driver.values()]
-        if not any(each.count for each, _ in estimates):
+        if not any(estimate.count for estimate, _ in estimates):
             continue  # it is not defined on this road
-        cells = [estimate_cell(each, metric.digits, episodes) for each, episodes in estimates]
+        cells = [estimate_cell(estimate, metric.digits, episodes) for estimate, episodes in estimates]
         for rows in compared.values():
             difference, units = paired_difference(rows, reference, name), count_units(rows, reference)
             cells.append(estimate_cell(difference, metric.digits, units, "+"))

@@ -59,9 +59,9 @@ def check_baseline(rows: EpisodeRows, planned_episodes: int = 0) -> None:
 def teleport_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return a note for each driver with teleports, which do not exist in real traffic."""
     counts = {label: count_teleports(rows) for label, rows in rows_by_driver.items()}
-    found = {label: format_count(count, "vehicle") for label, count in counts.items() if count}
+    count_texts = {label: format_count(count, "vehicle") for label, count in counts.items() if count}
     reason = "which had waited longer than time-to-teleport or collided"
-    return [f"{label}: SUMO teleported or removed {vehicles}, {reason}" for label, vehicles in found.items()]
+    return [f"{label}: SUMO teleported or removed {vehicles}, {reason}" for label, vehicles in count_texts.items()]
 
 
 def _repeated_drive_notes(rows_by_driver: RowsByDriver) -> list[str]:
@@ -155,6 +155,6 @@ def warning_notes(rows_by_driver: RowsByDriver) -> tuple[list[str], list[str]]:
         else:
             others.append(f"SUMO warns: {note}")
     if len(others) > MAX_WARNING_KINDS:
-        rest = len(others) - MAX_WARNING_KINDS
-        others[MAX_WARNING_KINDS:] = [f"SUMO gives {format_count(rest, 'less frequent kind')} of warnings"]
+        more = len(others) - MAX_WARNING_KINDS
+        others[MAX_WARNING_KINDS:] = [f"SUMO gives {format_count(more, 'less frequent kind')} of warnings"]
     return lost, others

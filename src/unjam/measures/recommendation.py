@@ -162,9 +162,9 @@ class ControllerResult:
         comparisons = (self.difference_to_acc, ACC_BASELINE), (self.effect.travel_time, "the human baseline")
         change, baseline = max(
             comparisons,
-            key=lambda each: (
-                *(each[0].low > 0, each[0].mean >= 0, each[0].low <= 0 <= each[0].high),
-                each[0].half_width,
+            key=lambda result: (
+                *(result[0].low > 0, result[0].mean >= 0, result[0].low <= 0 <= result[0].high),
+                result[0].half_width,
             ),
         )
         seeds = f"with {format_count(change.count, 'test seed')}"
@@ -196,7 +196,7 @@ def recommended_result(results: Sequence[ControllerResult]) -> ControllerResult 
 
 
 def _quickest(results: Sequence[ControllerResult]) -> ControllerResult | None:
-    return min(results, key=lambda each: each.effect.relative_travel_time, default=None)
+    return min(results, key=lambda result: result.effect.relative_travel_time, default=None)
 
 
 def plotted_result(results: Sequence[ControllerResult]) -> ControllerResult | None:

@@ -326,9 +326,9 @@ def _crossed_variance(table: Any) -> tuple[float, float]:
     """Return the variance of the mean, (MS_T + MS_S - MS_R) / (T S), and its degrees of freedom."""
     trainings, seeds = table.shape
     rows, columns = table.mean(1) - table.mean(), table.mean(0) - table.mean()
-    rest = table - table.mean() - rows[:, None] - columns
+    residuals = table - table.mean() - rows[:, None] - columns
     freedom = np.array([trainings - 1.0, seeds - 1.0, (trainings - 1.0) * (seeds - 1.0)])
-    squares = np.array([seeds * (rows**2).sum(), trainings * (columns**2).sum(), (rest**2).sum()]) / freedom
+    squares = np.array([seeds * (rows**2).sum(), trainings * (columns**2).sum(), (residuals**2).sum()]) / freedom
     # At least the variance of either effect alone: the estimated difference may be negative by chance.
     spread = float(max(squares[0] + squares[1] - squares[2], squares[0], squares[1]))
     if spread == 0:

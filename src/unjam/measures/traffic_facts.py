@@ -71,10 +71,10 @@ def measure_traffic(episode: Episode, scenario: Motorway, ramp_number: int = 0) 
     speeds = episode.speeds[::stride][: len(positions)]
     per_interval = round(INTERVAL / step)
 
-    def detect(place: float, lane: int | None = None) -> tuple[Floats, Floats]:
+    def detect(position: float, lane: int | None = None) -> tuple[Floats, Floats]:
         """Return flow [veh/h] and mean speed [m/s] of each interval at a detector across one lane or all."""
         with np.errstate(invalid="ignore"):
-            passes = (positions[:-1] <= place) & (positions[1:] > place)
+            passes = (positions[:-1] <= position) & (positions[1:] > position)
         if lane is not None:
             passes &= lane_indices[1:] == lane
         whole = len(passes) // per_interval * per_interval
@@ -142,7 +142,7 @@ def wave_speed(positions: Floats, speeds: Floats, step: float) -> float:
     It is the lag with the highest mean correlation between the speeds in cells `WAVE_DISTANCE` apart. Both arrays have
     the shape (moments, vehicles); `step` is the time between two moments [s].
     """
-    first, last = (round(place / CELL) for place in (APPROACH[0], 0.0))
+    first, last = (round(position / CELL) for position in (APPROACH[0], 0.0))
     window = max(1, round(WAVE_SMOOTHING / step))
     if len(speeds) * step < 2 * MAX_WAVE_LAG:
         return nan

@@ -57,7 +57,7 @@ COMMON_METRICS = ("min_time_gap", "cav_max_braking", "human_max_braking", "colli
 
 def road_metrics(rows_by_driver: RowsByDriver) -> RoadMetrics:
     """Return what matters on the road of these rows, which their metrics show."""
-    rows = [row for own in rows_by_driver.values() for row in own]
+    rows = [row for driver_rows in rows_by_driver.values() for row in driver_rows]
     if is_measured(rows, LAG_METRIC):
         return RECORDED_ROAD
     return OPEN_ROAD if is_measured(rows, TIME_METRIC) else CLOSED_ROAD
@@ -113,15 +113,19 @@ class Verdict:
 def verdicts(rows_by_driver: RowsByDriver, baseline: str = "") -> list[Verdict]:
     """Return the verdict on each driver but the baseline, empty: human drivers; none without this baseline."""
     reference = baseline or HUMAN_LABEL
-    found = feasibility_by_driver(rows_by_driver) if rows_by_driver.get(reference) else {}
-    return [_verdict(label, rows_by_driver, reference, found[label]) for label in found if label != reference]
+    verdicts = feasibility_by_driver(rows_by_driver) if rows_by_driver.get(reference) else {}
+    return [_verdict(label, rows_by_driver, reference, verdicts[label]) for label in verdicts if label != reference]
 
 
 def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible: str) -> Verdict:
-    rows, others, names = rows_by_driver[label], rows_by_driver[reference], road_metrics(rows_by_driver).compared
+    rows, reference_rows, names = (
+        rows_by_driver[label],
+        rows_by_driver[reference],
+        road_metrics(rows_by_driver).compared,
+    )
     name_of_others = "human drivers" if reference == HUMAN_LABEL else reference
     checked = (*names, FUEL_METRIC) if names[0] == POWER_FUEL_METRIC else names
-    differences = {name: paired_difference(rows, others, name) for name in checked}
+    differences = {name: paired_difference(rows, reference_rows, name) for name in checked}
     if not any(difference.count for difference in differences.values()):
         return Verdict(label, "", f"no episode can be compared with {name_of_others}", None)
     changes = {name: is_better(name, difference) for name, difference in differences.items()}
@@ -129,10 +133,10 @@ def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible:
     for name in names:
         if differences[name].count:
             title = METRICS[name].label.removesuffix(", departure delay included")
-            text = _difference_text(name, differences[name], relative_difference(rows, others, name).mean)
+            text = _difference_text(name, differences[name], relative_difference(rows, reference_rows, name).mean)
             texts.append(DifferenceText(title, text, changes[name]))
     prices = [text for name, text in PRICES.items() if changes.get(name) is False]
-    own, paired = zip(*pair_rows(rows, others), strict=True)
+    own, paired = zip(*pair_rows(rows, reference_rows), strict=True)
     if (teleports := count_teleports(own) - count_teleports(paired)) > 0:
         prices.append(f"{format_count(teleports, 'more vehicle')} teleported or removed")
     comparison = _comparison(differences, changes, rows, name_of_others, " and ".join(prices))

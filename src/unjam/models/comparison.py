@@ -75,14 +75,14 @@ def replay_accelerations(
     indices = np.tile(start_indices, (model.members, 1))
     recordings = [data.recordings[index] for index in indices[:, 0]]
     states = data.states_at(indices).map(lambda values: to_device(values, device))
-    drawn = to_device(np.stack([recording.drawn_values for recording in recordings]), device)
+    drawn_values = to_device(np.stack([recording.drawn_values for recording in recordings]), device)
     windows = zip(recordings, indices[:, 1], strict=True)
     accelerations = np.stack([each.applied_acceleration[at : at + control_steps] for each, at in windows], 1)
     generator = torch_generator((0,), device)  # not used
     members = torch.arange(model.members, device=device)
     dynamics = ModelDynamics(model, scenario, "", generator, add_noise=False, members=members)
     actuators = data.actuator_states_at(indices).map(lambda values: to_device(values, device))
-    starts = RolloutStarts(states, actuators, {}, drawn)
+    starts = RolloutStarts(states, actuators, {}, drawn_values)
     world = ModelWorld(dynamics, starts, control_steps, scenario.acceleration_limits, None)
     for _ in DriveLoop(world, ReplayDriver(to_device(accelerations, device))):
         pass

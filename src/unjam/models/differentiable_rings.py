@@ -118,14 +118,14 @@ class DifferentiableRings(RingBatch):
     def _as_tensor(self, name: str, values: Any, shape: Sequence[int]) -> Tensor:
         """Return numbers of the user as a tensor; raise `InputError` unless they are finite and have the shape."""
         allowed = f"finite numbers of shape {tuple(shape)}"
-        found = cast(Tensor, as_numbers(values, name, allowed, self._to_array))
-        if found.shape != tuple(shape):
-            raise invalid_value(f"{name}: shape", tuple(found.shape), str(tuple(shape)))
-        if not bool((is_finite := found.isfinite()).all()):
+        tensor = cast(Tensor, as_numbers(values, name, allowed, self._to_array))
+        if tensor.shape != tuple(shape):
+            raise invalid_value(f"{name}: shape", tuple(tensor.shape), str(tuple(shape)))
+        if not bool((is_finite := tensor.isfinite()).all()):
             index = int((~is_finite).flatten().nonzero()[0])
-            value, ring = float(found.flatten()[index]), index % len(self.roads)  # the last axis, or its blocks
+            value, ring = float(tensor.flatten()[index]), index % len(self.roads)  # the last axis, or its blocks
             raise InputError(f"{name}: {value} of ring {ring} is not allowed; allowed: {allowed}")
-        return found
+        return tensor
 
     def initial_memory(self, driver: Any) -> Memory:
         """Return the memory after the warm-up as tensors, of a driver or of an object with `initial_memory(n)`.

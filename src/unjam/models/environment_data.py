@@ -73,10 +73,12 @@ class EnvironmentData:
     def add(self, episodes: Sequence[Episode], scenario: Scenario) -> None:
         """Store the trajectories of `episodes`, and drop the oldest episodes beyond the capacity."""
         for episode in episodes:
-            drawn = np.array(scenario.scale_drawn_values(episode.drawn_values)) if episode.has_run else np.zeros(0)
+            drawn_values = (
+                np.array(scenario.scale_drawn_values(episode.drawn_values)) if episode.has_run else np.zeros(0)
+            )
             for trajectory in episode.trajectories:
                 values = {part.name: getattr(trajectory, part.name) for part in fields(Trajectory)}
-                self.recordings.append(Recording(**values, drawn_values=drawn, episode=self.episode_count))
+                self.recordings.append(Recording(**values, drawn_values=drawn_values, episode=self.episode_count))
             self.episode_count += 1
         while self.recordings:
             oldest = self.recordings[0].episode
@@ -116,8 +118,13 @@ class EnvironmentData:
 
     def start_indices(self, min_control_steps: int = 1, first_episode: int = 0) -> StartIndices:
         """Return the steps with a new residual and enough steps after them, of episodes from the first on."""
-        new = [(index, each) for index, each in enumerate(self.recordings) if each.episode >= first_episode]
-        due = {index: np.arange(0, len(each.reward) - min_control_steps + 1, each.action_repeat) for index, each in new}
+        new = [
+            (index, recording) for index, recording in enumerate(self.recordings) if recording.episode >= first_episode
+        ]
+        due = {
+            index: np.arange(0, len(recording.reward) - min_control_steps + 1, recording.action_repeat)
+            for index, recording in new
+        }
         indices = np.repeat(np.array(list(due), np.int64), [len(steps) for steps in due.values()])
         return np.column_stack([indices, np.concatenate([[], *due.values()]).astype(np.int64)])
 
@@ -133,10 +140,12 @@ class EnvironmentData:
             return ActuatorState(np.zeros(len(start_indices)))
         starts = [(self.recordings[index], step) for index, step in start_indices]
         pending = [
-            np.array([each.applied_acceleration[at - lag] if at >= lag else 0.0 for each, at in starts])
+            np.array([recording.applied_acceleration[at - lag] if at >= lag else 0.0 for recording, at in starts])
             for lag in range(self.actuator.delay_steps(self.control_step), 0, -1)
         ]
-        changes = np.array([each.states.speed[at] - each.states.speed[max(at - 1, 0)] for each, at in starts])
+        changes = np.array(
+            [recording.states.speed[at] - recording.states.speed[max(at - 1, 0)] for recording, at in starts]
+        )
         return ActuatorState(changes / self.control_step, tuple(pending))
 
     def _response(self, recording: Recording) -> Floats:

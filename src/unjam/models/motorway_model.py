@@ -141,9 +141,9 @@ def learned_correction(
     sigma = float(model.noise) * sqrt(steps) if has_noise else 0.0
 
     def replacement(speed: Floats, leader_speed: Floats, gap: Floats, base_speed: Floats) -> Floats:
-        drawn = torch.randn(speed.size, generator=generator, dtype=torch.float64).numpy()
+        noise = torch.randn(speed.size, generator=generator, dtype=torch.float64).numpy()
         learned = residual(speed, leader_speed, gap, speed) if residual else 0.0
-        return speed - base_speed + learned + sigma * drawn
+        return speed - base_speed + learned + sigma * noise
 
     return replacement
 

@@ -123,8 +123,8 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
         """
         rewards = [self.data.recordings[index].reward[at : at + plan.control_steps] for index, at in plan.starts]
         is_new = [self.data.recordings[index].episode >= self.first_new_episode for index in plan.starts[:, 0]]
-        is_known = [new and len(each) == plan.control_steps for new, each in zip(is_new, rewards, strict=True)]
-        return np.array([each.sum() if known else nan for known, each in zip(is_known, rewards, strict=True)])
+        is_known = [new and len(row) == plan.control_steps for new, row in zip(is_new, rewards, strict=True)]
+        return np.array([row.sum() if known else nan for known, row in zip(is_known, rewards, strict=True)])
 
     @property
     def max_reward(self) -> float:

@@ -81,16 +81,16 @@ def copy_array(values: Array) -> Array:
 
 def replace_entries(values: Array, index: Any, source: Array, source_index: Any) -> Array:
     """Return a copy of an array with `source[source_index]` in place of the entries `values[index]`."""
-    found = copy_array(values)
-    found[index] = source[source_index]
-    return found
+    copied = copy_array(values)
+    copied[index] = source[source_index]
+    return copied
 
 
 def replace_columns(values: Any, columns: Any, source: Any, source_columns: Any) -> Any:
     """Return arrays, also in tuples and lists, with columns of `source` in place of some along the last axis."""
     if isinstance(values, tuple | list):
         pairs = zip(values, source, strict=True)
-        parts = [replace_columns(own, columns, other, source_columns) for own, other in pairs]
+        parts = [replace_columns(target, columns, other, source_columns) for target, other in pairs]
         return type(values)(*parts) if hasattr(values, "_fields") else type(values)(parts)
     if not hasattr(values, "shape"):
         return values

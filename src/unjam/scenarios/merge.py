@@ -160,21 +160,21 @@ class Merge(Scenario):
 def _free_flow_speed(flow: float, length: float, humans: IDMParameters, step: float) -> float:
     """Return the mean speed over `length` of human drivers that enter one after the other in free flow [m/s]."""
     delay = round(3600.0 / flow / step)
-    leader, own = list[tuple[float, float]](), list[tuple[float, float]]()
+    leader, trajectory = list[tuple[float, float]](), list[tuple[float, float]]()
     for _ in range(PLATOON_SIZE):
-        own = [(0.0, HIGHWAY_ENTRY_SPEED)]
-        while own[-1][0] < length:
-            if len(own) * step > MAX_FREE_FLOW_SECONDS:
+        trajectory = [(0.0, HIGHWAY_ENTRY_SPEED)]
+        while trajectory[-1][0] < length:
+            if len(trajectory) * step > MAX_FREE_FLOW_SECONDS:
                 allowed = f"human drivers that need at most {MAX_FREE_FLOW_SECONDS:g} s for {length:g} m"
                 raise invalid_value("humans", humans, allowed)
-            position, speed = own[-1]
-            index = len(own) - 1 + delay
+            position, speed = trajectory[-1]
+            index = len(trajectory) - 1 + delay
             leader_position, leader_speed = leader[index] if index < len(leader) else (inf, speed)
             gap = clamp_min(leader_position - position - VEHICLE_LENGTH, MIN_IDM_GAP)
             speed = next_speed(speed, idm_acceleration(speed, leader_speed, gap, humans), step)
-            own.append((next_position(position, speed, step), speed))
-        leader = own
-    return length / ((len(own) - 1) * step)
+            trajectory.append((next_position(position, speed, step), speed))
+        leader = trajectory
+    return length / ((len(trajectory) - 1) * step)
 
 
 _RAMP_BEGIN = -MERGE_RAMP_LENGTH * cos(RAMP_ANGLE)

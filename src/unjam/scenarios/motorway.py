@@ -238,20 +238,23 @@ class Motorway(Scenario):
 
     def _draw_types(self, generator: np.random.Generator) -> tuple[dict[str, VehicleType], Callable[[str], str]]:
         """Return all vehicle types, and a function that replaces types by trucks or ACCs by draws of its own."""
-        (others,) = generator.spawn(1)
+        (lane_change_generator,) = generator.spawn(1)
         humans = {f"human_type_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
         lane_changing, trucks, acc = self.lane_changing, self.trucks, self.ordinary_acc
-        types = {name: one._replace(parameters=lane_changing.draw(others)) for name, one in humans.items()}
+        types = {
+            name: human_type._replace(parameters=lane_changing.draw(lane_change_generator))
+            for name, human_type in humans.items()
+        }
         truck_numbers = range(motorway_vehicles.TRUCK_TYPE_COUNT if trucks.share else 0)
         truck_types = [f"truck_type_{number}" for number in truck_numbers]
         if acc.share:
             types |= {_with_acc(name): acc.replace_driver(types[name]) for name in humans}
-        types |= {name: trucks.draw(others, self.car_following, lane_changing) for name in truck_types}
+        types |= {name: trucks.draw(lane_change_generator, self.car_following, lane_changing) for name in truck_types}
 
         def select_type(human: str) -> str:
-            draw = others.random()
+            draw = lane_change_generator.random()
             if draw < trucks.share:
-                return truck_types[others.integers(motorway_vehicles.TRUCK_TYPE_COUNT)]
+                return truck_types[lane_change_generator.integers(motorway_vehicles.TRUCK_TYPE_COUNT)]
             return _with_acc(human) if draw < trucks.share + acc.share else human
 
         return types, select_type
@@ -362,6 +365,6 @@ MOTORWAY_SCENARIOS = {
 }
 """the named roads of this kind"""
 FREE_FLOW_TIMES = {
-    each.geometry._replace(vehicle_length=0.0): time for each, time in ((_ON_RAMP_1, 113.0), (ON_RAMP, 106.6))
+    motorway.geometry._replace(vehicle_length=0.0): time for motorway, time in ((_ON_RAMP_1, 113.0), (ON_RAMP, 106.6))
 }
 """mean travel time in human-only traffic without a peak, of six seeds [s]"""

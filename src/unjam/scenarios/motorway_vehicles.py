@@ -71,7 +71,9 @@ class LaneChanging(Subclassable):
     def draw(self, generator: np.random.Generator) -> tuple[tuple[str, float], ...]:
         """Return the parameters of one driver that differ from SUMO's defaults, by SUMO's names."""
         intervals = {name: getattr(self, key) for key, name in LC2013_NAMES.items()}
-        values = {name: draw_uniform(generator, each) for name, each in intervals.items() if each is not None}
+        values = {
+            name: draw_uniform(generator, interval) for name, interval in intervals.items() if interval is not None
+        }
         if self.uncooperative_share and generator.random() < self.uncooperative_share:
             values |= {LC2013_NAMES["cooperation"]: 0.0, LC2013_NAMES["speed_cooperation"]: 0.0}
         return tuple(values.items())

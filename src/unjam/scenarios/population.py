@@ -138,7 +138,7 @@ def write_population(path: Path, population: Population) -> None:
         "limits": list(population.limits),
         "residual": residual,
         **population.metadata,
-        "drivers": [{**detail, **asdict(one)} for detail, one in zip(details, population.drivers, strict=True)],
+        "drivers": [{**detail, **asdict(driver)} for detail, driver in zip(details, population.drivers, strict=True)],
     }
     atomic_write(path, to_json(content, indent=1))
 

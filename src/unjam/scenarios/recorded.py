@@ -131,10 +131,10 @@ class Recorded(Scenario):
     def _leaders(self) -> list[LeaderRecording]:
         from unjam.recordings.leader_files import read_leaders
 
-        files, found, problems = recording_files(Path(self.recordings)), list[LeaderRecording](), dict[str, str]()
+        files, leaders, problems = recording_files(Path(self.recordings)), list[LeaderRecording](), dict[str, str]()
         for path in files:
             try:
-                found += read_leaders(path)
+                leaders += read_leaders(path)
             except InputError as error:
                 problems[path.name] = str(error)
         if problems:
@@ -142,7 +142,7 @@ class Recorded(Scenario):
             more = f"; also refused: {shorten_list(others)}" if others else ""
             way = "to go on, move it elsewhere, or select others by a pattern like 'drives/2021-03*'"
             raise InputError(f"{problems[first]}{more}{f'; {way}' if len(files) > 1 else ''}")
-        return found
+        return leaders
 
     @property
     def acceleration_limits(self) -> Limits:
@@ -172,13 +172,13 @@ class Recorded(Scenario):
 
     def _recordings_note(self) -> str:
         """What was read of the recordings, so that a wrong unit or a gap in time is seen."""
-        path, files, found = Path(self.recordings), recording_files(Path(self.recordings)), self._leaders
-        seconds, speeds = [each.seconds for each in found], np.concatenate([each.speed for each in found])
+        path, files, leaders = Path(self.recordings), recording_files(Path(self.recordings)), self._leaders
+        seconds, speeds = [leader.seconds for leader in leaders], np.concatenate([leader.speed for leader in leaders])
         source = path.name if path.is_file() else f"{format_count(len(files), 'file')} of {path.name}"
-        parts = f"{format_count(len(found), 'part')} of {min(seconds):.0f} to" if len(found) > 1 else ""
+        parts = f"{format_count(len(leaders), 'part')} of {min(seconds):.0f} to" if len(leaders) > 1 else ""
         text = f"{parts} {max(seconds):.0f} s with speeds of {speeds.min():.1f} to {speeds.max():.1f} m/s"
-        drawn = {"random": ", drawn at random", "name": ", in the order of their names"}[self.order]
-        return f"recordings: {source}: {text.strip()}{drawn if len(files) > 1 else ''}"
+        order_text = {"random": ", drawn at random", "name": ", in the order of their names"}[self.order]
+        return f"recordings: {source}: {text.strip()}{order_text if len(files) > 1 else ''}"
 
     @property
     def training_notes(self) -> list[str]:
@@ -201,12 +201,12 @@ class Recorded(Scenario):
         number = seed[-1] % len(files)
         if self.order == "random":
             number = int(np.random.default_rng([len(files), *seed[:-1]]).permutation(len(files))[number])
-        road, others = replace(self, recordings=str(files[number])).draw_from_seed(seed)
-        return replace(road, drawn_values={**road.drawn_values, "file": float(number)}), others
+        road, seeds = replace(self, recordings=str(files[number])).draw_from_seed(seed)
+        return replace(road, drawn_values={**road.drawn_values, "file": float(number)}), seeds
 
     def draw(self, generator: np.random.Generator) -> RecordedRoad:
         """Return the road with the speeds of a random recording, or of a random part of it."""
-        drawn, recording = self._draw_recording(generator)
+        road, recording = self._draw_recording(generator)
         room = recording.seconds - self.begin
         if room < self.control_step:
             raise InputError(
@@ -223,7 +223,7 @@ class Recorded(Scenario):
             start += float(generator.uniform(0.0, room - self.window))
             seconds = min(self.window, seconds)
         speeds = recording.speeds_at(start, seconds, self.simulation_step)
-        return self.build(speeds, {**drawn, "begin": start}, generator)
+        return self.build(speeds, {**road, "begin": start}, generator)
 
     def build(self, speeds: Floats, drawn_values: dict[str, float], generator: np.random.Generator) -> RecordedRoad:
         """Return the road behind a vehicle with given speeds in all simulation steps [m/s], shape (S + 1,)."""
@@ -263,9 +263,9 @@ class Recorded(Scenario):
 
         files = recording_files(Path(self.recordings))
         number = int(generator.integers(len(files)))
-        found = read_leaders(files[number])
-        part = int(generator.integers(len(found)))
-        return {"file": float(number), "part": float(part)}, found[part]
+        leaders = read_leaders(files[number])
+        part = int(generator.integers(len(leaders)))
+        return {"file": float(number), "part": float(part)}, leaders[part]
 
     def _fact_values(self) -> tuple[str, str, str, str]:
         source = f"recordings of {self.recordings}" if self.recordings else "artificial waves"

@@ -369,14 +369,14 @@ class Scenario(Subclassable):
 
     def draw_from_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
         """Return the road of an episode's seed, and the seeds of noise, exploration, simulator and sensors."""
-        road, *others = _spawn_seeds(seed)
+        road, *other_seeds = _spawn_seeds(seed)
         kind, generator = type(self), np.random.default_rng(road)
         if is_packaged(kind):
-            return self.draw(generator), others
+            return self.draw(generator), other_seeds
         file = getattr(sys.modules.get(kind.__module__), "__file__", None) or ""
         drawn = UserFunction(self.draw, kind.__name__, file)(generator)  # an error is reported with its line
         check_road(drawn, VEHICLE_LENGTH, kind.__name__)
-        return drawn, others
+        return drawn, other_seeds
 
     def possible_cav_ids(self) -> tuple[str, ...]:
         """Return the ids of all CAVs that an episode can have."""

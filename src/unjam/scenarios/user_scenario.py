@@ -22,22 +22,22 @@ _class_recipes: dict[type[Scenario], dict[str, Any]] = {}
 
 def load_python_scenario(text: str) -> Scenario:
     """Return the scenario `path.py:name`; a class has its default settings. Raise `InputError` if it is none."""
-    found = _load_object(FileReference.parse(text))
-    return build_dataclass(found, {}, text) if isinstance(found, type) else found
+    scenario = _load_object(FileReference.parse(text))
+    return build_dataclass(scenario, {}, text) if isinstance(scenario, type) else scenario
 
 
 def _load_object(reference: FileReference) -> Scenario | type[Scenario]:
     """Return the class or instance with a name, or that of a function; a second run would make other classes."""
-    found, reference = reference.load_object_once()
-    if isfunction(found):
-        found = UserFunction(found, str(reference), str(reference.path))()
-    kind: type[Any] = found if isinstance(found, type) else type(found)
+    loaded, reference = reference.load_object_once()
+    if isfunction(loaded):
+        loaded = UserFunction(loaded, str(reference), str(reference.path))()
+    kind: type[Any] = loaded if isinstance(loaded, type) else type(loaded)
     if not issubclass(kind, Scenario):
         allowed = "a class or an instance of unjam.scenarios.Scenario, or a function that returns one"
-        raise InputError(f"{reference}: {found!r:.60} is not allowed; allowed: {allowed}")
+        raise InputError(f"{reference}: {loaded!r:.60} is not allowed; allowed: {allowed}")
     if kind.__module__.startswith(USER_MODULE_PREFIX):
         _class_recipes[kind], _ = pack(reference)
-    return found
+    return loaded
 
 
 def class_recipe(kind: type[Scenario]) -> dict[str, Any]:
@@ -59,8 +59,8 @@ def class_reference(code: Any) -> FileReference:
 
 def load_class(code: Any) -> type[Scenario]:
     """Return the class of a recipe; raise `InputError` if its file has changed."""
-    found = _load_object(class_reference(code))
-    return found if isinstance(found, type) else type(found)
+    kind = _load_object(class_reference(code))
+    return kind if isinstance(kind, type) else type(kind)
 
 
 def load_toml_scenario(path: Path, kinds: dict[str, type[Scenario]]) -> tuple[Scenario, dict[str, Any]]:

@@ -71,8 +71,8 @@ def open_backend(backend: BackendLike) -> Iterator[Backend]:
 def _make_backend(backend: str | type[Backend]) -> Backend:
     name = backend if isinstance(backend, str) else backend.__name__
     if isinstance(backend, type) or is_file_reference(name):
-        found = backend if isinstance(backend, type) else FileReference.parse(name).load_object()
-        return check_backend(call_backend(name, found) if isinstance(found, type) else found, name)
+        loaded = backend if isinstance(backend, type) else FileReference.parse(name).load_object()
+        return check_backend(call_backend(name, loaded) if isinstance(loaded, type) else loaded, name)
     if check_backend_name(name) == "batch":
         from unjam.worlds.batch.backend import BatchBackend
 

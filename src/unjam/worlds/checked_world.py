@@ -64,8 +64,8 @@ class CheckedWorld:
         self._steps = 0
 
     def __getattr__(self, name: str) -> Any:
-        found = call_backend(self._label, getattr, self._world, name)
-        return partial(call_backend, self._label, found) if callable(found) else found
+        value = call_backend(self._label, getattr, self._world, name)
+        return partial(call_backend, self._label, value) if callable(value) else value
 
     def local_state(self) -> LocalState:
         """Return the state that the CAVs observe now."""

@@ -112,8 +112,8 @@ def seeded_generators(seed: Sequence[int]) -> Iterator[None]:
     numbers, torch = np.random.SeedSequence(seed).generate_state(4), sys.modules.get("torch")
     torch_seeder = _TorchSeeder(int(numbers[0]))
     with _generators_lock:
-        now = random.getstate(), np.random.get_state(), torch and torch.get_rng_state()
-        _generator_states.append(_generator_states[0] if _generator_states else now)
+        states = random.getstate(), np.random.get_state(), torch and torch.get_rng_state()
+        _generator_states.append(_generator_states[0] if _generator_states else states)
         random.seed(numbers.tobytes())
         np.random.seed(numbers)
         if torch:

@@ -22,8 +22,8 @@ class LaneNeighbors(NamedTuple):
 def find_neighbors(road: Array, lane: Array, lane_count: int) -> LaneNeighbors:
     """Return the neighbors of vehicles that are sorted by road, and from front to back."""
     count = len(road)
-    found = np.empty((2, lane_count, count), np.intp)
-    for number, (leaders, followers) in enumerate(found.swapaxes(0, 1)):
+    neighbors = np.empty((2, lane_count, count), np.intp)
+    for number, (leaders, followers) in enumerate(neighbors.swapaxes(0, 1)):
         rows = np.flatnonzero(lane == number)
         distances = np.diff(np.concatenate([[-1], rows, [count]]))
         leaders[:] = np.concatenate([[NO_VEHICLE], rows]).repeat(distances)[:-1]
@@ -31,43 +31,43 @@ def find_neighbors(road: Array, lane: Array, lane_count: int) -> LaneNeighbors:
     vehicles_of_roads = np.bincount(road)
     ends = vehicles_of_roads.cumsum()  # rows behind the last vehicle of each road
     end, start = ends.repeat(vehicles_of_roads), (ends - vehicles_of_roads).repeat(vehicles_of_roads)
-    leaders, followers = found
+    leaders, followers = neighbors
     is_leader, is_follower = leaders >= start, followers < end
     return LaneNeighbors(np.where(is_leader, leaders, NO_VEHICLE), np.where(is_follower, followers, NO_VEHICLE))
 
 
 def find_road_neighbors(road: Array, lane: Array, position: Array, geometry: MotorwayGeometry) -> LaneNeighbors:
     """Return the neighbors of sorted vehicles on all lanes; on lane 0, vehicles of different ramps are none."""
-    found = find_neighbors(road, lane, geometry.lane_count + 1)
+    neighbors = find_neighbors(road, lane, geometry.lane_count + 1)
     if len(geometry.ramps) > 1:
         ramp = geometry.sections(lane, position).ramp
-        for rows in found:
+        for rows in neighbors:
             rows[0, (lane == 0) & (ramp[rows[0]] != ramp)] = NO_VEHICLE
-    return found
+    return neighbors
 
 
 def find_unsorted_neighbors(lane: Array, position: Array, geometry: MotorwayGeometry) -> LaneNeighbors:
     """Return the neighbors of the vehicles of one road, in any order, as `find_road_neighbors`."""
     order = np.argsort(-position, kind="stable")
-    found = np.array(find_road_neighbors(0 * order, lane[order], position[order], geometry))
-    found[..., order] = np.where(found >= 0, order[found], NO_VEHICLE)
-    return LaneNeighbors(*found)
+    neighbors = np.array(find_road_neighbors(0 * order, lane[order], position[order], geometry))
+    neighbors[..., order] = np.where(neighbors >= 0, order[neighbors], NO_VEHICLE)
+    return LaneNeighbors(*neighbors)
 
 
 def neighbors_on_lane(neighbors: Array, lane: Array) -> Array:
     """Return each vehicle's neighbor on a lane given for each; `NO_VEHICLE` for lanes that do not exist."""
     lane_count, count = neighbors.shape
-    found = neighbors.take(clamp_max(clamp_min(lane, 0), lane_count - 1) * count + np.arange(count))
-    return np.where((lane >= 0) & (lane < lane_count), found, NO_VEHICLE)
+    lane_neighbor = neighbors.take(clamp_max(clamp_min(lane, 0), lane_count - 1) * count + np.arange(count))
+    return np.where((lane >= 0) & (lane < lane_count), lane_neighbor, NO_VEHICLE)
 
 
 def observe_lane(
     neighbors: LaneNeighbors, rows: Array, lane: Array, position: Array, speed: Array, length: Array
 ) -> list[tuple[Array, Array]]:
     """Return speeds and gaps of the neighbors of some rows ahead and behind, on a `lane` given for each row."""
-    found = list[tuple[Array, Array]]()
+    pairs = list[tuple[Array, Array]]()
     for side, sign in zip(neighbors, (1.0, -1.0), strict=True):
         row = neighbors_on_lane(side[:, rows], lane)
         gap = sign * (position[row] - position[rows]) - length[row if sign > 0.0 else rows]
-        found.append(observe_neighbor(row >= 0, gap, speed[row], speed[rows]))
-    return found
+        pairs.append(observe_neighbor(row >= 0, gap, speed[row], speed[rows]))
+    return pairs

@@ -71,7 +71,9 @@ class TrafficLog:
         self._snapshot_vehicle_count += len(self.names)
         while self._snapshot_vehicle_count > MAX_SNAPSHOT_VEHICLES and len(self._snapshots) > 2:
             self.snapshot_stride *= 2
-            self._snapshots = {time: each for time, each in self._snapshots.items() if time % self.snapshot_stride == 0}
+            self._snapshots = {
+                time: snapshot for time, snapshot in self._snapshots.items() if time % self.snapshot_stride == 0
+            }
             self._snapshot_vehicle_count = sum(len(self._numbers_by_moment[time]) for time in self._snapshots)
 
     def columns(self, groups: Sequence[Hashable]) -> NDArray[np.intp]:
@@ -89,7 +91,7 @@ class TrafficLog:
 
     def snapshots(self, name: str, columns: NDArray[np.intp]) -> Floats:
         """Return a quantity of all snapshots, shape (snapshots, columns, ...); NaN without a vehicle."""
-        return self._table({time: each[name] for time, each in self._snapshots.items()}, columns)
+        return self._table({time: snapshot[name] for time, snapshot in self._snapshots.items()}, columns)
 
     def _table(self, values_by_moment: dict[int, Any], columns: NDArray[np.intp]) -> Floats:
         shape = next((np.shape(values)[1:] for values in values_by_moment.values()), ())
@@ -161,8 +163,8 @@ class OpenRoadLog:
         """Add the speeds of all vehicles after a simulation step [m/s]; `cav_ids` are those of the driver."""
         last, is_same = self._speeds, names == self._names
         if not is_same:  # in few steps, so that the others are fast
-            before = dict(zip(self._names, last.tolist(), strict=True))
-            last = np.array(list(map(before.get, names, speeds.tolist())), np.float64)
+            previous = dict(zip(self._names, last.tolist(), strict=True))
+            last = np.array(list(map(previous.get, names, speeds.tolist())), np.float64)
         if not is_same or cav_ids is not self._cav_ids:
             self._kinds = np.array(list(map(set(cav_ids).__contains__, names)), np.uint8)
             self._names, self._cav_ids = list(names), cav_ids

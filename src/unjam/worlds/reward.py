@@ -312,9 +312,9 @@ def _step_outcomes(
         start, stop = max(cav.start_step, first), min(cav.step_slice.stop, end)
         rows, steps = slice(start - first, stop - first), slice(start - cav.start_step, stop - cav.start_step)
         accelerations[rows, column] = cav.applied_acceleration[steps]
-        after = slice(steps.start + 1, steps.stop + 1)
-        time_gaps[rows, column] = time_gap(cav.states.leader_gap[after], cav.states.speed[after])
-        cav_speeds[rows, column] = cav.states.speed[after]
+        later_steps = slice(steps.start + 1, steps.stop + 1)
+        time_gaps[rows, column] = time_gap(cav.states.leader_gap[later_steps], cav.states.speed[later_steps])
+        cav_speeds[rows, column] = cav.states.speed[later_steps]
     crashed = np.zeros(size, bool)
     crashed[-1:] = has_crashed
     waiting = backlog[1:][step_range] if len(backlog) else np.zeros(size)

@@ -79,8 +79,8 @@ class SimulatedRoad(RoadWorld):
     is_scalar = False
     remaining_rows: Sequence[int] | None = None  # pyright: ignore[reportIncompatibleMethodOverride]
 
-    def __init__(self, scenario: Scenario, seed: Sequence[int], drawn: DrawnRoad | None = None) -> None:
-        self.road, (noise_seed, exploration_seed, _, sensor_seed) = drawn or scenario.draw_from_seed(seed)
+    def __init__(self, scenario: Scenario, seed: Sequence[int], drawn_road: DrawnRoad | None = None) -> None:
+        self.road, (noise_seed, exploration_seed, _, sensor_seed) = drawn_road or scenario.draw_from_seed(seed)
         self.scenario, self.seed, self.limits = scenario, tuple(seed), scenario.acceleration_limits
         self.has_crashed = False
         self.is_finished = False

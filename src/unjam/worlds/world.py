@@ -165,13 +165,13 @@ class CarFollowingWorld(_OfflineWorld):
     def advance(self, command: Command | None) -> None:
         """Make one step of all pairs."""
         assert command is not None
-        before, step = self._states[-1], self._step
+        previous, step = self._states[-1], self._step
         acceleration = self.limits.clip(np.asarray(command.acceleration))
-        self._actuator_state = self._actuator.apply_command(acceleration, before.speed, self._actuator_state, step)
-        speed = next_speed(before.speed, self._actuator_state.acceleration, step)
-        leader = next_speed(before.leader_speed, self._leader_accelerations[len(self._states) - 1], step)
+        self._actuator_state = self._actuator.apply_command(acceleration, previous.speed, self._actuator_state, step)
+        speed = next_speed(previous.speed, self._actuator_state.acceleration, step)
+        leader = next_speed(previous.leader_speed, self._leader_accelerations[len(self._states) - 1], step)
         self._position = self._position + speed * step
-        self._states.append(FollowingState(speed, leader, before.gap + (leader - speed) * step))
+        self._states.append(FollowingState(speed, leader, previous.gap + (leader - speed) * step))
 
     def record(self, driver_log: DriverLog) -> FollowingState:
         """Return the states of all pairs in T steps, arrays of shape (T + 1, n)."""

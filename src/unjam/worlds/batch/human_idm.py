@@ -56,9 +56,9 @@ def leaders(
 
     Shapes: (vehicles, W); `loop_length` (W,). Positions are those of front bumpers; `leader` is the vehicle ahead.
     """
-    xp, lane_length, place = namespace(speed), loop_length / RING_EDGES, position % loop_length
-    lane = xp.floor(place / lane_length)
-    distance = (lane + 1.0) * lane_length - place  # to the end of the lanes seen so far
+    xp, lane_length, lap_position = namespace(speed), loop_length / RING_EDGES, position % loop_length
+    lane = xp.floor(lap_position / lane_length)
+    distance = (lane + 1.0) * lane_length - lap_position  # to the end of the lanes seen so far
 
     def leader_if_present(is_present: Array, leader_speed: Array, gap: Array) -> Leader:
         return Leader(xp.where(is_present, leader_speed, parameters.desired_speed), xp.where(is_present, gap, FREE_GAP))
@@ -68,7 +68,7 @@ def leaders(
     braking, time_headway = parameters.comfortable_deceleration, parameters.time_headway
     look_ahead = look_ahead_distance(max_speed, time_headway, braking, step)
     # A remainder takes longer than everything else here; the remainder of less than one loop needs no division.
-    offsets = xp.stack([place - edge * lane_length for edge in range(RING_EDGES)])
+    offsets = xp.stack([lap_position - edge * lane_length for edge in range(RING_EDGES)])
     offsets = xp.where(offsets < 0.0, offsets + loop_length, offsets)
     # The user can have set another default device of torch.
     rows, columns = (xp.arange(count, device=speed.device) for count in (RING_EDGES, speed.shape[1]))

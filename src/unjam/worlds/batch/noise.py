@@ -58,7 +58,7 @@ class SeededNoise:
         """Return the state of each world's noise as NumPy arrays."""
         steps = np.array(self._remaining_steps).reshape(-1, *self._block.shape[2:], len(self._human_generators))
         generators = enumerate(self._human_generators)
-        return [NoiseState(each.bit_generator.state, steps[:, :, world].copy()) for world, each in generators]
+        return [NoiseState(generator.bit_generator.state, steps[:, :, world].copy()) for world, generator in generators]
 
     def restore(self, states: Sequence[NoiseState]) -> None:
         """Continue from these states; all remaining blocks have the same length."""

@@ -144,15 +144,15 @@ def warm_up_states(keys: Sequence[_WarmUpKey], upcoming: Sequence[_WarmUpKey]) -
     cache = WARM_UP_CACHE
     if all(key in cache for key in keys):
         return [cache[key] for key in keys]
-    known = {**cache, **_warm_up([key for key in dict.fromkeys([*keys, *upcoming]) if key not in cache])}
-    counts = [1 if state.history is None else len(state.history.speed) for state in known.values()]
+    warm_ups = {**cache, **_warm_up([key for key in dict.fromkeys([*keys, *upcoming]) if key not in cache])}
+    counts = [1 if state.history is None else len(state.history.speed) for state in warm_ups.values()]
     remaining_cavs = sum(counts)
     cache.clear()
-    for (key, state), count in zip(known.items(), counts, strict=True):
+    for (key, state), count in zip(warm_ups.items(), counts, strict=True):
         if remaining_cavs <= MAX_CACHED_CAVS:
             cache[key] = state
         remaining_cavs -= count
-    return [known[key] for key in keys]
+    return [warm_ups[key] for key in keys]
 
 
 def _warm_up(keys: Sequence[_WarmUpKey]) -> dict[_WarmUpKey, WarmUpState]:
@@ -182,9 +182,9 @@ def run_batches(
         batch[index] = task
     episodes: dict[int, Episode] = {}
     for batch in batches:
-        own = list(batch.values())
-        later = [task for task in upcoming if _can_share_batch(task, own[0])]
-        episodes |= zip(batch, run_batch(own, upcoming=later, allow_statistical=allow_statistical), strict=True)
+        batch_tasks = list(batch.values())
+        later = [task for task in upcoming if _can_share_batch(task, batch_tasks[0])]
+        episodes |= zip(batch, run_batch(batch_tasks, upcoming=later, allow_statistical=allow_statistical), strict=True)
     return [episodes[index] for index in range(len(tasks))]
 
 

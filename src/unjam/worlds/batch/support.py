@@ -127,8 +127,8 @@ BATCH_KINDS: dict[type[Scenario], BatchKind] = {
 
 def batch_kind(scenario: Scenario) -> BatchKind | None:
     """Return how batches simulate a scenario or, if its class has only other values, its base; None if they cannot."""
-    found = ((base, kind) for base, kind in BATCH_KINDS.items() if isinstance(scenario, base))
-    return next((kind for base, kind in found if not replaced_member(type(scenario), base, TEXT_MEMBERS)), None)
+    kinds = ((base, kind) for base, kind in BATCH_KINDS.items() if isinstance(scenario, base))
+    return next((kind for base, kind in kinds if not replaced_member(type(scenario), base, TEXT_MEMBERS)), None)
 
 
 def required_batch_kind(scenario: Scenario) -> BatchKind:

@@ -50,24 +50,24 @@ class CarFollowingModels:
 
     def follow_speed(self, speed: Array, leader_speed: Array, gap: Array) -> Array:
         """Return the maximum speed behind a leader [m/s]."""
-        found = self._idm_speed(speed, leader_speed, gap, self._humans)
-        if own := self._cav_indices:
-            distance = gap[own] - MIN_CAV_GAP + stopping_distance(leader_speed[own], self._cav_braking, self._step)
-            found[own] = self._krauss_speed(speed[own], distance)
-        return found
+        new_speed = self._idm_speed(speed, leader_speed, gap, self._humans)
+        if cavs := self._cav_indices:
+            distance = gap[cavs] - MIN_CAV_GAP + stopping_distance(leader_speed[cavs], self._cav_braking, self._step)
+            new_speed[cavs] = self._krauss_speed(speed[cavs], distance)
+        return new_speed
 
     def stop_speed(self, speed: Array, distance: Array) -> Array:
         """Return the maximum speed of vehicles that must stop within a distance [m/s]."""
         xp = namespace(speed)
-        found = self._idm_speed(speed, 0.0, distance, self._humans_before_stop)
-        creeps = (speed < SUMO_MIN_GAP) & (found < SUMO_MIN_GAP)
+        stop_speed = self._idm_speed(speed, 0.0, distance, self._humans_before_stop)
+        creeps = (speed < SUMO_MIN_GAP) & (stop_speed < SUMO_MIN_GAP)
         if bool(creeps.any()):  # the IDM would not start again before a stop line
             reachable = max_speed_to_stop(distance - SUMO_MIN_GAP, COMMANDED_HUMAN_BRAKING, self._step)
-            found = xp.where(creeps, reachable, found)
-        found = xp.minimum(found, distance / self._step) * (distance >= MIN_STOP_DISTANCE)
-        if own := self._cav_indices:
-            found[own] = self._krauss_speed(speed[own], distance[own])
-        return found
+            stop_speed = xp.where(creeps, reachable, stop_speed)
+        stop_speed = xp.minimum(stop_speed, distance / self._step) * (distance >= MIN_STOP_DISTANCE)
+        if cavs := self._cav_indices:
+            stop_speed[cavs] = self._krauss_speed(speed[cavs], distance[cavs])
+        return stop_speed
 
     def clip_speed(self, speed: Array, wanted_speed: Array) -> Array:
         """Return speeds within the limits of engine and brakes [m/s]."""

@@ -142,9 +142,11 @@ class FigureEightMovement:
     def move(self, speed: Array, position: Array, leader: human_idm.Leader, noise: Array, cav_speeds: Array) -> Array:
         """Return the speeds after a step, (vehicles, W), with `noise` [m/s], and commands (CAVs, W) or None."""
         commanded = clamp_min(self._human_model(speed, *leader) + noise, 0.0)
-        place = position % self._loop_length
+        lap_position = position % self._loop_length
         (major_start, major_end), (minor_start, minor_end) = self._crossings  # where SUMO drives humans itself
-        is_commanded = ((place < major_start) | (major_end <= place)) & ((place < minor_start) | (minor_end <= place))
+        is_commanded = ((lap_position < major_start) | (major_end <= lap_position)) & (
+            (lap_position < minor_start) | (minor_end <= lap_position)
+        )
         if cav_speeds is not None:
             commanded[self._cav_indices], is_commanded[self._cav_indices] = cav_speeds, True
         return self._next_speeds(speed, position, leader, commanded, is_commanded)
@@ -369,15 +371,15 @@ def may_follow_commands(
 
 def figure_eight_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
     """Return which vehicles touch the leader on the same lane, or overlap on the crossing; see `ring_contacts`."""
-    xp, place = namespace(position), position % loop_length
+    xp, lap_position = namespace(position), position % loop_length
     lengths, touches = lane_lengths(figure_eight_radius(loop_length)), gap < human_idm.CONTACT_GAP
     if bool(touches.any()):
-        lane, end = 0.0 * place, 0.0
+        lane, end = 0.0 * lap_position, 0.0
         for length in lengths[:-1]:
             end = end + length
-            lane = lane + (place > end)
+            lane = lane + (lap_position > end)
         touches = touches & (lane == xp.concatenate([lane[1:], lane[:1]]))
     low, high = CROSSING_LINK / 2 - CAR_WIDTH / 2, CROSSING_LINK / 2 + CAR_WIDTH / 2 + VEHICLE_LENGTH
-    fronts = ((place - start) % loop_length for start in (lengths[0], sum(lengths[:7])))
+    fronts = ((lap_position - start) % loop_length for start in (lengths[0], sum(lengths[:7])))
     first, second = ((front > low) & (front < high) for front in fronts)
     return touches | ((first | second) & (first.any(0) & second.any(0)))

@@ -90,7 +90,9 @@ def lane_change_context(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, 
         gap = np.where(is_present, position[row] - length - position - vehicles.minimum_gap, NO_NEIGHBOR_GAP)
         return Neighbor(row, is_present, speed[row], gap)
 
-    leader, ahead = (neighbor_ahead(neighbors_on_lane(neighbors.leaders, each)) for each in (lane, target_lane))
+    leader, ahead = (
+        neighbor_ahead(neighbors_on_lane(neighbors.leaders, checked_lane)) for checked_lane in (lane, target_lane)
+    )
     row = neighbors_on_lane(neighbors.followers, target_lane)
     gap = np.where(row >= 0, position - length - position[row] - vehicles.minimum_gap[row], NO_NEIGHBOR_GAP)
     behind, followers = Neighbor(row, row >= 0, speed[row], gap), drivers.select(row)
@@ -142,7 +144,7 @@ def mandatory_lane_changes(
     rows = np.arange(len(position))[is_urgent]
     if len(rows) == 0:
         return vehicles, is_urgent, is_asked
-    own, cooperative = vehicles.own_advice.copy(), vehicles.cooperative_advice.copy()
+    own_advice_after, cooperative = vehicles.own_advice.copy(), vehicles.cooperative_advice.copy()
     bias = vehicles.speed_bias.copy()
     merging = _MergingVehicles(vehicles, context, geometry, rows)
     leader, follower = merging.leader, merging.follower
@@ -152,12 +154,12 @@ def mandatory_lane_changes(
     overtakes_leader = is_blocked & overtakes
     np.minimum.at(cooperative, leader.row[overtakes_leader], 0.0 * merging.speed[overtakes_leader])
     is_request, speeds, more_advice, asks_for_change = merging.request_from_follower(planned, ~overtakes_leader)
-    own[rows] = np.minimum(own_advice, more_advice)
+    own_advice_after[rows] = np.minimum(own_advice, more_advice)
     np.minimum.at(cooperative, follower.row[is_request], (speeds - follower.speed)[is_request] / step)
     is_asked[follower.row[asks_for_change]] = True
     stuck_rows = rows[np.logical_or(merging.is_leader_blocking, merging.is_follower_blocking)]
     bias[stuck_rows] = 1.0
-    vehicles = vehicles._replace(own_advice=own, cooperative_advice=cooperative, speed_bias=bias)
+    vehicles = vehicles._replace(own_advice=own_advice_after, cooperative_advice=cooperative, speed_bias=bias)
     return _yield_to_stuck(vehicles, context, geometry, stuck_rows), is_urgent, is_asked
 
 
@@ -170,8 +172,8 @@ class _MergingVehicles:
         self.speed, self._step = vehicles.speed[rows], context.step
         self._remaining_distance = context.sections.merge_end[rows] - vehicles.position[rows]
         self._vehicle_length, self._minimum_gap = geometry.vehicle_length, vehicles.minimum_gap[rows]
-        self.leader = Neighbor(*(each[rows] for each in context.target_leader))
-        self.follower = Neighbor(*(each[rows] for each in context.target_follower))
+        self.leader = Neighbor(*(values[rows] for values in context.target_leader))
+        self.follower = Neighbor(*(values[rows] for values in context.target_follower))
         self.is_leader_blocking = context.is_leader_blocking[rows]
         self.is_follower_blocking = context.is_follower_blocking[rows]
         self._drivers, self._follower_drivers = context.drivers.select(rows), context.follower_drivers.select(rows)
@@ -309,14 +311,14 @@ def _speed_gain_changes(
         anticipated[faster] = faster_drivers.follow_speed(later, gap, leader_speed[faster], step)
         return anticipated
 
-    there = np.minimum(target_speed, anticipated_speed(ahead, remaining))
+    target_lane_speed = np.minimum(target_speed, anticipated_speed(ahead, remaining))
     # At steady speeds, the safe speeds are compared, without the restriction against passing on the right.
-    here = np.minimum(np.where(accelerates, max_speed, own_speed), anticipated_speed(leader, own_remaining))
-    relative = (there - here) / clamp_min(there, MIN_REFERENCE_SPEED)
+    own_lane_speed = np.minimum(np.where(accelerates, max_speed, own_speed), anticipated_speed(leader, own_remaining))
+    relative = (target_lane_speed - own_lane_speed) / clamp_min(target_lane_speed, MIN_REFERENCE_SPEED)
     continues = remaining / clamp_min(speed, 0.1) > MIN_REMAINING_TIME
     # To the right.
     right = may_change & (context.target_lane < vehicles.lane)
-    is_slower = here - RIGHT_SPEED_TOLERANCE > there
+    is_slower = own_lane_speed - RIGHT_SPEED_TOLERANCE > target_lane_speed
     decay = np.where(right & is_slower & (gain < 0.0), 0.5**step, 0.0 * gain + 1.0)
     is_suitable = right & ~is_slower
     is_counted = is_suitable & ((gain < 0.0) | (relative > 0.0))
@@ -338,9 +340,9 @@ def _speed_gain_changes(
     wants_change = keeps_right | (right & (gain < -RIGHT_GAIN_THRESHOLD) & continues)
     # To the left.
     left = may_change & is_left
-    decay = np.where(here > there, 0.5**step, 0.0 * gain + 0.8**step)
-    gain = np.where(left & (here >= there) & (gain > 0.0), gain * decay, gain)
-    gain = gain + np.where(left & (here < there), step * relative, 0.0 * gain)
+    decay = np.where(own_lane_speed > target_lane_speed, 0.5**step, 0.0 * gain + 0.8**step)
+    gain = np.where(left & (own_lane_speed >= target_lane_speed) & (gain > 0.0), gain * decay, gain)
+    gain = gain + np.where(left & (own_lane_speed < target_lane_speed), step * relative, 0.0 * gain)
     gains = (gain > LEFT_GAIN_THRESHOLD) & ((relative > 1e-3) | must_brake_soon) & continues
     merges = (vehicles.lane == 0) & (relative >= 0.0) & (gain > 0.0)
     vehicles = vehicles._replace(speed_gain=gain, keep_right=keep, adjacent_advice=advice)

@@ -169,8 +169,8 @@ class BatchMotorways:
         """The neighbors of the vehicles."""
         lane = self.vehicles.lane  # a new column if vehicles enter, leave, change lanes or are sorted
         if self._cached_neighbors is None or self._cached_neighbors[0] is not lane:
-            found = find_road_neighbors(self.vehicles.road, lane, self.vehicles.position, self.geometry)
-            self._cached_neighbors = lane, found
+            neighbors = find_road_neighbors(self.vehicles.road, lane, self.vehicles.position, self.geometry)
+            self._cached_neighbors = lane, neighbors
         return self._cached_neighbors[1]
 
     def replace_roads(self, roads: Sequence[int], source: Self, source_roads: Sequence[int]) -> None:

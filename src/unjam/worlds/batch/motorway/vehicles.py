@@ -148,22 +148,26 @@ class MotorwayDrivers(NamedTuple):
         room = (clamp_min(gap, 0.0) + stop_distance) / step
         # n whole steps of braking from v = n b h + r require n b h ((n - 1) / 2 + delay) + (n + delay) r = room.
         steps = np.floor(0.5 - delay + square_root(0.25 + delay * (delay - 1.0) + 2.0 * room / change))
-        rest = room - change * steps * ((steps - 1.0) / 2.0 + delay)
-        return change * steps + rest / (steps + delay)
+        remaining_gap = room - change * steps * ((steps - 1.0) / 2.0 + delay)
+        return change * steps + remaining_gap / (steps + delay)
 
     def brake_gap(self, speed: Array, step: float) -> Array:
         """Return the stopping distance of drivers that brake after their time headway."""
         braking, time_headway = self.parameters.comfortable_deceleration, self.parameters.time_headway
         return stopping_distance(speed, braking, step) + speed * time_headway
 
-    def _eidm_or_idm(self, found: Array, idm_function: Callable[..., Array], *values: Array, **options: float) -> Array:
+    def _eidm_or_idm(
+        self, eidm_values: Array, idm_function: Callable[..., Array], *values: Array, **options: float
+    ) -> Array:
         """Return the values of EIDM drivers, and those of `idm_function` for the others."""
         is_idm = as_rows(~self.is_eidm)
         if not len(is_idm):
-            return found
-        found = found + 0.0
-        found[is_idm] = idm_function(*(each[is_idm] for each in values), self.select(is_idm).parameters, **options)
-        return found
+            return eidm_values
+        eidm_values = eidm_values + 0.0
+        eidm_values[is_idm] = idm_function(
+            *(value[is_idm] for value in values), self.select(is_idm).parameters, **options
+        )
+        return eidm_values
 
 
 def _idm_follow_speed(speed: Array, gap: Array, leader_speed: Array, parameters: IDMArrays, step: float) -> Array:
@@ -189,10 +193,10 @@ def find_rows(numbers: Array, vehicles: MotorwayVehicles, candidates: Array) -> 
     """Return the rows of the vehicles with these numbers among rows; `NO_VEHICLE` for those that are not there."""
     if not len(candidates):
         return 0 * numbers + NO_VEHICLE
-    own = vehicle_numbers(vehicles, candidates)
-    order = own.argsort()
-    found = order[np.searchsorted(own[order], numbers).clip(0, len(own) - 1)]
-    return np.where(own[found] == numbers, candidates[found], NO_VEHICLE)
+    keys = vehicle_numbers(vehicles, candidates)
+    order = keys.argsort()
+    rows = order[np.searchsorted(keys[order], numbers).clip(0, len(keys) - 1)]
+    return np.where(keys[rows] == numbers, candidates[rows], NO_VEHICLE)
 
 
 def sorted_rows(vehicles: MotorwayVehicles) -> Array:

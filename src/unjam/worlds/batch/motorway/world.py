@@ -64,7 +64,8 @@ class MotorwayBatch:
         self.roads = [cast(MotorwayRoad, road) for road, _ in drawn]
         generator_seeds = [others[:2] for _, others in drawn] if replay is None else replay.seeds
         self._human_generators, self._exploration_generators = (
-            [np.random.default_rng(seed) for seed in each] for each in zip(*generator_seeds, strict=True)
+            [np.random.default_rng(seed) for seed in seeds_of_kind]
+            for seeds_of_kind in zip(*generator_seeds, strict=True)
         )
         self._draw = draw
         precision = np.float64 if draw is None else np.float32
@@ -276,10 +277,10 @@ class MotorwayBatch:
 
     def last_applied_acceleration(self) -> Floats:
         """Return the CAVs' accelerations in the last control step [m/s2]; zero for those that have left."""
-        before, after = self._cav_speeds_before, self._local_state.speed
-        remaining, changes = self.remaining_rows, np.zeros(len(before))
-        rows = np.arange(len(before)) if remaining is None else np.array(remaining, np.intp)
-        changes[rows] = after[: len(rows)] - before[rows]
+        previous_speed, new_speed = self._cav_speeds_before, self._local_state.speed
+        remaining, changes = self.remaining_rows, np.zeros(len(previous_speed))
+        rows = np.arange(len(previous_speed)) if remaining is None else np.array(remaining, np.intp)
+        changes[rows] = new_speed[: len(rows)] - previous_speed[rows]
         return changes / self.scenario.control_step
 
     def last_outcome(self) -> Outcome:

@@ -42,9 +42,11 @@ def make_ring_episodes(
     for ring, (scenario, road, seed, count, has_crashed) in enumerate(rings):
         step_count = count * scenario.steps_per_control_step
         counts = {"requested_accelerations": count, "speeds": step_count + 1}
-        own: dict[str, Any] = {name: each[: counts.get(name, step_count), :, ring] for name, each in values.items()}
-        own |= {"has_crashed": has_crashed, "penetration_rate": penetration_rate}
-        log = OrderedRoadLog(scenario, road, start_positions[:, ring], **own)
+        ring_arrays: dict[str, Any] = {
+            name: array[: counts.get(name, step_count), :, ring] for name, array in values.items()
+        }
+        ring_arrays |= {"has_crashed": has_crashed, "penetration_rate": penetration_rate}
+        log = OrderedRoadLog(scenario, road, start_positions[:, ring], **ring_arrays)
         motion = log.speeds_and_positions()
         position = motion[1][:, -1]
         # The leader's position is not wrapped: a vehicle that touches its leader may be a little beyond it.

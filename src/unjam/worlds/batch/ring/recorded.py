@@ -64,12 +64,16 @@ class RecordedBatch(RingBatch):
 
     def episode_of(self, road: int, motion: Floats) -> Episode:
         """Return the record of one road without commands, from its `motion`, (control steps + 1, 2, vehicles)."""
-        drawn, scenario, (speeds, positions) = cast(OrderedRoad, self.roads[road]), self.scenario, motion.swapaxes(0, 1)
+        drawn_road, scenario, (speeds, positions) = (
+            cast(OrderedRoad, self.roads[road]),
+            self.scenario,
+            motion.swapaxes(0, 1),
+        )
         if scenario.steps_per_control_step > 1:
             scenario = replace(scenario, simulation_step=scenario.control_step, steps_per_control_step=1)
-        moved, no_commands = np.diff(positions, axis=0) / scenario.control_step, np.zeros((0, len(drawn.cav_ids)))
-        log = OrderedRoadLog(scenario, drawn, positions[0], moved, speeds, no_commands, no_commands, no_commands)
-        fields = common_fields(scenario, drawn, (), bool(self.crashed_roads[road]))
+        moved, no_commands = np.diff(positions, axis=0) / scenario.control_step, np.zeros((0, len(drawn_road.cav_ids)))
+        log = OrderedRoadLog(scenario, drawn_road, positions[0], moved, speeds, no_commands, no_commands, no_commands)
+        fields = common_fields(scenario, drawn_road, (), bool(self.crashed_roads[road]))
         return log.episode((speeds.T, positions.T), fields, DriverLog(), None)
 
     def replace_roads(self, roads: Any, source: Any, source_roads: Any) -> None:

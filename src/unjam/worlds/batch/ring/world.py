@@ -82,7 +82,7 @@ class RingBatch:
         draws all noise, or each road that of SUMO's episode. `human_model` replaces SUMO's IDM away from junctions.
         """
         scenario = self.scenario = scenarios[0]
-        drawn = [each.draw_from_seed(seed) for each, seed in zip(scenarios, seeds, strict=True)]
+        drawn = [column.draw_from_seed(seed) for column, seed in zip(scenarios, seeds, strict=True)]
         roads, generator_seeds = [cast(OrderedRoad, road) for road, _ in drawn], [others for _, others in drawn]
         self._scenarios, self._seeds, self._keep_record, self._to_array = scenarios, seeds, keep_record, to_array
         self.roads, self._is_controlled = roads, False
@@ -92,7 +92,7 @@ class RingBatch:
         self.cav_count = self.entered_count = cavs * len(roads)
         indices = np.array([roads[0].vehicle_ids.index(name) for name in roads[0].cav_ids])
         self._cav_indices, self._leader_indices, self._follower_indices = (
-            each.tolist() for each in (indices, indices + 1, (indices - 1) % vehicles)
+            column.tolist() for column in (indices, indices + 1, (indices - 1) % vehicles)
         )
         loops, step = np.array([road.loop_length for road in roads]), scenario.simulation_step
         self._loop_lengths, self._cav_loop_lengths = to_array(loops), to_array(np.tile(loops, cavs))
@@ -178,8 +178,8 @@ class RingBatch:
         scenario, states = self.scenario, list[LocalState]()
         max_count = round(MAX_RECALL_SECONDS / scenario.control_step)
         for remaining in range(scenario.warmup, 0, -1):
-            control_steps, rest = divmod(remaining, scenario.steps_per_control_step)
-            if rest == 0 and control_steps <= max_count:
+            control_steps, rest_steps = divmod(remaining, scenario.steps_per_control_step)
+            if rest_steps == 0 and control_steps <= max_count:
                 states.append(self.exact_state().map(as_numpy))
             self._simulate(None)
         if not states or not scenario.remember_warmup:
@@ -271,16 +271,16 @@ class RingBatch:
         """Return the exact local state of the CAVs now."""
         loop, position = self._cav_loop_lengths, self._rows_of(self._position, self._cav_indices)
         if self._has_quick_noise and isfinite(self.roads[0].loop_length):
-            place = position - loop * namespace(position).floor(position / loop)  # `%` takes ten times as long
+            lap_position = position - loop * namespace(position).floor(position / loop)  # `%` takes ten times as long
         else:
-            place = position % loop
+            lap_position = position % loop
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
         distances = [(start - position) % loop for start in self._crossing_starts]
         return LocalState(
             *self.following_state(),
             self._rows_of(self._speed, self._follower_indices),
             self._rows_of(self._gap, self._follower_indices),
-            place,
+            lap_position,
             loop,
             distance_to_crossing=reduce(namespace(position).minimum, distances) if distances else None,
             penetration_rate=None if rate is None else position * 0.0 + rate,
