@@ -126,10 +126,7 @@ def config_differences(runs: Sequence[Run]) -> dict[str, list[Any]]:
 
 
 def remove_run(folder: Path) -> None:
-    """Remove a run folder permanently.
-
-    Raise `InputError` if it is no run folder, in use, a link, or contains the working folder.
-    """
+    """Remove a run folder; raise `InputError` if it is none, in use, a link, or contains the working folder."""
     read_run(folder)
     if folder.is_symlink() or Path.cwd().is_relative_to(folder.resolve()):
         raise InputError(f"run: {str(folder)!r} is a link or has the working folder; allowed: a run folder elsewhere")

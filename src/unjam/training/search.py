@@ -79,8 +79,7 @@ def search(
 
     The folder gets `search.json`, and `best.toml` for `unjam train --config`. An interrupted search resumes, also with
     more `trials` in total. `base` and `space` must pass `check_search_space`. Raise `InputError` if the folder has
-    another search, and `UnjamError` if all trainings failed, or if a training was stopped, so that the search can be
-    resumed.
+    another search, and `UnjamError` if all trainings failed, or if a training was stopped and can be resumed.
     """
     files = _file_hashes(base, space)
     log = TrialLog(folder, {"config": asdict(base), "space": repr(space), "files": files})

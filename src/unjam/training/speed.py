@@ -298,10 +298,7 @@ def make_benchmark_ring(vehicles: int, horizon: int) -> Ring:
 def start_batch(
     rings: int, vehicles: int, driver: Driver, device: Device = "cpu", human_drivers: HumanSpeedModel | None = None
 ) -> Iterator[object]:
-    """Return an iterator over control steps of new rings, in single precision with fast noise.
-
-    Human drivers follow `human_drivers`, by default the IDM.
-    """
+    """Return an iterator over control steps of new rings, in single precision, with fast noise, by default of IDM."""
     generator, to_array = torch_generator((0,), device), partial(to_device, device=device)
     world = RingBatch(
         [make_benchmark_ring(vehicles, MAX_HORIZON)] * rings,

@@ -123,7 +123,7 @@ class SettingSampler:
         self._study.tell(trial, score, state=TrialState.FAIL if score is None else None)
 
     def _accept_or_refuse(self, trial: Trial, values: dict[str, Any], refused: list[float]) -> bool:
-        """Return whether the string gain of a setting is allowed; if not, report it to Optuna and add it to `refused`."""
+        """Return whether the string gain of a setting is allowed; if not, tell Optuna, and extend `refused`."""
         driver = label_with_parameters(self._expert, values)
         gain = 0.0 if invalid_reason(driver) else self._string_gain(driver)
         trial.set_constraint("excess_gain", gain - self._max_string_gain)
