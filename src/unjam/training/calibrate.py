@@ -158,7 +158,7 @@ def _detector_loops(network: Path, kind: str, measurement: Measurement) -> list[
 
 
 def scale_vehicle_types(files: SumoFiles, factors: CalibrationFactors) -> dict[str, dict[str, str]]:
-    """Return the attributes of passenger types that `factors` change, multiplied by them, by id of the type.
+    """Return the scaled attributes of passenger vehicle types, those with factors other than one, by id of the type.
 
     The time gap `tau` stays at least as long as the simulation step, or vehicles would collide. Raise `InputError` if
     an attribute is not a number.

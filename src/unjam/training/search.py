@@ -34,7 +34,7 @@ SEARCH_FILE, BEST_CONFIG_FILE = "search.json", "best.toml"
 MESSAGE_INTERVAL = 30.0
 """time without a message after which the progress of trainings is shown [s]"""
 TRIAL_FAILURE_CODES = (UnjamError.exit_code, InputError.exit_code)
-"""exit codes of failed trials; after other codes, such as that of a full disk, a trial is resumed"""
+"""exit codes of failed trials; after other codes, such as the code of a full disk, a trial is resumed"""
 
 
 def check_search_space(base: RunConfig, space: SearchSpace) -> None:

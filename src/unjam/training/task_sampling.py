@@ -13,7 +13,7 @@ TaskSampling = Literal["weights", "regret"]
 REGRET_FRACTION = 0.5
 """part of the environment steps that is distributed by regret; the rest is distributed by weights to all tasks"""
 MAX_WARM_UP_ITERATIONS = 8
-"""maximum number of iterations with a common warm-up of their rings: few rings cost nearly as much as many"""
+"""maximum number of iterations with a common warm-up of their rings: few rings take nearly as long as many"""
 
 
 class TaskSampler:

@@ -183,26 +183,26 @@ def tune(
     trial_count = (steps - final_steps) // trial_steps
     if trial_count < 2:
         raise InputError(f"steps: {steps} is not allowed; allowed: >= {final_steps + 2 * trial_steps} for two settings")
-    unsupported = statistically_unsupported_reason if is_single else unsupported_reason
+    find_reason = statistically_unsupported_reason if is_single else unsupported_reason
     with open_backend(backend) as simulator:
         check_support(simulator, *roads.values())
     backend_reason = "" if backend == "sumo" else f"trials run in {backend}"
-    reasons = {road: backend_reason or unsupported(scenario) for road, scenario in roads.items()}
+    reasons = {road: backend_reason or find_reason(scenario) for road, scenario in roads.items()}
     if max_string_gain and not any(scenario.is_closed for scenario in roads.values()):
         raise invalid_value("max_string_gain", max_string_gain, f"0 on {next(iter(roads))}: it is no closed road")
     if screen and all(reasons.values()):
         raise InputError(f"screen: {next(iter(reasons.values()))}")
-    screened = [road for road, reason in reasons.items() if screen is not False and not reason]
+    batch_roads = [road for road, reason in reasons.items() if screen is not False and not reason]
     recipes = {road: scenario_recipe(scenario) for road, scenario in roads.items()}
     request = {"roads": recipes, "expert": expert, "space": repr(space), "steps": steps, "reward": reward}
     files = file_hashes([expert, reward, backend], *roads.values())
     request |= {"files": files} if files else {}
     request |= {"max_string_gain": max_string_gain} if max_string_gain else {}
-    log = TrialLog(folder, request | {"seed": seed, "screen": bool(screened), "backend": backend})
+    log = TrialLog(folder, request | {"seed": seed, "screen": bool(batch_roads), "backend": backend})
     watch = watch_files(roads.values(), expert, reward, backend)
-    points = find_operating_points(roads, workers) if max_string_gain else {}
+    operating_points = find_operating_points(roads, workers) if max_string_gain else {}
     sumo_runners = dict.fromkeys(roads, partial(_run_in_sumo, workers))
-    trial_runners = sumo_runners | dict.fromkeys(screened, _run_in_batch)
+    trial_runners = sumo_runners | dict.fromkeys(batch_roads, _run_in_batch)
 
     @cache
     def human_rows(first: int, count: int) -> dict[str, EpisodeRows]:
@@ -213,8 +213,7 @@ def tune(
     ) -> list[TuningTrial]:
         drivers = [label_with_parameters(expert, values) for values in settings]
         verdicts: dict[str, TrialVerdict] = {name: (None, why) for name in drivers if (why := invalid_reason(name))}
-        new = [name for name in drivers if name not in verdicts and (first, name) not in log.verdicts]
-        new = list(dict.fromkeys(new))
+        new = [name for name in dict.fromkeys(drivers) if name not in verdicts and (first, name) not in log.verdicts]
         for driver, rows in zip(new, _run_drivers(roads, new, first, count, (reward, backend), runners), strict=True):
             watch.check()
             log.add(first, driver, _score_rows(rows, human_rows(first, count)))
@@ -224,13 +223,16 @@ def tune(
     def string_gain(driver: str) -> float:
         key = STRING_GAIN_SEED, driver
         if key not in log.verdicts:
-            gains = [point.string_gain(driver_from_name(driver, point.road.control_step)) for point in points.values()]
+            gains = [
+                point.string_gain(driver_from_name(driver, point.road.control_step))
+                for point in operating_points.values()
+            ]
             log.add(*key, (max(gains, default=0.0), "largest string gain"))
         return log.verdicts[key][0] or 0.0
 
     trials: list[TuningTrial] = []
     sampler = SettingSampler(expert, space, seed, string_gain, max_string_gain)
-    shares_batches = any(required_batch_kind(roads[road]).has_own_drivers for road in screened)
+    shares_batches = any(required_batch_kind(roads[road]).has_own_drivers for road in batch_roads)
     batch_size = SCREENING_BATCH_SIZE if screen or shares_batches else 1  # many trials take as long as few
     for first in range(0, trial_count, batch_size):
         proposals = sampler.ask(min(batch_size, trial_count - first))
@@ -243,12 +245,12 @@ def tune(
     ranked = sorted((trial for trial in trials if trial.score is not None), key=_ranking_score, reverse=True)
     best_values = list({trial.driver: trial.values for trial in ranked}.values())[:TUNING_FINALISTS]
     *finalists, default = score_settings([*best_values, {}], episodes, 2 * episodes, sumo_runners)
-    is_default_allowed = not points or string_gain(default.driver) <= max_string_gain
+    is_default_allowed = not operating_points or string_gain(default.driver) <= max_string_gain
     best = max((*finalists, default) if is_default_allowed else finalists, key=_ranking_score, default=None)
     if best is None or best.score is None:
         raise UnjamError(f"all {trial_count} settings of {expert} are infeasible: {default.verdict}")
     run_count = len({trial.driver for trial in trials if not invalid_reason(trial.driver)})
-    batch_steps = run_count * episodes * sum(roads[road].max_episode_steps for road in screened)
+    batch_steps = run_count * episodes * sum(roads[road].max_episode_steps for road in batch_roads)
     unused_steps = (TUNING_FINALISTS - len(best_values)) * 2 * trial_steps
     sumo_steps = run_count * trial_steps + final_steps - unused_steps - batch_steps
     file = None if is_file_reference(expert) else folder / f"{expert}{SUFFIX}"
@@ -262,7 +264,7 @@ def tune(
         "batch_steps": batch_steps,
         "best": asdict(best),
         "default": asdict(default),
-        **({"string_gain": string_gain(best.driver), "max_string_gain": max_string_gain} if points else {}),
+        **({"string_gain": string_gain(best.driver), "max_string_gain": max_string_gain} if operating_points else {}),
     }
     if file is not None:
         driver = driver_from_name(best.driver, scenario.control_step)
