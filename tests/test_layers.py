@@ -229,7 +229,7 @@ UNSAFE_BUT = {
     "sumo_files/reader_program.py: open(copy, 'w', encoding='utf-8')": PRIVATE,
     "reports/video.py: imageio_ffmpeg.write_frames(str(video), (FRAME_SIZE, FRAME_SIZE), fps=rate, "
     "ffmpeg_log_level='error')": PRIVATE,
-    "training/tensorboard.py: SummaryWriter(str(place), filename_suffix=f'.{secrets.token_hex(8)}')": (
+    "training/tensorboard.py: SummaryWriter(str(log_folder), filename_suffix=f'.{secrets.token_hex(8)}')": (
         "the name of its file cannot be guessed, and its folder was made without following links"
     ),
     "training/train.py: self._controllers.save(contents, is_best)": "through `unjam.files`",

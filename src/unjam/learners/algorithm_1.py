@@ -123,7 +123,7 @@ class Algorithm1:
         return [without_model, *((False, part, settings.model_updates) for part in range(settings.model_updates))]
 
     def _model_experience(self, iteration: int, part: int, parts: int) -> Experience | None:
-        """Return part `part` of `parts` of the present policy's experience in all models; None if there is none."""
+        """Return the part with index `part` of the present policy's experience in all models, or None."""
         network = self.network()
         results = [rollouts.roll_out(network, iteration, part, parts) for rollouts in self.model_rollouts]
         rows = [experience for experience in results if experience is not None]

@@ -65,7 +65,7 @@ class ModelRollouts:
         }
 
     def roll_out(self, network: Network, iteration: int, part: int = 0, parts: int = 1) -> Experience | None:
-        """Return part `part` of `parts` of the experience of `network` in the model; None if k* is too short."""
+        """Return the part with index `part` of the experience of `network` in the model; None if k* is too short."""
         model, driver = self.world_model, full_policy(self.task, self.spec.policy, network)
         control_steps = int(min(self.k_star, model.max_control_steps)) // driver.action_repeat * driver.action_repeat
         seed, *seeds = (self._seed(iteration, purpose, part) for purpose in (STARTS_SEED, NOISE_SEED, EXPLORATION_SEED))

@@ -66,34 +66,34 @@ class SB3Learner(Learner):
     def state(self) -> tuple[dict[str, Any], Tensors]:
         """Return values and tensors to resume exactly, without a random state, because each update is seeded."""
         tensors: Tensors = {}
-        for part, state in self.sb3.get_parameters().items():
+        for component, state in self.sb3.get_parameters().items():
             if "param_groups" in state:  # an optimizer
                 for index, entry in state["state"].items():
-                    tensors |= {f"{part}/{index}/{name}": tensor for name, tensor in entry.items()}
+                    tensors |= {f"{component}/{index}/{name}": tensor for name, tensor in entry.items()}
             else:
-                tensors |= {f"{part}/{name}": tensor for name, tensor in state.items()}
+                tensors |= {f"{component}/{name}": tensor for name, tensor in state.items()}
         return {"updates": self.sb3._n_updates}, tensors
 
     def restore(self, values: dict[str, Any], tensors: Tensors) -> None:
         """Resume from the values and tensors that `state` returned with the same configuration."""
-        initial = self.sb3.get_parameters()
-        self.sb3.set_parameters({part: self._stored_state(part, state, tensors) for part, state in initial.items()})
+        states = self.sb3.get_parameters()
+        self.sb3.set_parameters({name: self._stored_state(name, state, tensors) for name, state in states.items()})
         self.sb3._n_updates = values["updates"]
 
-    def _stored_state(self, part: str, initial_state: dict[str, Any], tensors: Tensors) -> dict[str, Any]:
+    def _stored_state(self, component: str, initial_state: dict[str, Any], tensors: Tensors) -> dict[str, Any]:
         """Return the stored state of a network or optimizer for `set_parameters`, given its state in a new learner."""
-        stored = tensors_with_prefix(f"{part}/", tensors)
+        stored = tensors_with_prefix(f"{component}/", tensors)
         if "param_groups" not in initial_state:
             return stored
-        groups = recursive_getattr(self.sb3, part).param_groups
+        groups = recursive_getattr(self.sb3, component).param_groups
         shapes = [parameter.shape for group in groups for parameter in group["params"]]
         entries: dict[int, Tensors] = {}
         for name, tensor in stored.items():
             index, _, key = name.partition("/")
-            check_shape(f"{part}/{name}", tensor, torch.Size() if key == "step" else shapes[int(index)])
+            check_shape(f"{component}/{name}", tensor, torch.Size() if key == "step" else shapes[int(index)])
             entries.setdefault(int(index), {})[key] = tensor
         if any(entry.keys() != ADAM_STATE for entry in entries.values()):
-            raise ValueError(f"{part} is no state of Adam")
+            raise ValueError(f"{component} is no state of Adam")
         return {"state": entries, "param_groups": initial_state["param_groups"]}
 
 

@@ -113,7 +113,7 @@ def load_corridor(file: str, detectors: Path, begin: float | None = None, end: f
     files = read_sumo_files(Path(network.file))
     first = files.begin if begin is None else begin
     last = next((limit for limit in (end, files.end) if limit is not None), inf)
-    measurements = tuple(each for each in all_measurements if each.begin >= first and each.end <= last)
+    measurements = tuple(row for row in all_measurements if row.begin >= first and row.end <= last)
     if not measurements:
         raise InputError(f"{detectors.name}: no interval lies between {first:g} s and {last:g} s")
     if not passenger_types(files):
@@ -135,7 +135,7 @@ def _edge_id(kind: str, measurement: Measurement) -> str:
 def _check_speed_unit(network: Path, kind: str, measurements: Sequence[Measurement], file: str) -> None:
     """Raise `InputError` if measured speeds are so far above the speed limits that they have another unit."""
     limits = network_geometry(network).speed_limits
-    ratios = [each.speed / limits[_edge_id(kind, each)] for each in measurements if isfinite(each.speed)]
+    ratios = [row.speed / limits[_edge_id(kind, row)] for row in measurements if isfinite(row.speed)]
     ratio = float(np.percentile(ratios, SPEED_PERCENTILE)) if ratios else 0.0
     if ratio > MAX_SPEED_LIMIT_RATIO:
         raise InputError(
@@ -158,7 +158,7 @@ def _detector_loops(network: Path, kind: str, measurement: Measurement) -> list[
 
 
 def scale_vehicle_types(files: SumoFiles, factors: CalibrationFactors) -> dict[str, dict[str, str]]:
-    """Return the attributes of passenger types that `factors` change, multiplied by them, by id of the type.
+    """Return the scaled attributes of passenger vehicle types, those with factors other than one, by id of the type.
 
     The time gap `tau` stays at least as long as the simulation step, or vehicles would collide. Raise `InputError` if
     an attribute is not a number.
@@ -219,13 +219,11 @@ class CalibrationResult:
     """Result of a calibration."""
 
     factors: CalibrationFactors
-    """best factors"""
     vehicle_types: dict[str, dict[str, str]]
     """changed attributes of vehicle types, by id"""
     original: list[Agreement]
-    """agreement of the original network on each test seed"""
+    """agreement of the original network on each test seed, as `calibrated` for the calibrated network"""
     calibrated: list[Agreement]
-    """agreement of the calibrated network on each test seed"""
     trials: list[CalibrationTrial]
     file: Path
     """the calibrated network"""
@@ -234,10 +232,8 @@ class CalibrationResult:
         """Return the mean of each measure with its CI: original, calibrated, and the paired difference."""
         estimates = {}
         for name in asdict(self.original[0]):
-            original, calibrated = (
-                np.array([getattr(agreement, name) for agreement in agreements])
-                for agreements in (self.original, self.calibrated)
-            )
+            agreements = self.original, self.calibrated
+            original, calibrated = (np.array([getattr(row, name) for row in rows]) for rows in agreements)
             columns = {"original": original, "calibrated": calibrated, "difference": calibrated - original}
             bounds = (0.0, 1.0 if name == "geh_below_5" else inf)
             estimates[name] = {

@@ -155,26 +155,27 @@ class RunConfig(AgentSettings):
         policy, evaluation = self.policy, self.evaluation
         scenarios = [road.make_scenario() for road in self.task_configs().values()]
         reasons = list(map(unsupported_reason if self.tasks else statistically_unsupported_reason, scenarios))
-        model = self.model.kind if self.model.model_ratio > 0 else ""
+        model_kind = self.model.kind if self.model.model_ratio > 0 else ""
         has_memory = "expert_memory" in policy.inputs or any(map(is_file_reference, policy.inputs))
-        has_pairs = not model or (model == "road" and not any(road.is_closed for road in scenarios))
+        has_pairs = not model_kind or (model_kind == "road" and not any(road.is_closed for road in scenarios))
         has_validated_tasks = len(self.tasks) > 1 and evaluation.validation_interval > 0
         device, patience, exploration = self.model.device, evaluation.patience, policy.exploration
-        no_memory = policy.history_features and not has_memory
-        no_validation = patience and not evaluation.validation_interval
-        no_noise = policy.episode_noise and self.agent in ("sac", "td3")
-        pairs = "per_step, per_episode, because these model rollouts have no antithetic pairs"
-        weights = "weights, except for several validated tasks"
+        lacks_exit_reward = policy.reward_after_exit and model_kind == "row"
+        lacks_memory = policy.history_features and not has_memory
+        lacks_validation = patience and not evaluation.validation_interval
+        lacks_episode_noise = policy.episode_noise and self.agent in ("sac", "td3")
+        allowed_exploration = "per_step, per_episode, because these model rollouts have no antithetic pairs"
+        allowed_sampling = "weights, except for several validated tasks"
         checks = (
             (self.backend == "batch" and all(reasons), "backend: batch", f"sumo ({reasons[0]})"),
-            (policy.reward_after_exit and model == "row", "policy.reward_after_exit: true", "false with a row model"),
+            (lacks_exit_reward, "policy.reward_after_exit: true", "false with a row model"),
             (self.unused_setting, self.unused_setting, f"none for the agent {self.agent}"),
-            (no_memory, "policy.history_features: true", "false without the input expert_memory"),
-            (no_validation, f"evaluation.patience: {patience}", "0 without validations"),
-            (model == "road" and device != "cpu", f"model.device: {device}", "cpu, for road models"),
-            (no_noise, f"policy.exploration: {exploration}", f"per_step, for {self.agent}"),
-            (exploration == "antithetic" and not has_pairs, "policy.exploration: antithetic", pairs),
-            (self.task_sampling == "regret" and not has_validated_tasks, "task_sampling: regret", weights),
+            (lacks_memory, "policy.history_features: true", "false without the input expert_memory"),
+            (lacks_validation, f"evaluation.patience: {patience}", "0 without validations"),
+            (model_kind == "road" and device != "cpu", f"model.device: {device}", "cpu, for road models"),
+            (lacks_episode_noise, f"policy.exploration: {exploration}", f"per_step, for {self.agent}"),
+            (exploration == "antithetic" and not has_pairs, "policy.exploration: antithetic", allowed_exploration),
+            (self.task_sampling == "regret" and not has_validated_tasks, "task_sampling: regret", allowed_sampling),
         )
         for is_wrong, value, allowed in checks:
             if is_wrong:

@@ -248,13 +248,9 @@ def drive(
         ]
         has_results = any(row["status"] != "failed" for rows in evaluation.rows.values() for row in rows)
         if folder is not None and has_results:
-            metadata = {
-                "scenario": Path(scenario).name,
-                "reward": reward_label(reward or road.reward),
-                "backend": backend_label(backend),
-            }
-            contents = {"manifest": manifest(), "controllers": hashes, "notes": notes, "baseline": baseline}
-            save_evaluation(folder, evaluation, {**metadata, **contents})
+            labels = {"reward": reward_label(reward or road.reward), "backend": backend_label(backend)}
+            metadata = {"scenario": Path(scenario).name, **labels, "manifest": manifest(), "controllers": hashes}
+            save_evaluation(folder, evaluation, {**metadata, "notes": notes, "baseline": baseline})
             from unjam.reports.html import write_report_page  # imported late: it draws
 
             report = write_report_page([folder], folder / "report.html")

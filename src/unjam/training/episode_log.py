@@ -26,7 +26,7 @@ class EpisodeLog(RowLog):
     """Rows of metrics by setup (scenario and driver) and seed."""
 
     def __init__(self, folder: Path, scenario: Scenario) -> None:
-        """Begin in a new folder, or resume with the same scenario, files and commit; raise `InputError` for others."""
+        """Begin in a new folder, or resume with the same scenario, files and commit; else raise `InputError`."""
         request = {"scenario": scenario_recipe(scenario), "files": file_hashes((), scenario)}
         super().__init__(folder, request | {"commit": manifest()["commit"]}, EPISODES_FILE)
         self._call_id, self._lock = token_hex(16), Lock()

@@ -114,8 +114,8 @@ def evaluate_on_roads(
     pairs = [(label, index) for index in range(len(seeds)) for label in drivers]
     pairs = [pair for pair in pairs if pair not in skipped]
     tasks = {(label, index): EpisodeTask(*drivers[label], seeds[index], **settings) for label, index in pairs}
-    remote = [pair for pair in pairs if tasks[pair].is_serializable]
-    local = [pair for pair in pairs if not tasks[pair].is_serializable]
+    remote_pairs = [pair for pair in pairs if tasks[pair].is_serializable]
+    local_pairs = [pair for pair in pairs if not tasks[pair].is_serializable]
     watch = watch or watch_files((scenario for scenario, _ in drivers.values()), reward, backend)
     on_progress = progress or (lambda pair, steps: None)
 
@@ -125,13 +125,13 @@ def evaluate_on_roads(
         return row, episode if with_plots and pair[1] == 0 and episode.has_run else None
 
     measured = workers.run_and_map(
-        [tasks[pair] for pair in remote],
-        lambda index, episode: measure_episode(remote[index], episode),
-        lambda index, steps: on_progress(remote[index], steps),
+        [tasks[pair] for pair in remote_pairs],
+        lambda index, episode: measure_episode(remote_pairs[index], episode),
+        lambda index, steps: on_progress(remote_pairs[index], steps),
     )
-    results = dict(zip(remote, measured, strict=True))
-    with open_backend(backend) if local else nullcontext(backend) as open_simulator:
-        for pair in local:
+    results = dict(zip(remote_pairs, measured, strict=True))
+    with open_backend(backend) if local_pairs else nullcontext(backend) as open_simulator:
+        for pair in local_pairs:
             task = replace(tasks[pair], backend=open_simulator)
             results[pair] = measure_episode(pair, run_episode(**vars(task), on_progress=partial(on_progress, pair)))
     rows = {label: [results[pair][0] for pair in pairs if pair[0] == label] for label in drivers}

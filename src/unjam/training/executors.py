@@ -143,11 +143,11 @@ def run_all(commands: dict[str, CommandLine], workers: int, executor: Executor, 
         return
     failed, start_time = [], time.monotonic()
     with open_executor(executor, workers) as start:
-        names = {start(command): name for name, command in commands.items()}
-        for done_count, future in enumerate(as_completed(names), start=1):
-            name, exit_code = names[future], future.result()
+        name_by_future = {start(command): name for name, command in commands.items()}
+        for done_count, future in enumerate(as_completed(name_by_future), start=1):
+            name, exit_code = name_by_future[future], future.result()
             minutes = (time.monotonic() - start_time) / 60.0
-            on_message(f"{done_count} of {len(names)}, {minutes:.0f} min: {name}{' failed' if exit_code else ''}")
+            on_message(f"{done_count} of {len(commands)}, {minutes:.0f} min: {name}{' failed' if exit_code else ''}")
             if exit_code != 0:
                 failed.append(name)
     if failed:
@@ -179,7 +179,7 @@ def _open_ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
 
 @contextmanager
 def _convert_ray_errors() -> Iterator[None]:
-    """Raise errors of Ray as `UnjamError`, and those that a process of the cluster raised with their own class."""
+    """Raise errors of Ray as `UnjamError`, and errors in processes of the cluster with their original class."""
     try:
         yield
     except Exception as error:

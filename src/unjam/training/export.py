@@ -60,7 +60,7 @@ class ControllerStore:
     """Controller files of a run, one per task folder: the `best` of scheduled validations, and the `latest`."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
-        """Take the folders of the tasks; the contents of their controllers follow."""
+        """Start without contents for the folders of the tasks."""
         self._folders = folders
         self._contents: dict[ControllerKind, list[bytes]] = {}
 
@@ -272,7 +272,7 @@ def _read_run_origin(run: str, scenario: str, settings: dict[str, Any]) -> tuple
 def _read_driver_origin(
     driver_name: str, scenario: str, settings: dict[str, Any]
 ) -> tuple[Scenario, Driver, dict[str, Any]]:
-    """Return road, driver and manifest entries of a driver; those of a controller's file are kept, except settings."""
+    """Return road, driver and manifest entries; for a controller's file the stored ones, with changed settings."""
     file = None if scenario else controller_path(driver_name)
     if file is not None:
         controller = read_controller(file)

@@ -89,7 +89,7 @@ class TrainedModel(NamedTuple):
 
 
 def read_trained_model(folder: Path, config: RunConfig) -> TrainedModel:
-    """Return the model of a run on the CPU; raise `InputError` if it has none, or no valid checkpoint."""
+    """Return the model of a run on the CPU; raise `InputError` without a model or a valid checkpoint."""
     _check_has_facts(folder, config)
     checkpoint, progress = load_checkpoint(folder / "checkpoint"), read_progress(folder)
     if checkpoint is None or not progress:

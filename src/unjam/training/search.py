@@ -34,7 +34,7 @@ SEARCH_FILE, BEST_CONFIG_FILE = "search.json", "best.toml"
 MESSAGE_INTERVAL = 30.0
 """time without a message after which the progress of trainings is shown [s]"""
 TRIAL_FAILURE_CODES = (UnjamError.exit_code, InputError.exit_code)
-"""exit codes of failed trials; after other codes, such as that of a full disk, a trial is resumed"""
+"""exit codes of failed trials; after other codes, such as the code of a full disk, a trial is resumed"""
 
 
 def check_search_space(base: RunConfig, space: SearchSpace) -> None:
@@ -79,8 +79,7 @@ def search(
 
     The folder gets `search.json`, and `best.toml` for `unjam train --config`. An interrupted search resumes, also with
     more `trials` in total. `base` and `space` must pass `check_search_space`. Raise `InputError` if the folder has
-    another search, and `UnjamError` if all trainings failed, or if a training was stopped, so that the search can be
-    resumed.
+    another search, and `UnjamError` if all trainings failed, or if a training was stopped and can be resumed.
     """
     files = _file_hashes(base, space)
     log = TrialLog(folder, {"config": asdict(base), "space": repr(space), "files": files})

@@ -67,7 +67,7 @@ def float_range(distribution: Distribution) -> Distribution:
 def default_search_space(expert: str, time_step: float) -> SearchSpace:
     """Return the default ranges of an expert's parameters: numbers within a factor of four, all words, both booleans.
 
-    Raise `InputError` if there is no such expert, or if it has no such parameters.
+    Raise `InputError` if there is no such expert, or if it has no tunable parameters.
     """
     parameters = tunable_parameters(expert, time_step)
     ranges = {name: _default_range(value, type_hint) for name, (value, type_hint) in parameters.items()}
@@ -102,7 +102,7 @@ def tunable_parameters(expert: str, time_step: float) -> dict[str, tuple[Any, An
 
 
 def expert_search_space(texts: Sequence[str], defaults: SearchSpace) -> SearchSpace:
-    """Return the search space of texts; ranges of integers become ranges of floats if the default ranges are such."""
+    """Return the search space of texts; ranges of integers become ranges of floats where the defaults are."""
     space = parse_search_space(texts)
     is_float = {name: isinstance(defaults.get(name), FloatDistribution) for name in space}
     return {name: float_range(distribution) if is_float[name] else distribution for name, distribution in space.items()}

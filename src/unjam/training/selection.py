@@ -49,7 +49,7 @@ ACC_DRIVER = "cruise"
 UNCHANGED_ACC_DRIVER = "acc with unchanged vehicles"
 """driver of ACC vehicles with the properties of the replaced vehicles instead of those that the user sets for CAVs"""
 OptionRunner = Callable[[Sequence[Option], Sequence[EpisodeSeed]], dict[Option, OptionRows]]
-"""runs options on seeds and returns their rows, if the time is up only of the first seeds"""
+"""runs options on seeds and returns their rows; if the time is up, only the rows of the first seeds"""
 
 
 class EpisodeBudget:
@@ -145,8 +145,8 @@ def select_controllers(
     Raise `UnjamError` if the human baseline or all options fail.
     """
     rows: dict[Option, OptionRows] = {option: [] for option in (HUMAN_BASELINE, *options)}
-    rejected: dict[Option, str] = {}
-    selection, remaining = Selection(rows, rejected, []), list(options)
+    rejection_reasons: dict[Option, str] = {}
+    selection, remaining = Selection(rows, rejection_reasons, []), list(options)
     rates = [option.penetration_rate for option in options]
     max_drivers = max(map(rates.count, rates), default=0)
     round_count = ceil(log2(max_drivers)) if max_drivers > 1 else 0
@@ -157,26 +157,28 @@ def select_controllers(
         if count:
             seeds = selection_seeds(count, len(rows[HUMAN_BASELINE]))
             _extend_rows(rows, run_options([HUMAN_BASELINE, *remaining], seeds))
-        rejected |= _failure_reasons(rows, remaining)
+        rejection_reasons |= _failure_reasons(rows, remaining)
         seed_count = len(rows[HUMAN_BASELINE])
         if seed_count >= MIN_HARM_SEEDS:
-            rejected |= {option: harm for option in remaining if (harm := describe_harm(selection.effect(option)))}
-        remaining = [option for option in remaining if option not in rejected]
+            rejection_reasons |= {
+                option: harm for option in remaining if (harm := describe_harm(selection.effect(option)))
+            }
+        remaining = [option for option in remaining if option not in rejection_reasons]
         for rate in dict.fromkeys(option.penetration_rate for option in remaining):
             ranked = sorted(
                 (option for option in remaining if option.penetration_rate == rate),
                 key=lambda option: _ranking_key(selection.effect(option)),
             )
             reason = f"behind {ranked[0].driver} ({format_count(seed_count, 'tuning seed')})"
-            rejected |= dict.fromkeys(ranked[ceil(len(ranked) / 2) :], reason)
-        remaining = [option for option in remaining if option not in rejected]
+            rejection_reasons |= dict.fromkeys(ranked[ceil(len(ranked) / 2) :], reason)
+        remaining = [option for option in remaining if option not in rejection_reasons]
         status = f"{format_count(seed_count, 'tuning seed')}: {len(remaining)} of {len(options)} options remain"
         on_message(f"{status}; {_remaining_time_text(budget)}")
         if not remaining:
             break
     if options and len(_failure_reasons(rows, options)) == len(options):
         raise_failure([row for option in options for row in rows[option]])
-    return Selection(rows, rejected, remaining)
+    return Selection(rows, rejection_reasons, remaining)
 
 
 @dataclass(frozen=True)

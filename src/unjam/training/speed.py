@@ -62,7 +62,7 @@ VECTOR_ENVIRONMENTS = ((1024, False), (4096, False), (1024, True))
 ASYNC_ENVIRONMENTS = 2
 """number of processes of Gymnasium's asynchronous vector environment"""
 MOTORWAYS, FILLING_STEPS, MOTORWAY_STEPS = 256, 150, 20
-"""number of motorways in a vector environment, of control steps before the measurement, and of those in each round"""
+"""number of motorways in a vector environment, and of control steps before the measurement and per round"""
 BUSY_ON_RAMP: dict[str, Any] = {
     "scenario": "on-ramp",
     "slots": 8,
@@ -298,10 +298,7 @@ def make_benchmark_ring(vehicles: int, horizon: int) -> Ring:
 def start_batch(
     rings: int, vehicles: int, driver: Driver, device: Device = "cpu", human_drivers: HumanSpeedModel | None = None
 ) -> Iterator[object]:
-    """Return an iterator over control steps of new rings, in single precision with fast noise.
-
-    Human drivers follow `human_drivers`, by default the IDM.
-    """
+    """Return an iterator over control steps of new rings in single precision with fast noise, by default with IDM."""
     generator, to_array = torch_generator((0,), device), partial(to_device, device=device)
     world = RingBatch(
         [make_benchmark_ring(vehicles, MAX_HORIZON)] * rings,

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from math import nan
 
 import numpy as np
@@ -46,11 +47,9 @@ class OperatingPoint:
 def find_operating_points(roads: Mapping[str, Scenario], workers: WorkerPool) -> dict[str, OperatingPoint]:
     """Return the operating points of closed roads by name, around the mean speed of human-only traffic."""
     closed_roads = {name: road for name, road in roads.items() if road.is_closed}
-    seeds = tuning_seeds(HUMAN_EPISODES)
-    rows = workers.run_and_map(
-        [EpisodeTask(road, Human(), seed) for road in closed_roads.values() for seed in seeds],
-        lambda index, episode: measure(episode),
-    )
+    roads_and_seeds = product(closed_roads.values(), tuning_seeds(HUMAN_EPISODES))
+    tasks = [EpisodeTask(road, Human(), seed) for road, seed in roads_and_seeds]
+    rows = workers.run_and_map(tasks, lambda index, episode: measure(episode))
     raise_failure(rows)
     points: dict[str, OperatingPoint] = {}
     for index, (name, road) in enumerate(closed_roads.items()):

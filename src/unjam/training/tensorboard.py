@@ -14,24 +14,24 @@ TENSORBOARD_FOLDER = "tensorboard"
 
 
 def tensorboard_writer(folder: Path | str) -> IterationCallback:
-    """Return an `on_iteration` of `unjam.train` that writes each row of progress into the run's folder.
+    """Return a function for `on_iteration` of `unjam.train` that writes each row of progress into the run's folder.
 
     Each number has a curve over environment steps. Raise `MissingPartError` if TensorBoard is not installed.
     """
-    import_optional("tensorboard")  # otherwise the error would come after the first iteration
+    import_optional("tensorboard")  # otherwise, the error would be raised after the first iteration
     from torch.utils.tensorboard.writer import SummaryWriter
 
-    place = Path(folder, TENSORBOARD_FOLDER)
+    log_folder = Path(folder, TENSORBOARD_FOLDER)
     writer: SummaryWriter | None = None
 
-    def write(row: dict[str, Any]) -> None:
+    def write_row(row: dict[str, Any]) -> None:
         nonlocal writer
-        if writer is None:  # the run creates its folder first
-            make_folder(place)  # follows no links; the name of the file cannot be guessed
-            writer = SummaryWriter(str(place), filename_suffix=f".{secrets.token_hex(8)}")
+        if writer is None:  # the training creates the run's folder before
+            make_folder(log_folder)  # follows no links; the random suffix keeps others from placing a link as the file
+            writer = SummaryWriter(str(log_folder), filename_suffix=f".{secrets.token_hex(8)}")
         for name, value in flatten_keys(row).items():
             if isinstance(value, int | float) and name not in ("iteration", "environment_steps"):
                 writer.add_scalar(name.replace(".", "/", 1), value, row["environment_steps"])
         writer.flush()
 
-    return write
+    return write_row

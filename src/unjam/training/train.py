@@ -1,4 +1,4 @@
-"""Training: from a configuration to a run folder. `unjam train`, `unjam.train`."""
+"""Training from a configuration into a run folder (`unjam train`, `unjam.train`)."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -41,7 +41,7 @@ from unjam.seeds import VALIDATION_SEED
 from unjam.text import one_line
 from unjam.training import run_folder
 from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
-from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert
+from unjam.training.evaluate import DriverAndEpisode, EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert
 from unjam.training.executors import IterationCallback, train_in_subprocess
 from unjam.training.export import ControllerStore
 from unjam.training.fingerprint import check_file_hashes, code_names, file_hashes, fingerprint
@@ -61,16 +61,16 @@ PROGRESS_METRICS = (
     *("mean_speed", "speed_std_fleet", "cav_mean_speed", "speed_std_cav", "mean_abs_accel"),
     "shield_override_share",
 )
-"""metrics of progress: means over the episodes of an iteration"""
+"""metrics in rows of progress, as means over the episodes of an iteration"""
 PROGRESS_RETURNS = ("return_mean", "return_expert", "return_validation")
 ALGORITHM_PREFIX = "algorithm/"
 ValidationReturns = Sequence[float] | None
-"""return on the validation seeds of each task; None without a validation"""
+"""mean return of each task on the validation seeds; None without a validation"""
 
 
 @dataclass(frozen=True)
 class TrainResult:
-    """A finished training run; one of several tasks has only their results, in `tasks`."""
+    """A finished training run; with several tasks, the results are only in `tasks`."""
 
     folder: Path
     rows: RowsByDriver
@@ -97,11 +97,11 @@ class TrainResult:
 
     @property
     def report(self) -> Path:
-        """The page with the results."""
+        """The HTML page with the results."""
         return self.folder / "report.html"
 
     def plot(self) -> "Figure":
-        """Return a figure of the learning curve: the return in training and in validation by environment steps."""
+        """Return a figure of the learning curve: the returns in training and validation over environment steps."""
         from unjam.reports.figures import learning_curve_figure
 
         return learning_curve_figure({"": read_progress(self.folder)}, {}, {})
@@ -116,19 +116,19 @@ def train(
 ) -> TrainResult:
     """Train into `folder`, evaluate the controller on test seeds, and write the report.
 
-    With `resume` a stopped run continues, and a finished one if `config.steps` is larger than before; the result is
-    the same as without interruption. A run of several tasks (`config.tasks`) is evaluated on each of them, in a folder
+    With `resume`, a stopped run continues, and a finished run if `config.steps` is larger than before; the result is
+    the same as without interruption. A run of several tasks (`config.tasks`) is evaluated on each task, in a folder
     with the name of the task.
 
-    If NumPy was imported before unjam, the training runs in its own process, so that the result is the same: see
-    `unjam.kernels`. Otherwise it uses the global generators of NumPy and torch, and restores them.
+    If NumPy was imported before unjam, the training runs in another process, so that the result is the same: see
+    `unjam.kernels`. Otherwise, it uses the global generators of NumPy and torch, and restores their state.
 
     Args:
         config: the configuration; see `unjam.load_config`.
-        folder: a new folder, or that of the run to resume.
+        folder: a new folder, or the folder of the run to resume.
         resume: whether to resume the run in `folder`.
         on_iteration: called with a row of progress after each iteration; if it returns False, the training ends as if
-            its steps were done, and can be resumed.
+            all steps were made, and can be resumed.
         progress: called during the final evaluation with ((driver, episode), control steps).
 
     Raises:
@@ -137,8 +137,8 @@ def train(
         DiskError: the disk is full; the last checkpoint is complete.
     """
     folder = Path(folder)
-    run = train_in_subprocess if needs_new_process() else train_in_process
-    rows = run(config, folder, resume, on_iteration, progress)
+    train_in = train_in_subprocess if needs_new_process() else train_in_process
+    rows = train_in(config, folder, resume, on_iteration, progress)
     results = {
         name: TrainResult(folder / name, rows[name], gain_over_expert(task, rows[name]))
         for name, task in config.task_configs().items()
@@ -157,7 +157,7 @@ def train_in_process(
     """Train in this process, as `train` does; return the rows of the evaluation by task and driver."""
     run_folder.check_config(config)  # before anything is written
     if not is_file_reference(config.agent):
-        learner_class(config.learner)  # a package that is missing is reported before anything is written
+        learner_class(config.learner)  # reports a missing package before anything is written
     if resume:
         run_folder.read_config(folder)
     else:
@@ -181,16 +181,15 @@ def train_in_process(
     return rows
 
 
-def _report_task_progress(progress: EvaluationProgress, name: str, episode: tuple[str, int], steps: int) -> None:
-    driver, number = episode
-    progress((f"{name} {driver}".strip(), number), steps)
+def _report_task_progress(progress: EvaluationProgress, task: str, episode: DriverAndEpisode, steps: int) -> None:
+    driver, index = episode
+    progress((f"{task} {driver}".strip(), index), steps)
 
 
 class Trainer:
-    """Runs an algorithm with episodes from the workers, validation and the run's folder.
+    """Trains: runs an algorithm with episodes from the workers, validates, and writes the run's folder.
 
-    Each of several tasks has its own folder with controller and progress; returns of the run are weighted means over
-    them.
+    Each of several tasks has a folder with controller and progress; returns of the run are weighted means over tasks.
     """
 
     def __init__(
@@ -220,11 +219,11 @@ class Trainer:
             run_folder.append_lineage(folder, self.collector.iteration)
 
     def _restore(self, values: dict[str, Any], tensors: Tensors) -> None:
-        """Continue from a checkpoint; raise one of `UNREADABLE_ERRORS` if another program has written it."""
+        """Resume from a checkpoint; raise one of `UNREADABLE_ERRORS` if it is not a checkpoint of this run."""
         state = unpack(run_folder.CheckpointValues, values, {})
         returns = [state.best_validation, *state.expert_returns]
         is_consistent = 0 < state.iteration <= state.environment_steps and len(returns) == 1 + len(self.tasks)
-        if not is_consistent or not all(isinstance(each, float) for each in returns):
+        if not is_consistent or not all(isinstance(value, float) for value in returns):
             raise ValueError("its numbers contradict each other")
         is_stopped = self.config.evaluation.should_stop_early(read_progress(self.folder))
         self._controllers.restore(tensors, is_stopped or state.environment_steps >= self.config.steps)
@@ -235,20 +234,20 @@ class Trainer:
         self._sampler.restore(state.sampler)
 
     def _string_gain_function(self) -> Callable[[Network], float]:
-        """Return the function that measures the largest string gain of the policy on all closed roads."""
+        """Return a function that measures the largest string gain of the full policy over all closed roads."""
         points = find_operating_points({task.name: task.scenario for task in self.tasks}, self.workers)
         if not points:
             allowed = f"none on {self.config.scenario}: it is no closed road"
             raise invalid_value("policy.max_string_gain", self.config.policy.max_string_gain, allowed)
 
         def string_gain(network: Network) -> float:
-            drivers = zip(self.tasks, self.make_drivers(network), strict=True)
-            return max(points[task.name].string_gain(driver) for task, driver in drivers if task.name in points)
+            pairs = zip(self.tasks, self.make_drivers(network), strict=True)
+            return max(points[task.name].string_gain(driver) for task, driver in pairs if task.name in points)
 
         return string_gain
 
     def train(self) -> None:
-        """Learn until the configured environment steps; an interruption loses at most the current iteration."""
+        """Run iterations up to the configured steps; an interruption loses at most the current iteration."""
         if self.config.tasks:
             for folder, task in zip(self.folders, self.config.task_configs().values(), strict=True):
                 make_folder(folder)
@@ -269,21 +268,21 @@ class Trainer:
             return check_network(self.config.agent, self.algorithm.network(), self.spec)
 
     def make_drivers(self, network: Network) -> list[Driver]:
-        """Return the full policy of each task: its expert plus this residual."""
+        """Return the full policy of each task: its expert plus the residual of `network`."""
         return [full_policy(task, self.config.policy, network) for task in self.tasks]
 
     def collect(self, network: Network, iteration: int) -> TaskEpisodes:
-        """Return the episodes of an iteration, at least one of each task, as many as the sampler says."""
+        """Run the episodes of an iteration, at least one of each task, with counts from the sampler."""
         check_network(self.config.agent, network, self.spec)
         steps = self.config.learner.steps_per_iteration
         remaining = self.config.steps - self.collector.environment_steps
         counts = self._sampler.episode_counts(steps)
         iterations = warm_up_iterations(iteration, remaining, steps, self.tasks, counts)
-        seeds = ((self.config.seed, each) for each in iterations)
+        seeds = ((self.config.seed, number) for number in iterations)
         return self._run_episodes(self.make_drivers(network), counts, self.config.policy.exploration_signs, *seeds)
 
     def validate(self, has_ended: bool = False) -> ValidationReturns:
-        """Run the validation seeds after some iterations and at the end, and save the best controller."""
+        """Validate if scheduled or at the end, and save a controller with a new best return; return the returns."""
         returns: ValidationReturns = None
         network, interval = self.network(), self.config.evaluation.validation_interval
         is_last = has_ended or self.collector.environment_steps >= self.config.steps
@@ -293,7 +292,7 @@ class Trainer:
             mean = self._sampler.weighted_mean(returns)
             if mean > self._best_validation:
                 self._save_controllers(network, is_scheduled)
-                if is_scheduled:  # a longer run, which may resume from this checkpoint, has no other validations
+                if is_scheduled:  # a longer run that resumes here must not depend on an unscheduled one
                     self._best_validation = mean
             if is_scheduled:
                 self._sampler.update(returns)
@@ -302,27 +301,27 @@ class Trainer:
         return returns
 
     def finish_iteration(self, log: IterationLog) -> bool:
-        """Validate if due, write progress and a checkpoint, and return whether to stop."""
-        started, validation = time.perf_counter(), self.validate()
-        seconds = {"collect": self.collector.seconds, **log.seconds, "validation": time.perf_counter() - started}
+        """Validate if scheduled, write progress and a checkpoint, and return whether to stop."""
+        start_time, validation = time.perf_counter(), self.validate()
+        seconds = {"collect": self.collector.seconds, **log.seconds, "validation": time.perf_counter() - start_time}
         log = replace(log, seconds=seconds)
-        whole, *tasks = self._progress_rows(log, validation)
-        early = self.config.evaluation.should_stop_early([*read_progress(self.folder), whole])
-        if early and validation is None:
-            started, validation = time.perf_counter(), self.validate(has_ended=True)
-            seconds["validation"] += time.perf_counter() - started
-            whole, *tasks = self._progress_rows(log, validation)
-        now = self._fingerprint["files"] | file_hashes(code_names(self.config))
-        check_file_hashes(self._fingerprint, {"files": now}, "train")  # an iteration of changed code is not stored
+        run_row, *task_rows = self._progress_rows(log, validation)
+        stops_early = self.config.evaluation.should_stop_early([*read_progress(self.folder), run_row])
+        if stops_early and validation is None:
+            start_time, validation = time.perf_counter(), self.validate(has_ended=True)
+            seconds["validation"] += time.perf_counter() - start_time
+            run_row, *task_rows = self._progress_rows(log, validation)
+        file_hashes_now = self._fingerprint["files"] | file_hashes(code_names(self.config))
+        check_file_hashes(self._fingerprint, {"files": file_hashes_now}, "train")  # before the iteration is stored
         self.watch.check()
-        for folder, row in [*zip(self.folders, tasks, strict=False), (self.folder, whole)]:
+        for folder, row in [*zip(self.folders, task_rows, strict=False), (self.folder, run_row)]:
             append_line(folder / run_folder.PROGRESS_FILE, to_json(row))
         self._save_checkpoint()
-        stopped = self._on_iteration(whole) is False
-        if stopped and validation is None and not early:
+        is_stopped = self._on_iteration(run_row) is False
+        if is_stopped and validation is None and not stops_early:
             self.validate(has_ended=True)
-            self._save_checkpoint()  # it has the controller in the folder
-        return stopped or early
+            self._save_checkpoint()  # again, with the controller that `validate` may have saved
+        return is_stopped or stops_early
 
     def _save_checkpoint(self) -> None:
         values, tensors = check_state(self.config.agent, self.algorithm.state())
@@ -334,45 +333,45 @@ class Trainer:
             best_validation=self._best_validation,
             expert_returns=self._expert_returns,
         )._asdict()
-        own = {f"{ALGORITHM_PREFIX}{name}": tensor for name, tensor in tensors.items()}
-        run_folder.save_checkpoint(self.folder / "checkpoint", state, own | self._controllers.tensors())
+        algorithm_tensors = {f"{ALGORITHM_PREFIX}{name}": tensor for name, tensor in tensors.items()}
+        run_folder.save_checkpoint(self.folder / "checkpoint", state, algorithm_tensors | self._controllers.tensors())
 
     @property
     def _counters(self) -> dict[str, int]:
         return {"iteration": self.collector.iteration, "environment_steps": self.collector.environment_steps}
 
     def validation_returns(self, drivers: Sequence[Driver]) -> list[float]:
-        """Return the mean validation return of each task with its driver."""
+        """Return the mean validation return of each task; `drivers` has the driver of each task."""
         counts = [self.config.evaluation.validation_episodes] * len(self.tasks)
         episodes = self._run_episodes(drivers, counts, [0.0], (VALIDATION_SEED,))
-        return [float(np.mean([measure(episode)["return"] for episode in of_task])) for of_task in episodes]
+        return [float(np.mean([measure(episode)["return"] for episode in task_episodes])) for task_episodes in episodes]
 
     def _run_episodes(
         self, drivers: Sequence[Driver], counts: Sequence[int], exploration_scales: list[float], *seeds: tuple[int, ...]
     ) -> TaskEpisodes:
-        """Run the given numbers of episodes of each task for the first seed; those of the other seeds will follow."""
+        """Run `counts` episodes of each task with the first seed; those with the other seeds are expected to follow."""
         stratified = self.config.stratified
-        now, *upcoming = (
+        tasks, *upcoming_tasks = (
             make_episodes(
                 self.tasks, drivers, counts, seed, stratified=stratified, exploration_scales=exploration_scales
             )
             for seed in seeds
         )
         if self.config.backend == "batch":
-            later, is_single = list(chain(*upcoming)), not self.config.tasks
-            episodes = run_batched_if_supported(now, self.workers.run, later, allow_statistical=is_single)
+            upcoming, is_single = list(chain(*upcoming_tasks)), not self.config.tasks
+            episodes = run_batched_if_supported(tasks, self.workers.run, upcoming, allow_statistical=is_single)
         else:
-            episodes = self.workers.run([replace(task, backend=self.config.backend) for task in now])
+            episodes = self.workers.run([replace(task, backend=self.config.backend) for task in tasks])
         raise_failure([measure(episode) for episode in episodes if not episode.has_run])
         return [episodes[end - count : end] for end, count in zip(np.cumsum(counts), counts, strict=True)]
 
     def _progress_rows(self, log: IterationLog, validation: ValidationReturns) -> list[dict[str, Any]]:
-        """Return the row of progress of the whole run, then those of its tasks if it has several."""
+        """Return the row of progress of the run, and with several tasks the row of each task."""
         rows = [self._progress_row(log, validation, index) for index in range(len(self.tasks))]
         if not self.config.tasks:
             return rows
         names = [*PROGRESS_RETURNS, *PROGRESS_METRICS] if validation else [*PROGRESS_RETURNS[:-1], *PROGRESS_METRICS]
-        whole = {
+        run_row = {
             **rows[0],
             **{name: self._sampler.weighted_mean([row[name] for row in rows]) for name in names},
             **{"k_star": None, "eps_m": None, "model": {}},
@@ -382,7 +381,7 @@ class Trainer:
                 for task, row in zip(self.tasks, rows, strict=True)
             },
         }
-        return [whole, *rows]
+        return [run_row, *rows]
 
     def _progress_row(self, log: IterationLog, validation: ValidationReturns, index: int) -> dict[str, Any]:
         measured = [measure(episode) for episode in self.collector.episodes[index]]

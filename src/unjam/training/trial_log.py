@@ -1,4 +1,4 @@
-"""Logs with which a search, tuning, calibration or assessment resumes after an interruption."""
+"""Logs from which a search, tuning, calibration or assessment resumes after an interruption."""
 
 import json
 from contextlib import suppress
@@ -15,30 +15,32 @@ from unjam.parameters import flatten_keys
 from unjam.training.run_folder import make_new_folder
 
 REQUEST_FILE, TRIALS_FILE = "request.json", "trials.jsonl"
-FILES_PREFIX = "files."  # of the keys of hashes of files in a flat request
+FILES_PREFIX = "files."
+"""prefix of the keys of file hashes in a flat request"""
 VERSIONED_PACKAGES = ("eclipse-sumo", "libsumo")
-"""packages of which, as of unjam, all rows of a log have the same version"""
+"""packages that, like unjam, must have the same version for all rows of a log"""
 
 TrialScore = tuple[float | None, str]
-"""score and reason; no score if the trial does not count"""
+"""score, None if the trial does not count, and a text such as the reason"""
 
 
 @dataclass(frozen=True)
 class TuningTrial:
-    """A trial of parameters of an expert."""
+    """Parameters of an expert and their score."""
 
     driver: str
+    """name of the driver with these parameters"""
     values: dict[str, Any]
     score: float | None
-    """mean return, on several roads the mean gain; None if the driver is infeasible"""
+    """mean return, or on several roads the mean gain; None if the driver is infeasible"""
     verdict: str
 
 
 class RowLog:
-    """Rows in the folder of a request, including those of earlier calls."""
+    """Rows of the results of a request, including those of earlier calls, in a folder."""
 
     def __init__(self, folder: Path, request: dict[str, Any], file_name: str) -> None:
-        """Begin in a new folder, or resume in that of the same request; raise `InputError` for other folders.
+        """Begin in a new folder, or resume in the folder of the same request; raise `InputError` for other folders.
 
         Versions of unjam and SUMO are part of the request.
         """
@@ -51,15 +53,17 @@ class RowLog:
             with suppress(ValueError, RecursionError, OSError):
                 stored = json.loads(path.read_text(encoding="utf-8"))
             stored = stored if isinstance(stored, dict) else {}
-            if (before := stored.get("request")) != request:
-                reason = f" ({_first_change(before, request)})" if isinstance(before, dict) else ""
+            if (stored_request := stored.get("request")) != request:
+                is_valid = isinstance(stored_request, dict)
+                reason = f" ({_first_change(stored_request, request)})" if is_valid else ""
                 raise InputError(f"out: {str(folder)!r} was made with other settings{reason}; allowed: a new folder")
             starts = stored.get("starts")
-            if not isinstance(starts, list) or not all(isinstance(each, dict) for each in starts):
+            if not isinstance(starts, list) or not all(isinstance(start, dict) for start in starts):
                 raise InputError(f"out: {REQUEST_FILE} in {str(folder)!r} is damaged; allowed: a new folder")
         else:
             make_new_folder(folder, ", or that of the same request")
         self.starts = [*starts, {"commit": current["commit"], "started": current["started"]}]
+        """commit and time of each call"""
         atomic_write(path, to_json({"request": request, "starts": self.starts}, indent=1))
         self._path = folder / file_name
         self.rows = read_json_lines(self._path)
@@ -67,14 +71,14 @@ class RowLog:
             atomic_write(self._path, "".join(f"{to_json(row)}\n" for row in self.rows))
 
     def append(self, row: dict[str, Any]) -> None:
-        """Add a row; it is on the disk when this returns."""
+        """Add a row and write it to the disk."""
         self.rows.append(row)
         append_line(self._path, to_json(row))
 
 
-def _first_change(before: dict[str, Any], now: dict[str, Any]) -> str:
-    """Return the first setting or file in which two requests differ, as a clause."""
-    old, new = flatten_keys(before), flatten_keys(now)
+def _first_change(old_request: dict[str, Any], new_request: dict[str, Any]) -> str:
+    """Return a clause about the first setting or file in which two requests differ."""
+    old, new = flatten_keys(old_request), flatten_keys(new_request)
     name = next(key for key in {**new, **old} if key not in old or key not in new or old[key] != new[key])
     if name.startswith(FILES_PREFIX):
         return f"{name.removeprefix(FILES_PREFIX)} has changed"
@@ -82,13 +86,13 @@ def _first_change(before: dict[str, Any], now: dict[str, Any]) -> str:
 
 
 class TrialLog(RowLog):
-    """Rows about trials, and verdicts by the first of their seeds."""
+    """Rows of the trials of a search, tuning or calibration, and the verdicts of trials."""
 
     def __init__(self, folder: Path, request: dict[str, Any]) -> None:
-        """Begin or resume as `RowLog`."""
+        """Begin or resume as `RowLog` does."""
         super().__init__(folder, request, TRIALS_FILE)
         self.verdicts: dict[tuple[int, str], TrialScore] = {}
-        """verdicts by first seed and driver, without damaged rows"""
+        """verdicts by first seed and driver (or factors), without damaged rows"""
         for row in self.rows:
             with suppress(KeyError, TypeError):
                 score, verdict = row["score"], row["verdict"]
@@ -97,6 +101,6 @@ class TrialLog(RowLog):
                     self.verdicts[row["first_seed"], row["driver"]] = score, verdict
 
     def add(self, first_seed: int, driver: str, verdict: TrialScore) -> None:
-        """Add a verdict; it is on the disk when this returns."""
+        """Add a verdict and write it to the disk."""
         self.verdicts[first_seed, driver] = verdict
         self.append({"first_seed": first_seed, "driver": driver, "score": verdict[0], "verdict": verdict[1]})

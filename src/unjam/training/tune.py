@@ -1,6 +1,6 @@
-"""Tuning of an expert's parameters with as many environment steps as a training: the baseline for trained controllers.
+"""Tuning of an expert's parameters with the environment steps of a training, as a baseline for trained controllers.
 
-Infeasible settings do not count, and those with too large a string gain are not tried.
+Infeasible settings have no score, and settings with too large a string gain are not tried.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -44,16 +44,16 @@ TUNING_FILE = "tuned.json"
 TUNING_EPISODES = 8
 TUNING_EPISODES_PER_ROAD = 2
 TUNING_FINALISTS = 5
-"""trials that run again on twice as many other seeds, because the best of many trials is partly lucky"""
+"""number of best trials that run again on twice as many other seeds, because the best trial is partly lucky"""
 MAX_REFUSED_SETTINGS = 60
-"""settings in a row with too large string gains, after which there seem to be no others"""
+"""number of consecutive settings with too large string gains, after which the tuning fails"""
 SCREENING_BATCH_SIZE = 8
-"""trials that are screened at once, each on its own rings"""
+"""number of trials that are screened together, each on its own rings"""
 STRING_GAIN_SEED = -1
-"""key of string gains in the log, in place of the first seed: they need no episode"""
+"""placeholder for the first seed in log entries of string gains, which need no episode"""
 
 TuningRunner = Callable[[list[list[EpisodeTask]]], list[EpisodeRows]]
-"""runs the tasks of each driver on one road, in SUMO or in a batch, and measures their episodes"""
+"""runs the tasks of each driver on a road, in SUMO or in a batch, and returns the rows of each driver"""
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,7 @@ class TuningResult:
     """Result of a tuning."""
 
     best: TuningTrial
+    """the best finalist"""
     default: TuningTrial
     """the expert with default parameters, on the seeds of the finalists"""
     trials: list[TuningTrial]
@@ -69,16 +70,16 @@ class TuningResult:
     batch_steps: int
     """control steps in batches"""
     file: Path | None
-    """the tuned controller; None for a class `path.py:name`, since a file by itself may run no code"""
+    """the tuned controller; None for a class `path.py:name`, because a controller file must not run code"""
 
     @property
     def driver(self) -> str:
-        """Name of the tuned driver for `--driver`."""
+        """Name of the tuned driver for the option `--driver`."""
         return str(self.file or self.best.driver)
 
 
 def invalid_reason(driver: str) -> str:
-    """Return why a driver cannot be made, as for parameters that contradict each other; or an empty text."""
+    """Return why a driver cannot be made, for example with contradictory parameters, or an empty text."""
     try:
         driver_from_name(driver, 1.0)
     except InputError as error:
@@ -87,7 +88,7 @@ def invalid_reason(driver: str) -> str:
 
 
 class SettingSampler:
-    """Proposes settings of an expert by Optuna's TPE; it learns from scores and from refused settings."""
+    """Proposes settings of an expert with Optuna's TPE, which learns from scores and from refused settings."""
 
     def __init__(
         self,
@@ -97,30 +98,32 @@ class SettingSampler:
         string_gain: Callable[[str], float],
         max_string_gain: float = 0.0,
     ) -> None:
-        """Take the function that measures the string gain of a driver's name; it is not called with the limit 0."""
+        """Start a study; `string_gain` returns the string gain of a named driver, and is not called without a limit."""
         self._expert, self._space = expert, space
         self._string_gain, self._max_string_gain = string_gain, max_string_gain
         self._study = create_study(direction="maximize", sampler=TPESampler(seed=seed, multivariate=True))
 
     def ask(self, count: int) -> list[tuple[Trial, dict[str, Any]]]:
-        """Return new settings; raise `UnjamError` if too many in a row have too large a string gain."""
+        """Return new settings; raise `UnjamError` if too many consecutive settings have too large a string gain."""
         accepted: list[tuple[Trial, dict[str, Any]]] = []
         refused: list[float] = []
         while len(accepted) < count:
             trial = self._study.ask(dict(self._space))
-            values = {key: float(f"{x:.4g}") if isinstance(x, float) else x for key, x in trial.params.items()}
-            if self._max_string_gain and not self._is_allowed(trial, values, refused):
+            values = {
+                key: float(f"{value:.4g}") if isinstance(value, float) else value for key, value in trial.params.items()
+            }
+            if self._max_string_gain and not self._accept_or_refuse(trial, values, refused):
                 continue
             accepted.append((trial, values))
             refused = []
         return accepted
 
     def tell(self, trial: Trial, score: float | None) -> None:
-        """Report the score of a setting; None: it is infeasible."""
+        """Report the score of a setting, or None if the setting is infeasible."""
         self._study.tell(trial, score, state=TrialState.FAIL if score is None else None)
 
-    def _is_allowed(self, trial: Trial, values: dict[str, Any], refused: list[float]) -> bool:
-        """Return whether the string gain is allowed; if not, tell the sampler, and add it to `refused`."""
+    def _accept_or_refuse(self, trial: Trial, values: dict[str, Any], refused: list[float]) -> bool:
+        """Return whether the string gain of a setting is allowed; if not, tell Optuna, and extend `refused`."""
         driver = label_with_parameters(self._expert, values)
         gain = 0.0 if invalid_reason(driver) else self._string_gain(driver)
         trial.set_constraint("excess_gain", gain - self._max_string_gain)
@@ -151,27 +154,27 @@ def tune(
 ) -> TuningResult:
     """Search the parameters of an expert, and write `tuned.json` and the expert as `EXPERT.unjam` into a folder.
 
-    The trials are stored there: an interrupted tuning resumes with the same result. On one road the objective is the
-    return. On several roads it is the mean of the normalized gain, which is zero on roads where the driver cannot run.
+    The trials are stored in the folder: an interrupted tuning resumes with the same result. On one road, the objective
+    is the return. On several roads, it is the mean normalized gain, which is zero on roads where the driver cannot run.
 
     Args:
         roads: scenarios by name, with their limits and filters.
-        expert: name of a driver, or a class `path.py:name` whose parameters have defaults.
+        expert: name of a driver, or a class `path.py:name` with defaults for all parameters.
         steps: total budget of control steps.
-        reward: objective on one road; empty: the scenario's own.
-        seed: of the proposals.
-        screen: whether trials run in batches on roads that support it (on several roads: exactly), and only the
-            finalists and the default in SUMO; None: if any road supports it; not with another backend.
-        max_string_gain: settings with a larger string gain on a closed road are not tried; 0: any are.
+        reward: objective on one road; empty: the reward of the scenario.
+        seed: seed of the proposals.
+        screen: whether trials run in batches on roads that support this (on several roads: exactly), and only the
+            finalists and the default in SUMO; None: if any road supports this. Not with another backend than SUMO.
+        max_string_gain: settings with a larger string gain on a closed road are not tried; 0: no limit.
 
     Raises:
-        InputError: too few steps, a wrong parameter, no road that supports batches, or another folder.
-        UnjamError: all trials are infeasible, or too many settings in a row have too large string gains.
+        InputError: too few steps, a wrong parameter, no road that supports batches, or a folder of another tuning.
+        UnjamError: all trials are infeasible, or too many consecutive settings have too large string gains.
     """
-    known = tunable_parameters(expert, 1.0)
-    for key in space:
-        if key not in known:
-            raise unknown_name("vary", key, known)
+    parameters = tunable_parameters(expert, 1.0)
+    for name in space:
+        if name not in parameters:
+            raise unknown_name("vary", name, parameters)
     is_single = len(roads) == 1
     episodes = TUNING_EPISODES if is_single else TUNING_EPISODES_PER_ROAD
     trial_steps = episodes * sum(scenario.max_episode_steps for scenario in roads.values())
@@ -180,26 +183,26 @@ def tune(
     trial_count = (steps - final_steps) // trial_steps
     if trial_count < 2:
         raise InputError(f"steps: {steps} is not allowed; allowed: >= {final_steps + 2 * trial_steps} for two settings")
-    unsupported = statistically_unsupported_reason if is_single else unsupported_reason
+    find_reason = statistically_unsupported_reason if is_single else unsupported_reason
     with open_backend(backend) as simulator:
         check_support(simulator, *roads.values())
-    other = "" if backend == "sumo" else f"trials run in {backend}"
-    reasons = {road: other or unsupported(scenario) for road, scenario in roads.items()}
+    backend_reason = "" if backend == "sumo" else f"trials run in {backend}"
+    reasons = {road: backend_reason or find_reason(scenario) for road, scenario in roads.items()}
     if max_string_gain and not any(scenario.is_closed for scenario in roads.values()):
         raise invalid_value("max_string_gain", max_string_gain, f"0 on {next(iter(roads))}: it is no closed road")
     if screen and all(reasons.values()):
         raise InputError(f"screen: {next(iter(reasons.values()))}")
-    screened = [road for road, reason in reasons.items() if screen is not False and not reason]
+    batch_roads = [road for road, reason in reasons.items() if screen is not False and not reason]
     recipes = {road: scenario_recipe(scenario) for road, scenario in roads.items()}
     request = {"roads": recipes, "expert": expert, "space": repr(space), "steps": steps, "reward": reward}
     files = file_hashes([expert, reward, backend], *roads.values())
     request |= {"files": files} if files else {}
     request |= {"max_string_gain": max_string_gain} if max_string_gain else {}
-    log = TrialLog(folder, request | {"seed": seed, "screen": bool(screened), "backend": backend})
+    log = TrialLog(folder, request | {"seed": seed, "screen": bool(batch_roads), "backend": backend})
     watch = watch_files(roads.values(), expert, reward, backend)
-    points = find_operating_points(roads, workers) if max_string_gain else {}
+    operating_points = find_operating_points(roads, workers) if max_string_gain else {}
     sumo_runners = dict.fromkeys(roads, partial(_run_in_sumo, workers))
-    trial_runners = sumo_runners | dict.fromkeys(screened, _run_in_batch)
+    trial_runners = sumo_runners | dict.fromkeys(batch_roads, _run_in_batch)
 
     @cache
     def human_rows(first: int, count: int) -> dict[str, EpisodeRows]:
@@ -209,48 +212,50 @@ def tune(
         settings: list[dict[str, Any]], first: int, count: int, runners: Mapping[str, TuningRunner]
     ) -> list[TuningTrial]:
         drivers = [label_with_parameters(expert, values) for values in settings]
-        scores: dict[str, TrialScore] = {each: (None, why) for each in drivers if (why := invalid_reason(each))}
-        new = [each for each in drivers if each not in scores and (first, each) not in log.verdicts]
-        new = list(dict.fromkeys(new))
+        verdicts: dict[str, TrialScore] = {name: (None, why) for name in drivers if (why := invalid_reason(name))}
+        new = [name for name in dict.fromkeys(drivers) if name not in verdicts and (first, name) not in log.verdicts]
         for driver, rows in zip(new, _run_drivers(roads, new, first, count, (reward, backend), runners), strict=True):
             watch.check()
             log.add(first, driver, _score_rows(rows, human_rows(first, count)))
-        scores |= {each: log.verdicts[first, each] for each in drivers if each not in scores}
-        return [TuningTrial(each, values, *scores[each]) for each, values in zip(drivers, settings, strict=True)]
+        verdicts |= {name: log.verdicts[first, name] for name in drivers if name not in verdicts}
+        return [TuningTrial(name, values, *verdicts[name]) for name, values in zip(drivers, settings, strict=True)]
 
     def string_gain(driver: str) -> float:
         key = STRING_GAIN_SEED, driver
         if key not in log.verdicts:
-            gains = [each.string_gain(driver_from_name(driver, each.road.control_step)) for each in points.values()]
+            gains = [
+                point.string_gain(driver_from_name(driver, point.road.control_step))
+                for point in operating_points.values()
+            ]
             log.add(*key, (max(gains, default=0.0), "largest string gain"))
         return log.verdicts[key][0] or 0.0
 
     trials: list[TuningTrial] = []
     sampler = SettingSampler(expert, space, seed, string_gain, max_string_gain)
-    shares_batches = any(required_batch_kind(roads[road]).has_own_drivers for road in screened)
-    batch_size = SCREENING_BATCH_SIZE if screen or shares_batches else 1  # many take as long as few
+    shares_batches = any(required_batch_kind(roads[road]).has_own_drivers for road in batch_roads)
+    batch_size = SCREENING_BATCH_SIZE if screen or shares_batches else 1  # many trials take as long as few
     for first in range(0, trial_count, batch_size):
-        asked = sampler.ask(min(batch_size, trial_count - first))
-        tried = score_settings([values for _, values in asked], 0, episodes, trial_runners)
-        for (each, _), trial in zip(asked, tried, strict=True):
-            sampler.tell(each, trial.score)
+        proposals = sampler.ask(min(batch_size, trial_count - first))
+        batch = score_settings([values for _, values in proposals], 0, episodes, trial_runners)
+        for (proposal, _), trial in zip(proposals, batch, strict=True):
+            sampler.tell(proposal, trial.score)
             trials.append(trial)
             result = trial.verdict if trial.score is None else f"{trial.score:.4g}"
             on_message(f"{len(trials)} of {trial_count}: {trial.driver}: {result}")
-    ranked = sorted((each for each in trials if each.score is not None), key=_score_of, reverse=True)
-    best_values = list({each.driver: each.values for each in ranked}.values())[:TUNING_FINALISTS]
+    ranked = sorted((trial for trial in trials if trial.score is not None), key=_ranking_score, reverse=True)
+    best_values = list({trial.driver: trial.values for trial in ranked}.values())[:TUNING_FINALISTS]
     *finalists, default = score_settings([*best_values, {}], episodes, 2 * episodes, sumo_runners)
-    is_default_allowed = not points or string_gain(default.driver) <= max_string_gain
+    is_default_allowed = not operating_points or string_gain(default.driver) <= max_string_gain
     if not is_default_allowed:
         gain = string_gain(default.driver)
         on_message(f"{default.driver}: not selected: a string gain of {gain:.4g}; allowed: at most {max_string_gain:g}")
-    best = max((*finalists, default) if is_default_allowed else finalists, key=_score_of, default=None)
+    best = max((*finalists, default) if is_default_allowed else finalists, key=_ranking_score, default=None)
     if best is None or best.score is None:
         raise UnjamError(f"all {trial_count} settings of {expert} are infeasible: {default.verdict}")
-    trial_runs = len({trial.driver for trial in trials if not invalid_reason(trial.driver)})
-    batch_steps = trial_runs * episodes * sum(roads[road].max_episode_steps for road in screened)
+    run_count = len({trial.driver for trial in trials if not invalid_reason(trial.driver)})
+    batch_steps = run_count * episodes * sum(roads[road].max_episode_steps for road in batch_roads)
     unused_steps = (TUNING_FINALISTS - len(best_values)) * 2 * trial_steps
-    sumo_steps = trial_runs * trial_steps + final_steps - unused_steps - batch_steps
+    sumo_steps = run_count * trial_steps + final_steps - unused_steps - batch_steps
     file = None if is_file_reference(expert) else folder / f"{expert}{SUFFIX}"
     result = TuningResult(best, default, trials, sumo_steps, batch_steps, file)
     recipe = next(iter(recipes.values())) if is_single else recipes
@@ -262,18 +267,23 @@ def tune(
         "batch_steps": batch_steps,
         "best": asdict(best),
         "default": asdict(default),
-        **({"string_gain": string_gain(best.driver), "max_string_gain": max_string_gain} if points else {}),
+        **({"string_gain": string_gain(best.driver), "max_string_gain": max_string_gain} if operating_points else {}),
     }
     if file is not None:
         driver = driver_from_name(best.driver, scenario.control_step)
         atomic_write(file, controller_bytes(driver, {**controller_origin(scenario, driver), "tuning": tuning}))
-    facts = {"scenario": recipe, "expert": expert, **tuning, "manifest": {**manifest(), "starts": log.starts}}
-    document = {**facts, "trials": [asdict(trial) for trial in trials]}
+    document = {
+        "scenario": recipe,
+        "expert": expert,
+        **tuning,
+        "manifest": {**manifest(), "starts": log.starts},
+        "trials": [asdict(trial) for trial in trials],
+    }
     atomic_write(folder / TUNING_FILE, to_json(document, indent=1))
     return result
 
 
-def _score_of(trial: TuningTrial) -> float:
+def _ranking_score(trial: TuningTrial) -> float:
     return -inf if trial.score is None else trial.score
 
 
@@ -282,19 +292,19 @@ def _run_drivers(
     drivers: Sequence[str],
     first: int,
     count: int,
-    settings: tuple[str, str],
+    reward_and_backend: tuple[str, str],
     runners: Mapping[str, TuningRunner],
 ) -> list[dict[str, EpisodeRows]]:
-    """Return the rows of each driver by road on tuning seeds from `first` on; `settings`: reward and backend."""
+    """Return the rows by road of each driver, given by name, on `count` tuning seeds from `first` on."""
     results: list[dict[str, EpisodeRows]] = [{} for _ in drivers]
-    seeds, (reward, backend) = tuning_seeds(count, first), settings
+    seeds, (reward, backend) = tuning_seeds(count, first), reward_and_backend
     for road, scenario in roads.items() if drivers else ():
         tasks = [
             [
-                EpisodeTask(scenario.stratum(index, count), made, each, reward, backend=backend)
-                for index, each in enumerate(seeds)
+                EpisodeTask(scenario.stratum(index, count), driver, seed, reward, backend=backend)
+                for index, seed in enumerate(seeds)
             ]
-            for made in (driver_from_name(driver, scenario.control_step) for driver in drivers)
+            for driver in (driver_from_name(name, scenario.control_step) for name in drivers)
         ]
         for result, rows in zip(results, runners[road](tasks), strict=True):
             result[road] = rows
@@ -303,16 +313,16 @@ def _run_drivers(
 
 
 def _run_in_sumo(workers: WorkerPool, tasks: list[list[EpisodeTask]]) -> list[EpisodeRows]:
-    # Each episode is measured at its end: one of a motorway has 80 MB.
+    # Each episode is measured when it ends, because an episode of a motorway takes 80 MB of memory.
     rows = iter(workers.run_and_map([*chain(*tasks)], lambda index, episode: measure(episode)))
-    return [[next(rows) for _ in each] for each in tasks]
+    return [[next(rows) for _ in driver_tasks] for driver_tasks in tasks]
 
 
 def _run_in_batch(tasks: list[list[EpisodeTask]]) -> list[EpisodeRows]:
     all_tasks = [*chain(*tasks)]
     run = run_batches if required_batch_kind(all_tasks[0].scenario).has_own_drivers else run_batch
     episodes = iter(run(all_tasks, allow_statistical=True))
-    return [[measure(next(episodes)) for _ in each] for each in tasks]
+    return [[measure(next(episodes)) for _ in driver_tasks] for driver_tasks in tasks]
 
 
 def _score_rows(rows_by_road: Mapping[str, EpisodeRows], human_rows: Mapping[str, EpisodeRows]) -> TrialScore:
@@ -321,8 +331,8 @@ def _score_rows(rows_by_road: Mapping[str, EpisodeRows], human_rows: Mapping[str
             road: normalized_gain(rows, human_rows[road], [performance_bound(row) for row in human_rows[road]]).mean
             for road, rows in rows_by_road.items()
         }
-        worst = min(gains, key=lambda road: gains[road])
-        return float(np.mean(list(gains.values()))), f"worst on {worst}: {gains[worst]:+.2f}"
+        worst_road = min(gains, key=lambda road: gains[road])
+        return float(np.mean(list(gains.values()))), f"worst on {worst_road}: {gains[worst_road]:+.2f}"
     (rows,) = rows_by_road.values()
     verdict = overall_feasibility([{**row, HARD_BRAKING_METRIC: 0.0} for row in rows])
     return float(np.mean([row["return"] for row in rows])) if verdict == FEASIBLE else None, verdict
