@@ -149,10 +149,10 @@ def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
         raise _unreadable_file_error(path, "it is XML, but not SUMO's FCD output")
     parser, time = expat.ParserCreate(), ""
     names = ["timestep_time", *(f"vehicle_{name}" for name in FCD_ATTRIBUTES)]
-    rows, parts = list[tuple[Any, ...]](), list[pd.DataFrame]()
+    rows, frames = list[tuple[Any, ...]](), list[pd.DataFrame]()
 
     def store_rows() -> None:  # columns of a frame take a tenth of the memory of the rows
-        parts.append(pd.DataFrame(rows, columns=[*names, "line"]))
+        frames.append(pd.DataFrame(rows, columns=[*names, "line"]))
         rows.clear()
 
     def on_start(tag: str, attributes: XmlAttributes) -> None:
@@ -160,7 +160,7 @@ def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
         if tag == "timestep":
             time = attributes.get("time", "")
         elif tag == "vehicle":
-            if len(parts) * FCD_PART_ROWS + len(rows) == MAX_FCD_VEHICLES:
+            if len(frames) * FCD_PART_ROWS + len(rows) == MAX_FCD_VEHICLES:
                 raise _unreadable_file_error(path, f"it has more than {MAX_FCD_VEHICLES:,} elements 'vehicle'")
             rows.append((time, *map(attributes.get, FCD_ATTRIBUTES), parser.CurrentLineNumber))
             if len(rows) == FCD_PART_ROWS:
@@ -169,7 +169,7 @@ def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     parser.StartElementHandler = on_start
     parse_xml(path, parser, iter(lambda: file.read(HEAD_BYTES), b""))
     store_rows()
-    return pd.concat(parts, ignore_index=True).dropna(axis="columns", how="all")
+    return pd.concat(frames, ignore_index=True).dropna(axis="columns", how="all")
 
 
 def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
@@ -212,8 +212,8 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
 
 def _find_header(lines: list[str]) -> tuple[int, dict[Hashable, str]]:
     """Return the number of lines above the header of a CSV file, and their content; only files of OpenACC have some."""
-    for number, line in enumerate(lines):
+    for count, line in enumerate(lines):
         if re.match(r"time\s*[,;\t]\s*speed1\b", line.strip(), re.IGNORECASE):
-            above = [line.strip().partition(",") for line in lines[:number]]
-            return number, {key.strip(" :").lower(): value.strip(",\" '") for key, _, value in above}
+            above = [line.strip().partition(",") for line in lines[:count]]
+            return count, {key.strip(" :").lower(): value.strip(",\" '") for key, _, value in above}
     return 0, {}

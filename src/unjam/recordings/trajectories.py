@@ -70,10 +70,8 @@ class FollowingTrajectory:
 
     def resample(self, time_step: float) -> "FollowingTrajectory":
         """Return the trajectory with another time step [s], interpolated between the samples."""
-        new_times, old_times = even_times(self.seconds, time_step), self.time_step * np.arange(len(self.speed))
-        columns = {
-            name: np.interp(new_times, old_times, getattr(self, name)) for name in ("speed", "leader_speed", "gap")
-        }
+        times, old_times = even_times(self.seconds, time_step), self.time_step * np.arange(len(self.speed))
+        columns = {name: np.interp(times, old_times, getattr(self, name)) for name in ("speed", "leader_speed", "gap")}
         return replace(self, time_step=time_step, **columns)
 
 
