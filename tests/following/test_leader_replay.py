@@ -40,7 +40,7 @@ def test_vehicle_that_never_brakes_touches_its_leader_and_stays_behind_it() -> N
         return speed * 0.0 + 1.0
 
     assert simulate_followers(as_driver_model(accelerate), segments).has_collided[0]
-    states = list(follow_leader(accelerate, segments.start, segments.leader, segments.time_step))
+    states = list(follow_leader(accelerate, segments.initial_state, segments.leader, segments.time_step))
     assert min(gap[0] for _, gap in states) == 0.0
     assert max(speed[0] for speed, _ in states) < 20.0
 

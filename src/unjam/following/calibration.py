@@ -172,7 +172,7 @@ def gap_objective(
 def gap_mean_squares(segments: Segments, model: DriverModel, candidate_count: int = 1) -> Floats:
     """Return `SimulationErrors.gap_mse` for several candidates at once [m2], shape (candidates, n)."""
     total = np.zeros((candidate_count, len(segments.sample_counts)))
-    speed, gap = (np.broadcast_to(values, total.shape) for values in segments.start)
+    speed, gap = (np.broadcast_to(values, total.shape) for values in segments.initial_state)
     states = follow_leader(model(speed, gap), (speed, gap), segments.leader, segments.time_step)
     for index, (_, gap) in enumerate(states, 1):
         total += np.square(gap - segments.gap[index]) * segments.is_present[index]

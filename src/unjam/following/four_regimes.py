@@ -92,7 +92,7 @@ def make_four_regimes(settings: FourRegimesSettings) -> list[FollowingTrajectory
     for number, columns in enumerate(zip(speeds, leader_speeds, gaps, strict=True)):
         name, kind = str(number), REGIMES[regime[number]]
         trajectory = FollowingTrajectory(name, name, settings.time_step, *columns, kind=kind)
-        trajectories.append(trajectory.part(0, min(length, settings.samples - number * length) + 1))
+        trajectories.append(trajectory.slice(0, min(length, settings.samples - number * length) + 1))
     return trajectories
 
 

@@ -118,7 +118,7 @@ class SimulationErrors(NamedTuple):
 
 def simulate_followers(model: DriverModel, segments: Segments) -> SimulationErrors:
     """Simulate a driver model behind the leader of each segment, starting from the first recorded sample."""
-    start, is_present, counts = segments.start, segments.is_present, segments.sample_counts
+    start, is_present, counts = segments.initial_state, segments.is_present, segments.sample_counts
     states = follow_leader(model(*start), start, segments.leader, segments.time_step)
     speed, gap = map(np.stack, zip(start, *states, strict=True))
     speed_mse = (np.square(speed - segments.speed) * is_present).sum(0) / counts

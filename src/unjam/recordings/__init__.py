@@ -1,1 +1,1 @@
-"""Recordings of real traffic: tables and car-following trajectories of files, and speeds of recorded leaders."""
+"""Recordings of real traffic: tables, car-following trajectories, and speeds of recorded leaders."""

@@ -1,4 +1,4 @@
-"""Recorded speeds of vehicles that others follow, and the files that have them."""
+"""Recorded speeds of leaders, and the files with these recordings."""
 
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
@@ -17,13 +17,13 @@ WILDCARDS = {*"*?["}
 
 @dataclass(frozen=True, eq=False)
 class LeaderRecording:
-    """Speeds of one vehicle at equal intervals: T samples."""
+    """Recorded speeds of one vehicle at equal intervals: T samples."""
 
     name: str
     time_step: float
     """time between two samples [s]"""
     speed: Floats = field(repr=False)
-    """[m/s], shape (T,)"""
+    """speeds [m/s], shape (T,)"""
 
     @property
     def seconds(self) -> float:
@@ -31,24 +31,27 @@ class LeaderRecording:
         return self.time_step * (len(self.speed) - 1)
 
     def speeds_at(self, start: float, seconds: float, step: float) -> Floats:
-        """Return speeds from `start` on, every `step` for at most `seconds` [s], between samples interpolated [m/s]."""
+        """Return interpolated speeds [m/s] at times from `start` on, every `step` for at most `seconds` [s]."""
         times = start + even_times(min(seconds, self.seconds - start), step)
         return np.interp(times, self.time_step * np.arange(len(self.speed)), self.speed)
 
 
 def recording_files(path: Path) -> list[Path]:
-    """Return the file, or those of a folder or pattern (`2021-03*`) that can be recordings; `InputError` if none."""
+    """Return the files at a path that may be recordings; raise `InputError` if there are none.
+
+    The path is a file, a folder, or a pattern such as `drives/2021-03*`.
+    """
     if path.is_file():
         return [path]
     folder, pattern = (path, "*") if path.is_dir() else (path.parent, path.name)
     if not folder.is_dir() or not WILDCARDS & {*pattern}:
         allowed = "a file with speeds, a folder of them, or a pattern like 'drives/2021-03*'"
         raise invalid_value("recordings", str(path), allowed)
-    files = (each for each in folder.iterdir() if fnmatchcase(each.name, pattern) and each.is_file())
-    found = sorted(each for each in files if each.suffix.lower() in FILE_SUFFIXES)
-    if not found:
-        endings, others = ", ".join(FILE_SUFFIXES), sorted(each.name for each in folder.iterdir())
+    files = (file for file in folder.iterdir() if fnmatchcase(file.name, pattern) and file.is_file())
+    recordings = sorted(file for file in files if file.suffix.lower() in FILE_SUFFIXES)
+    if not recordings:
+        endings, names = ", ".join(FILE_SUFFIXES), sorted(file.name for file in folder.iterdir())
         allowed = f"a folder or a pattern with at least one file that ends in {endings}"
-        content = f"; {folder.name or '.'} has {shorten_list(others)}" if others else ""
+        content = f"; {folder.name or '.'} has {shorten_list(names)}" if names else ""
         raise invalid_value("recordings", str(path), f"{allowed}{content}")
-    return found
+    return recordings

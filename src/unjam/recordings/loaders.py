@@ -13,34 +13,35 @@ from numpy.typing import NDArray
 
 from unjam.errors import InputError, unknown_name
 from unjam.physics.arrays import Floats
-from unjam.recordings.tables import check_unique, read_table
+from unjam.recordings.tables import check_unique_columns, read_table
 from unjam.recordings.trajectories import FollowingTrajectory, even_times
 from unjam.text import format_count, shorten_list
 
 TABLE_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
-"""required columns of a plain table; `pair` identifies follower and leader, the others are in s, m/s, m/s and m"""
+"""required columns of a plain table: `pair` identifies follower and leader; the units are s, m/s, m/s and m"""
 OPTIONAL_COLUMNS = ("driver", "kind", "split")
-"""optional columns of a plain table, as the fields of `FollowingTrajectory`"""
+"""optional columns of a plain table, which become fields of `FollowingTrajectory`"""
 COLUMN_ALIASES = {"t": "time", "v_foll": "speed", "v_lead": "leader_speed"}
 """alternative column names of plain tables"""
 VALUE_LIMITS = {"speed": (0.0, 70.0), "leader_speed": (0.0, 70.0), "gap": (0.0, 1000.0)}
-"""smallest and largest allowed value of a column [m/s, m/s, m]; other values are errors, or have another unit"""
+"""minimum and maximum value of a column [m/s, m/s, m]; other values are errors, or have another unit"""
 TIME_STEP_TOLERANCE, MISSING_ROW_INTERVAL = 0.01, 1.5
-"""largest relative difference between equal intervals, and smallest ratio to the usual one where a row is missing"""
+"""maximum relative difference of equal intervals, and minimum ratio to the median interval where a row is missing"""
 MAX_PAIR_JUMP = 5.0
-"""largest change of a gap between two rows beyond that by the speeds; a larger one is to another vehicle [m]"""
+"""maximum difference between the change of the gap from row to row and the change that follows from the speeds [m]; a
+larger difference means that the leader has changed"""
 MAX_TIME_STEP, MIN_TRAJECTORY_SAMPLES = 1.5, 3
-"""longest time between two samples, to see waves of a few seconds [s], and fewest samples of a trajectory"""
+"""maximum time between two samples, as waves last a few seconds [s], and minimum number of samples of a trajectory"""
 UNIT_RATIO_LIMITS = (2 / 3, 1.5)
-"""smallest and largest ratio of quantities that are equal where the units of all columns fit each other"""
+"""minimum and maximum ratio of quantities that are equal if the units of all columns are consistent"""
 CHANGE_SECONDS, MIN_GAP_CHANGE, MIN_CORRELATION = 5.0, 1.0, 0.7
-"""interval in which gaps change [s], smallest root mean square of these changes [m], and of their correlation with the
-speeds, from which on they show that a unit is wrong; in NGSIM and OpenACC the correlation is 1.00"""
+"""conditions for the check of units by changes of gaps: interval of a change [s], minimum root mean square of changes
+[m], and their minimum correlation with the speeds, which is 1.00 in NGSIM and OpenACC"""
 MAX_TIME_DECIMALS = 6
-"""most decimals of time stamps that are taken for rounded"""
+"""maximum number of decimals of time stamps that may be rounded"""
 METERS_PER_FOOT = 0.3048
 MEDIAN_LENGTH_LIMITS = (3.0, 8.0)
-"""smallest and largest plausible median of the vehicle lengths in a file [m]"""
+"""minimum and maximum plausible median of the vehicle lengths in a file [m]"""
 VEHICLE_COLUMNS = ("vehicle", "time", "front", "length", "speed", "lane", "leader")
 """columns of a table with a row for each vehicle and time; `leader` is the number of the vehicle ahead"""
 NGSIM_COLUMNS = ("vehicle_id", "global_time", "local_y", "v_length", "v_vel", "lane_id", "preceding")
@@ -50,14 +51,14 @@ RECONSTRUCTED_COLUMNS = ("vehicleid", "frameid", "localy", "vehiclelength", "mea
 HIGHD_COLUMNS = ("id", "frame", "x", "width", "xVelocity", "laneId", "precedingId")
 """names of `VEHICLE_COLUMNS` in the tracks of highD (Krajewski et al. 2018)"""
 HIGHD_FRAME_RATE, MAX_VEHICLE_ABSENCE = 25.0, 60.0
-"""frames per second of highD [1/s], and longest absence of a vehicle, after which its number is that of another [s]"""
+"""frames per second of highD [1/s], and maximum absence of a vehicle [s], after which its number is used again"""
 FCD_COLUMNS = ("timestep_time", "vehicle_speed", "vehicle_leaderSpeed", "vehicle_leaderGap")
-"""names of `TABLE_COLUMNS[1:]` in SUMO's FCD output as CSV, which contains leaders with the option
+"""names of `TABLE_COLUMNS[1:]` in SUMO's FCD output as CSV; it contains leaders if SUMO has the option
 --fcd-output.max-leader-distance"""
 GROUPED_NUMBER = re.compile(r"-?\d{1,3}(,\d{3})+(\.\d+)?")
-"""a number with commas between thousands"""
+"""pattern of a number with commas between thousands"""
 MAX_LISTED_ROWS, MAX_TEXT_LENGTH, MAX_BAD_ROWS = 5, 40, 1 << 20
-"""maximum number of bad rows, and of characters of a value, in a message, and of bad rows with a reason"""
+"""maximum number of bad rows in a summary, of characters of a value in a message, and of bad rows with a reason"""
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,9 @@ class ReadOptions:
     """Options for reading a file."""
 
     drop_bad_rows: bool = False
-    """whether to drop bad rows, each of which ends a trajectory, instead of refusing the file"""
+    """whether to drop bad rows, which end trajectories, instead of refusing the file"""
     bad_row_hint: str = "; --drop-bad-rows leaves them out"
-    """end of the message about a bad row"""
+    """end of the message about a bad row, which says how to drop it"""
     min_seconds: float = 20.0
     """minimum duration of a trajectory [s]; shorter ones are skipped and counted"""
     driver_columns: tuple[str, ...] = ()
@@ -76,7 +77,7 @@ class ReadOptions:
 
 @dataclass(frozen=True)
 class ReadResult:
-    """The trajectories in a file, and a record of the rows that are not used."""
+    """The trajectories in a file, and the rows that are not used."""
 
     trajectories: list[FollowingTrajectory] = field(repr=False)
     rows: int
@@ -86,25 +87,26 @@ class ReadResult:
     skipped_rows: dict[str, int]
     """number of valid rows that are not used, by reason"""
     jump_count: int = 0
-    """number of rows at which another trajectory begins, because the gap jumps"""
+    """number of rows at which a new trajectory begins because the gap jumps"""
 
     def summary_lines(self) -> list[str]:
         """Return the lines of a summary: rows that are used, skipped and dropped."""
-        used = sum(len(each.speed) for each in self.trajectories)
-        own = format_count(len(self.trajectories), "trajectory", "trajectories")
+        used = sum(len(trajectory.speed) for trajectory in self.trajectories)
+        count_text = format_count(len(self.trajectories), "trajectory", "trajectories")
         skipped = [(reason, format_count(count, "row")) for reason, count in self.skipped_rows.items() if count]
-        lines = [f"{own} with {used:,} of {self.rows:,} rows", *(f"skipped: {rows}: {why}" for why, rows in skipped)]
+        lines = [f"{count_text} with {used:,} of {self.rows:,} rows"]
+        lines += [f"skipped: {rows}: {reason}" for reason, rows in skipped]
         if self.jump_count:
             jumps = f"split at {format_count(self.jump_count, 'jump')} of the gap by more than {MAX_PAIR_JUMP:g} m"
             lines.append(f"{jumps} beyond the speeds: does a pair have several vehicles?")
         dropped = [f"dropped: line {line}: {reason}" for line, reason in self.bad_rows.items()]
-        more = len(dropped) - MAX_LISTED_ROWS
-        last = [f"dropped: {format_count(more, 'more bad row')}"] if more > 0 else []
-        return [*lines, *dropped[:MAX_LISTED_ROWS], *last]
+        unlisted = len(dropped) - MAX_LISTED_ROWS
+        last_line = [f"dropped: {format_count(unlisted, 'more bad row')}"] if unlisted > 0 else []
+        return [*lines, *dropped[:MAX_LISTED_ROWS], *last_line]
 
 
 def read_trajectories(path: Path, format: str = "", options: ReadOptions | None = None) -> ReadResult:
-    """Return the trajectories of a file in a format of `FILE_FORMATS`; empty: it is detected from the columns.
+    """Return the trajectories of a file in a format of `FILE_FORMATS`; if empty, the columns show the format.
 
     Raise `InputError` if the file is missing or has another format, its units are wrong, or a row is bad.
     """
@@ -114,12 +116,12 @@ def read_trajectories(path: Path, format: str = "", options: ReadOptions | None 
 
 
 def trajectories_of_table(frame: pd.DataFrame, path: Path, options: ReadOptions, format: str = "") -> ReadResult:
-    """Return the trajectories of the table of a file; `format` as in `read_trajectories`."""
+    """Return the trajectories of the table of a file; `format` is that of `read_trajectories`."""
     return FILE_FORMATS[format or detect_format(frame)](frame, path, options)
 
 
 def _convert_table(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    frame = frame.rename(columns={other: name for other, name in COLUMN_ALIASES.items() if name not in frame})
+    frame = frame.rename(columns={alias: name for alias, name in COLUMN_ALIASES.items() if name not in frame})
     _check_columns(frame, TABLE_COLUMNS, path)
     if options.driver_columns and "driver" not in frame:
         _check_columns(frame, options.driver_columns, path)
@@ -145,9 +147,9 @@ def _convert_reconstructed(frame: pd.DataFrame, path: Path, options: ReadOptions
 
 
 def _convert_highd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of a highD file: x is the left end of a vehicle, and decreases in one direction."""
+    """Return the trajectories of a highD file, in which x is the left end of a vehicle in both driving directions."""
     vehicles = _select_columns(frame, HIGHD_COLUMNS, VEHICLE_COLUMNS, path)
-    # The direction is that of the whole lane, because a standing vehicle has none.
+    # All vehicles of a lane give its direction, because a standing vehicle has none.
     is_forward = vehicles.groupby("lane")["speed"].transform("sum").to_numpy() >= 0
     front = (vehicles["front"] + vehicles["length"]).where(is_forward, -vehicles["front"])
     motion = {"front": front, "speed": vehicles["speed"].abs(), "time": vehicles["time"] / HIGHD_FRAME_RATE}
@@ -155,23 +157,24 @@ def _convert_highd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> Rea
 
 
 def _convert_fcd(frame: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
-    """Return the trajectories of SUMO's FCD output: one for each combination of vehicle and leader."""
-    key = ("vehicle_id", "vehicle_leaderID")
+    """Return the trajectories of SUMO's FCD output, one for each pair of a vehicle and its leader."""
+    id_columns = ("vehicle_id", "vehicle_leaderID")
     vehicles = _select_columns(frame, FCD_COLUMNS, TABLE_COLUMNS[1:], path)
-    _check_columns(frame, key, path)
+    _check_columns(frame, id_columns, path)
     is_free = vehicles["gap"] < 0
     driver = frame["vehicle_id"].astype(str)
-    vehicles = vehicles.assign(pair=join_row_values(frame, key), driver=driver, kind="simulated")
+    vehicles = vehicles.assign(pair=join_row_values(frame, id_columns), driver=driver, kind="simulated")
     return split_trajectories(vehicles.loc[~is_free], path, options, {"no leader": int(np.sum(is_free))})
 
 
 def _trajectories_from_vehicles(vehicles: pd.DataFrame, path: Path, options: ReadOptions) -> ReadResult:
+    """Return the trajectories of a table with `VEHICLE_COLUMNS` and the column `site`."""
     low, high = MEDIAN_LENGTH_LIMITS
     median = float(np.nanmedian(vehicles["length"]))
     if not low <= median <= high:
         raise InputError(
             f"{path.name}: a median vehicle length of {median:.1f} m is not allowed; allowed: {low:g} to {high:g} m; "
-            "are the units those of this format?"
+            "does the file have the units of this format?"
         )
     key = ["site", "time", "leader"]
     leaders = vehicles.loc[:, ["site", "time", "vehicle", "front", "speed", "length"]]
@@ -191,7 +194,7 @@ def _trajectories_from_vehicles(vehicles: pd.DataFrame, path: Path, options: Rea
 
 
 def _reused_number_suffix(vehicles: pd.DataFrame) -> pd.Series:
-    """Return "" for the first vehicle with a number, "2" for the second: those of NGSIM restart every 15 minutes."""
+    """Return "" for the first vehicle with a number, "2" for the second: NGSIM's numbers restart every 15 minutes."""
     ordered = vehicles.sort_values(by="time", kind="stable")
     key = [ordered["site"], ordered["vehicle"]]
     is_new = ordered["time"].groupby(key, dropna=False).diff() > MAX_VEHICLE_ABSENCE
@@ -203,19 +206,19 @@ def _convert_openacc(frame: pd.DataFrame, path: Path, options: ReadOptions) -> R
     """Return the trajectories of an OpenACC file (JRC): a platoon in which each vehicle follows the previous one."""
     numbers = sorted(int(name[3:]) for name in frame.columns if re.fullmatch(r"IVS\d+", name))
     if not numbers:
-        raise InputError(f"{path.name}: no column IVS1: not an OpenACC file")
+        raise InputError(f"{path.name}: it has no column IVS1, as files of OpenACC have")
     vehicles = [name.strip() for name in frame.attrs.get("vehicle_order", "").split(",") if name.strip()]
-    parts = []
+    platoon = []
     for number in numbers:
         columns = ("Time", f"Speed{number + 1}", f"Speed{number}", f"IVS{number}")
-        part = _select_columns(frame, columns, TABLE_COLUMNS[1:], path)
+        pair = _select_columns(frame, columns, TABLE_COLUMNS[1:], path)
         label = f"Driver{number + 1}"
         kind = frame[label].astype(str) if label in frame else pd.Series("", frame.index)
         suffix = np.where(kind == "", "", "-" + kind)
         name = vehicles[number] if number < len(vehicles) else f"vehicle {number + 1}"
         driver = name + suffix if len(set(kind)) > 1 else name  # a change of kind is a change of driver
-        parts.append(part.assign(pair=f"{path.stem}-{number + 1}" + suffix, driver=driver, kind=kind))
-    return split_trajectories(pd.concat(parts), path, options)
+        platoon.append(pair.assign(pair=f"{path.stem}-{number + 1}" + suffix, driver=driver, kind=kind))
+    return split_trajectories(pd.concat(platoon), path, options)
 
 
 FILE_FORMATS: dict[str, Callable[[pd.DataFrame, Path, ReadOptions], ReadResult]] = {
@@ -229,7 +232,7 @@ FILE_FORMATS: dict[str, Callable[[pd.DataFrame, Path, ReadOptions], ReadResult]]
 
 
 def detect_format(frame: pd.DataFrame) -> str:
-    """Return the name in `FILE_FORMATS` of a table, by its columns."""
+    """Return the name in `FILE_FORMATS` of the format that has the columns of a table."""
     names = set(map(str, frame.columns))
     if {name.lower() for name in names}.issuperset(NGSIM_COLUMNS):
         return "ngsim"
@@ -240,12 +243,12 @@ def detect_format(frame: pd.DataFrame) -> str:
 
 
 def alphanumeric(name: str) -> str:
-    """Return the letters, in lower case, and digits of a column name."""
+    """Return the letters and digits of a column name, in lower case."""
     return re.sub(r"[^a-z0-9]", "", str(name).lower())
 
 
 def _select_columns(frame: pd.DataFrame, names: tuple[str, ...], labels: tuple[str, ...], path: Path) -> pd.DataFrame:
-    """Return the column `line`, and these columns as numbers under new names."""
+    """Return the column `line`, and the columns `names` as numbers under the names `labels`."""
     _check_columns(frame, names, path)
     numbers = to_numeric(frame.loc[:, ["line", *names]], names)
     return numbers.rename(columns=dict(zip(names, labels, strict=True)))
@@ -256,11 +259,11 @@ def _check_columns(frame: pd.DataFrame, required: Iterable[str], path: Path) -> 
     if missing:
         columns = shorten_list(str(name) for name in frame.columns if name != "line")
         raise InputError(f"{path.name}: no column {missing[0]!r}; it has: {columns}; required: {', '.join(required)}")
-    check_unique(path, [str(name) for name in frame.columns if name in required])
+    check_unique_columns(path, [str(name) for name in frame.columns if name in required])
 
 
 def join_row_values(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
-    """Return for each row the values of these columns, joined by hyphens, equal ones only once for speed."""
+    """Return the values of these columns joined by hyphens, for each row; equal rows are joined once, for speed."""
     group = frame.groupby(list(columns), sort=False, observed=True, dropna=False).ngroup()
     first = frame[list(columns)].loc[~group.duplicated()]
     names = ["-".join(map(str, row)) for row in first.itertuples(index=False)]
@@ -268,9 +271,9 @@ def join_row_values(frame: pd.DataFrame, columns: tuple[str, ...]) -> pd.Series:
 
 
 def to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
-    """Return the table with these columns as numbers, also with commas between thousands; other values become NaN.
+    """Return the table with these columns as numbers; other values than numbers become NaN.
 
-    The column `not_numeric` has the first other value of each row.
+    Numbers may have commas between thousands. The column `not_numeric` has the first other value of each row.
     """
     columns, not_numeric = dict[str, pd.Series](), pd.Series("", frame.index)
     for name in names:
@@ -284,8 +287,8 @@ def to_numeric(frame: pd.DataFrame, names: Iterable[str]) -> pd.DataFrame:
         is_grouped = texts.map(lambda text: bool(GROUPED_NUMBER.fullmatch(text)))
         numbers = texts[is_grouped].map(lambda text: float(text.replace(",", "")))
         columns[name] = columns[name].astype(np.float64).fillna(numbers)
-        others = f"{name}: " + texts[~is_grouped].head(MAX_BAD_ROWS).map(lambda text: repr(text[:MAX_TEXT_LENGTH]))
-        not_numeric = not_numeric.where(not_numeric != "", others.reindex(frame.index).fillna(""))
+        bad_values = f"{name}: " + texts[~is_grouped].head(MAX_BAD_ROWS).map(lambda text: repr(text[:MAX_TEXT_LENGTH]))
+        not_numeric = not_numeric.where(not_numeric != "", bad_values.reindex(frame.index).fillna(""))
     return frame.assign(**columns, not_numeric=not_numeric)
 
 
@@ -294,28 +297,28 @@ def split_trajectories(
 ) -> ReadResult:
     """Return the trajectories of a table with the columns `line`, `TABLE_COLUMNS` and any of `OPTIONAL_COLUMNS`.
 
-    A trajectory consists of rows of one pair, between which none is missing and the gap does not jump. Its time step is
-    that of its pair. Rows may be in any order. `skipped_rows` has the numbers of rows that were skipped before, by
-    reason. Raise `InputError` if a row is bad, or no trajectory remains.
+    A trajectory consists of successive rows of one pair. It ends where a row is missing or the gap jumps. All
+    trajectories of a pair have the same time step. Rows may be in any order. `skipped_rows` has the number of rows that
+    the caller has skipped, by reason. Raise `InputError` if a row is bad, or no trajectory remains.
     """
     (is_bad, bad_rows), skipped_rows = _find_bad_rows(frame), skipped_rows or {}
     bad_count = int(np.sum(is_bad))
     if bad_count > (MAX_BAD_ROWS if options.drop_bad_rows else 0):
-        more = f" ({bad_count} bad rows)" if bad_count > 1 else ""
+        count_text = f" ({bad_count} bad rows)" if bad_count > 1 else ""
         line, reason = next(iter(bad_rows.items()))
         hint = f"; {MAX_BAD_ROWS:,} can be left out" if options.drop_bad_rows else options.bad_row_hint
-        raise InputError(f"{path.name}: line {line}: {reason}{more}{hint}")
+        raise InputError(f"{path.name}: line {line}: {reason}{count_text}{hint}")
     good = frame.loc[~is_bad].sort_values(by=["pair", "time"], kind="stable")
     groups = [rows for _, rows in good.groupby("pair", sort=False, dropna=False) if len(rows) > 1]
     if not groups:
         raise InputError(f"{path.name}: time: there are no two rows of one vehicle")
     intervals = [np.diff(rows["time"].to_numpy(np.float64)) for rows in groups]
-    has_missing = [each > MISSING_ROW_INTERVAL * np.median(each) for each in intervals]
-    parts = [*zip(groups, intervals, has_missing, strict=True)]
-    has_jump = [(_find_jumps(rows, each) | _find_other_facts(rows)) & ~missing for rows, each, missing in parts]
-    regular = [each[~missing] for _, each, missing in parts]
-    steps = _common_time_steps([float(each.mean()) for each in regular], [float(each.sum()) for each in regular])
-    trajectories, part_counts, short_count, longest = list[FollowingTrajectory](), Counter[str](), len(good), 0.0
+    has_missing = [times > MISSING_ROW_INTERVAL * np.median(times) for times in intervals]
+    pairs = [*zip(groups, intervals, has_missing, strict=True)]
+    has_jump = [(_find_jumps(rows, times) | _find_label_changes(rows)) & ~missing for rows, times, missing in pairs]
+    regular = [times[~missing] for _, times, missing in pairs]
+    steps = _common_time_steps([float(times.mean()) for times in regular], [float(times.sum()) for times in regular])
+    trajectories, trajectory_counts, short_count, longest = list[FollowingTrajectory](), Counter[str](), len(good), 0.0
     for rows, missing, jumps, step in zip(groups, has_missing, has_jump, steps, strict=True):
         for first, last in pairwise([0, *(np.flatnonzero(missing | jumps) + 1).tolist(), len(rows)]):
             seconds = (last - first - 1) * step
@@ -325,58 +328,60 @@ def split_trajectories(
             if step > MAX_TIME_STEP:
                 allowed = f"<= {MAX_TIME_STEP:g} s; are its times in seconds?"
                 raise InputError(f"{path.name}: time: steps of {step:g} s are not allowed; allowed: {allowed}")
-            part = rows.iloc[first:last]
-            short_count -= len(part)
-            pair = str(part["pair"].iloc[0])
-            speed, leader_speed, gap = _at_even_times(part, step)
-            known = {name: part[name].head(1).dropna() for name in OPTIONAL_COLUMNS if name in part}
-            driver, kind, split = ("".join(map(str, known.get(name, ()))) for name in OPTIONAL_COLUMNS)
-            part_counts[pair] += 1
-            name = pair if part_counts[pair] == 1 else f"{pair}/{part_counts[pair]}"
+            segment = rows.iloc[first:last]
+            short_count -= len(segment)
+            pair = str(segment["pair"].iloc[0])
+            speed, leader_speed, gap = _resample_rows(segment, step)
+            labels = {name: segment[name].head(1).dropna() for name in OPTIONAL_COLUMNS if name in segment}
+            driver, kind, split = ("".join(map(str, labels.get(name, ()))) for name in OPTIONAL_COLUMNS)
+            trajectory_counts[pair] += 1
+            name = pair if trajectory_counts[pair] == 1 else f"{pair}/{trajectory_counts[pair]}"
             trajectories.append(FollowingTrajectory(name, driver or pair, step, speed, leader_speed, gap, kind, split))
     limit = f"{options.min_seconds:g} s"
     if not trajectories:
         breaks = {"rows are missing": has_missing, "the gap jumps": has_jump}
-        counts = ", ".join(f"{what} at {sum(map(np.sum, where)):,} places" for what, where in breaks.items())
+        counts = ", ".join(f"{reason} at {sum(map(np.sum, masks)):,} places" for reason, masks in breaks.items())
         raise InputError(f"{path.name}: no trajectory lasts {limit}; the longest lasts {longest:.3g} s; {counts}")
     _check_units(trajectories, path)
     reasons = {**skipped_rows, f"trajectories shorter than {limit}": short_count}
-    jump_count = int(sum(each.sum() for each in has_jump))
+    jump_count = int(sum(jumps.sum() for jumps in has_jump))
     return ReadResult(trajectories, len(frame) + sum(skipped_rows.values()), bad_rows, reasons, jump_count)
 
 
-def _find_other_facts(rows: pd.DataFrame) -> NDArray[np.bool_]:
+def _find_label_changes(rows: pd.DataFrame) -> NDArray[np.bool_]:
     """Return after which rows the driver, kind or split changes."""
-    facts = [rows[name].astype(object).fillna("").to_numpy() for name in OPTIONAL_COLUMNS if name in rows]
-    changes = [each[1:] != each[:-1] for each in facts]
+    columns = [rows[name].astype(object).fillna("").to_numpy() for name in OPTIONAL_COLUMNS if name in rows]
+    changes = [labels[1:] != labels[:-1] for labels in columns]
     return np.logical_or.reduce(changes) if changes else np.zeros(len(rows) - 1, bool)
 
 
 def _find_jumps(rows: pd.DataFrame, intervals: Floats) -> NDArray[np.bool_]:
-    """Return after which rows the gap changes by more than the speeds allow; `intervals` to the next rows [s]."""
+    """Return after which rows the gap jumps, given the intervals to the next rows [s]: see `MAX_PAIR_JUMP`."""
     speed, leader_speed, gap = (rows[name].to_numpy(np.float64) for name in ("speed", "leader_speed", "gap"))
-    closing = speed - leader_speed
-    expected = -0.5 * (closing[1:] + closing[:-1]) * intervals
+    approach_rate = speed - leader_speed
+    expected = -0.5 * (approach_rate[1:] + approach_rate[:-1]) * intervals
     return np.abs(np.diff(gap) - expected) > MAX_PAIR_JUMP
 
 
 def _check_units(trajectories: Sequence[FollowingTrajectory], path: Path) -> None:
-    """Raise `InputError` if the gaps do not change as the speeds and the times imply: then their units do not fit."""
+    """Raise `InputError` if the gaps do not change as speeds and times imply, so that a unit must be wrong."""
     low, high = UNIT_RATIO_LIMITS
-    own = sum(each.speed[1:].sum() * each.time_step for each in trajectories)
-    led = sum(each.leader_speed[1:].sum() * each.time_step - (each.gap[-1] - each.gap[0]) for each in trajectories)
-    if own > MIN_GAP_CHANGE and not low <= led / own <= high:
+    follower_distance, leader_distance = 0, 0
+    for pair in trajectories:
+        follower_distance += pair.speed[1:].sum() * pair.time_step
+        leader_distance += pair.leader_speed[1:].sum() * pair.time_step - (pair.gap[-1] - pair.gap[0])
+    if follower_distance > MIN_GAP_CHANGE and not low <= (ratio := leader_distance / follower_distance) <= high:
         raise InputError(
-            f"{path.name}: speed, leader_speed: a ratio of {led / own:.2g} of the distances of leader and follower "
+            f"{path.name}: speed, leader_speed: a ratio of {ratio:.2g} of the distances of leader and follower "
             f"is not allowed; allowed: {low:.2g} to {high:g}, as in m/s"
         )
     expected, recorded = list[Floats](), list[Floats]()
-    for each in trajectories:
-        closing = each.leader_speed - each.speed
-        implied = np.cumsum((closing[1:] + closing[:-1]) / 2.0) * each.time_step
-        lag = min(max(1, round(CHANGE_SECONDS / each.time_step)), len(implied) - 1)
+    for pair in trajectories:
+        gap_rate = pair.leader_speed - pair.speed
+        implied = np.cumsum((gap_rate[1:] + gap_rate[:-1]) / 2.0) * pair.time_step
+        lag = min(max(1, round(CHANGE_SECONDS / pair.time_step)), len(implied) - 1)
         expected.append(implied[lag:] - implied[:-lag])
-        recorded.append(each.gap[1:][lag:] - each.gap[1:][:-lag])
+        recorded.append(pair.gap[1:][lag:] - pair.gap[1:][:-lag])
     implied, change = np.concatenate(expected), np.concatenate(recorded)
     squares, product = (float(implied @ implied), float(change @ change)), float(implied @ change)
     is_clear = abs(product) >= MIN_CORRELATION * np.sqrt(squares[0] * squares[1])
@@ -390,33 +395,34 @@ def _check_units(trajectories: Sequence[FollowingTrajectory], path: Path) -> Non
 
 
 def _common_time_steps(steps: Sequence[float], seconds: Sequence[float]) -> list[float]:
-    """Return the mean interval of each pair [s], where nearly equal ones become their mean weighted by `seconds`."""
+    """Return the time step of each pair [s]; nearly equal ones become their mean, weighted by durations (`seconds`)."""
     common = np.array(steps)
     order = np.argsort(common, kind="stable")
     starts = np.flatnonzero(np.diff(common[order], prepend=0.0) > TIME_STEP_TOLERANCE * common[order])
-    for numbers in np.split(order, starts[1:]):
-        mean = float(np.average(common[numbers], weights=np.array(seconds)[numbers]))
-        short = round(mean, 4)  # the precision of times in single precision
-        common[numbers] = short if abs(mean - short) <= 1e-4 * mean else round(mean, MAX_TIME_DECIMALS)
+    for indices in np.split(order, starts[1:]):
+        mean = float(np.average(common[indices], weights=np.array(seconds)[indices]))
+        short = round(mean, 4)  # times in single precision have this precision
+        common[indices] = short if abs(mean - short) <= 1e-4 * mean else round(mean, MAX_TIME_DECIMALS)
     return common.tolist()
 
 
-def _at_even_times(rows: pd.DataFrame, step: float) -> list[Floats]:
-    """Return speed, leader speed and gap of rows at equal intervals, interpolated unless only times are rounded."""
-    times, *values = (rows[name].to_numpy(np.float64) for name in TABLE_COLUMNS[1:])
+def _resample_rows(rows: pd.DataFrame, step: float) -> list[Floats]:
+    """Return speed, leader speed and gap at equal intervals, interpolated unless the times are only rounded."""
+    times, *columns = (rows[name].to_numpy(np.float64) for name in TABLE_COLUMNS[1:])
     times = times - times[0]
     if np.all(np.abs(np.diff(times) - step) <= TIME_STEP_TOLERANCE * step):
-        return values
-    numbers = np.arange(len(times))
-    deviation = np.abs(times - np.polyval(np.polyfit(numbers, times, 1), numbers)).max()
-    decimals = (10.0**-digits for digits in range(MAX_TIME_DECIMALS + 1))
-    resolution = next((each for each in decimals if np.all(np.abs(times / each - np.round(times / each)) < 0.01)), 0.0)
-    if deviation <= 0.75 * resolution:  # half of it, except for the error of the fitted line
-        return values
-    return [np.interp(even_times(times[-1], step), times, each) for each in values]
+        return columns
+    indices = np.arange(len(times))
+    deviation = np.abs(times - np.polyval(np.polyfit(indices, times, 1), indices)).max()
+    units = (10.0**-digits for digits in range(MAX_TIME_DECIMALS + 1))
+    resolution = next((unit for unit in units if np.all(np.abs(times / unit - np.round(times / unit)) < 0.01)), 0.0)
+    if deviation <= 0.75 * resolution:  # an error of rounding is up to half of it; the fitted line has an error, too
+        return columns
+    return [np.interp(even_times(times[-1], step), times, column) for column in columns]
 
 
 def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:
+    """Return which rows are bad, and the reasons by line of the file."""
     reasons: dict[int, str] = {}
     is_bad = np.zeros(len(frame), bool)
     for name in TABLE_COLUMNS[1:]:

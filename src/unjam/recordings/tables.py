@@ -1,4 +1,4 @@
-"""Read tables of recorded traffic: CSV with any separator, Parquet, and SUMO's FCD output as XML; compressed or not."""
+"""Read tables of recorded traffic from CSV with any separator, Parquet, and SUMO's FCD output as XML."""
 
 import csv
 import gzip
@@ -18,46 +18,47 @@ from unjam.sandbox import limit_memory_growth
 from unjam.sumo_files.reader import BrokenFileError, XmlAttributes, parse_xml
 
 HEAD_BYTES, HEAD_LINES = 1 << 16, 20
-"""number of first bytes from which the format of a file is detected (no line is longer), and of lines in which its
-header is searched"""
+"""number of bytes at the beginning of a file from which its format is detected, which is also the maximum length of a
+line, and number of lines in which the header is searched"""
 MAX_TEXT_BYTES, MAX_CELLS, MAX_FCD_VEHICLES = 1 << 30, 1 << 27, 1 << 23
-"""maximum size of a table: bytes of text (uncompressed, each cell of Parquet counted), cells, and `vehicle` elements of
-FCD output as XML; each takes about five times as much memory"""
+"""maximum size of a table, which takes about five times as much memory: bytes of uncompressed text (in Parquet, of all
+cells), cells, and `vehicle` elements of FCD output as XML"""
 MAX_BINARY_LENGTH = 16
-"""longest value of a column of equally long binary values in Parquet that is read [bytes], as decimal numbers have"""
+"""maximum length of binary values of equal length in Parquet that are read, such as decimal numbers [bytes]"""
 MAX_PARQUET_MEMORY = 8 << 30
-"""maximum memory that a Parquet file takes while it is read [bytes]"""
+"""maximum memory for reading a Parquet file [bytes]"""
 RECONSTRUCTED_COLUMN_ORDER = (
     *("vehicleid", "frameid", "laneid", "localy", "meanspeed"),
     *("meanaccel", "vehiclelength", "vehicleclassid", "followerid", "leaderid"),
 )
-"""columns of the reconstructed NGSIM files, which have no header, in their order"""
+"""columns of the reconstructed NGSIM files, in order; these files have no header"""
 NGSIM_COLUMN_ORDER = (
     *("vehicle_id", "frame_id", "total_frames", "global_time", "local_x", "local_y", "global_x", "global_y"),
     *("v_length", "v_width", "v_class", "v_vel", "v_acc", "lane_id", "preceding", "following"),
     *("space_headway", "time_headway"),
 )
-"""columns of NGSIM's text files, which have no header, in their order"""
+"""columns of NGSIM's text files, in order; these files have no header"""
 HEADERLESS_COLUMNS = {len(names): list(names) for names in (RECONSTRUCTED_COLUMN_ORDER, NGSIM_COLUMN_ORDER)}
-"""header of each format without one, by its number of columns"""
+"""columns of files without a header, by their number"""
 FCD_ATTRIBUTES = ("id", "speed", "leaderID", "leaderSpeed", "leaderGap")
-"""attributes of a vehicle in SUMO's FCD output that are read; as CSV, their names begin with `vehicle_`"""
+"""attributes of a vehicle that are read of SUMO's FCD output as XML; as CSV, their names begin with `vehicle_`"""
 FCD_PART_ROWS = 1 << 16
 """number of `vehicle` elements that are converted at a time"""
 ALLOWED_FILES = "CSV with a line for each row, Parquet, or SUMO's FCD output"
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Return the table of a file with a column `line`; its `attrs` have the lines above the header, by first word.
+    """Return the table of a file, which may be compressed.
 
-    Raise `InputError` if the file is missing or cannot be read, or is no table.
+    The column `line` has the line of each row in the file; its `attrs` have the lines above the header, by first word.
+    Raise `InputError` if the file is missing, cannot be read, or is not a table.
     """
     if not path.is_file():
         raise InputError(f"data: {str(path)!r} does not exist")
     try:
-        with path.open("rb") as raw:
-            is_packed = raw.read(2) == b"\x1f\x8b"
-        with gzip.open(path) if is_packed else path.open("rb") as file:
+        with path.open("rb") as compressed_file:
+            is_compressed = compressed_file.read(2) == b"\x1f\x8b"
+        with gzip.open(path) if is_compressed else path.open("rb") as file:
             head = file.read(HEAD_BYTES)
             if head.startswith(b"PAR1"):
                 return _read_parquet(path)
@@ -75,7 +76,7 @@ def read_table(path: Path) -> pd.DataFrame:
 
 
 def _check_text_size(path: Path, file: Any, head: bytes) -> None:
-    """Raise `InputError` if a text is too large, before it takes memory: packed files can be tiny."""
+    """Raise `InputError` if a text is too large; a small compressed file can contain a very long text."""
     size, cells, chunk = 0, 0, head
     while chunk and size <= MAX_TEXT_BYTES and cells <= MAX_CELLS:
         size += len(chunk)
@@ -85,9 +86,9 @@ def _check_text_size(path: Path, file: Any, head: bytes) -> None:
 
 
 def _read_parquet(path: Path) -> pd.DataFrame:
-    """Return the columns of numbers and text of a Parquet file, text only if it takes little memory as a column.
+    """Return the columns of a Parquet file that are numbers or text.
 
-    A file of some kilobytes can refer to one long text a million times.
+    The length of all text is limited: a file of some kilobytes can refer to one long text a million times.
     """
     import pyarrow as pa
     from pyarrow.compute import call_function
@@ -95,13 +96,14 @@ def _read_parquet(path: Path) -> pd.DataFrame:
 
     with ParquetFile(path) as file:
         metadata, schema = file.metadata, file.schema
-        check_unique(path, file.schema_arrow.names)
-    flat = [schema.column(number) for number in range(len(schema))]
-    flat = [each for each in flat if each.path == each.name and each.max_repetition_level == 0]
-    flat = [each for each in flat if each.length <= MAX_BINARY_LENGTH]
-    names, texts = {each.name for each in flat}, {each.name for each in flat if each.physical_type == "BYTE_ARRAY"}
-    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-    chunks = [(group, group.column(number)) for group in groups for number in range(metadata.num_columns)]
+        check_unique_columns(path, file.schema_arrow.names)
+    columns = [schema.column(index) for index in range(len(schema))]
+    columns = [column for column in columns if column.path == column.name and column.max_repetition_level == 0]
+    columns = [column for column in columns if column.length <= MAX_BINARY_LENGTH]
+    names = {column.name for column in columns}
+    texts = {column.name for column in columns if column.physical_type == "BYTE_ARRAY"}
+    groups = [metadata.row_group(index) for index in range(metadata.num_row_groups)]
+    chunks = [(group, group.column(index)) for group in groups for index in range(metadata.num_columns)]
     chunks = [(group, chunk) for group, chunk in chunks if chunk.path_in_schema in names]
     has_same_rows = all(chunk.num_values == group.num_rows for group, chunk in chunks)
     if not has_same_rows or sum(group.num_rows for group in groups) != metadata.num_rows:
@@ -110,16 +112,16 @@ def _read_parquet(path: Path) -> pd.DataFrame:
     text_bytes = sum(chunk.total_uncompressed_size for _, chunk in chunks if chunk.path_in_schema in texts)
     total_bytes = sum(chunk.total_uncompressed_size for _, chunk in chunks)
     _check_table_limits(path, text_bytes, (total_bytes - text_bytes) // MAX_BINARY_LENGTH)
-    # The data can be larger after decompression than the footer says.
+    # The decompressed data can be larger than the sizes in the footer of the file.
     with ParquetFile(path, read_dictionary=sorted(texts)) as file, limit_memory_growth(MAX_PARQUET_MEMORY):
-        table = file.read([each.name for each in flat], use_threads=False)
-        dictionaries = [number for number, kind in enumerate(table.schema.types) if pa.types.is_dictionary(kind)]
-        arrays = [array for number in dictionaries for array in table.column(number).chunks]
-        lengths = (call_function("binary_length", [each.dictionary]).take(each.indices) for each in arrays)
-        _check_table_limits(path, sum(each.sum().as_py() or 0 for each in lengths))
-        for number in dictionaries:
-            kind = table.schema.field(number).type.value_type
-            table = table.set_column(number, table.column_names[number], table.column(number).cast(kind))
+        table = file.read([column.name for column in columns], use_threads=False)
+        dictionaries = [index for index, kind in enumerate(table.schema.types) if pa.types.is_dictionary(kind)]
+        arrays = [array for index in dictionaries for array in table.column(index).chunks]
+        lengths = (call_function("binary_length", [array.dictionary]).take(array.indices) for array in arrays)
+        _check_table_limits(path, sum(array_lengths.sum().as_py() or 0 for array_lengths in lengths))
+        for index in dictionaries:
+            value_type = table.schema.field(index).type.value_type
+            table = table.set_column(index, table.column_names[index], table.column(index).cast(value_type))
         frame = table.to_pandas(ignore_metadata=True, use_threads=False)
     return frame.assign(line=np.arange(len(frame)) + 2)
 
@@ -135,8 +137,8 @@ def _unreadable_file_error(path: Path, reason: str) -> InputError:
     return InputError(f"{path.name}: cannot be read: {reason}; allowed: {ALLOWED_FILES}")
 
 
-def check_unique(path: Path, columns: Iterable[str]) -> None:
-    """Raise `InputError` if two of these columns have the same name: one of them would be ignored."""
+def check_unique_columns(path: Path, columns: Iterable[str]) -> None:
+    """Raise `InputError` if two columns have the same name, as one of them would be ignored."""
     counts = Counter(name.strip() for name in columns)
     for name in [name for name, count in counts.items() if name and count > 1]:
         raise InputError(f"{path.name}: {counts[name]} columns have the name {name!r}; allowed: one")
@@ -147,10 +149,10 @@ def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
         raise _unreadable_file_error(path, "it is XML, but not SUMO's FCD output")
     parser, time = expat.ParserCreate(), ""
     names = ["timestep_time", *(f"vehicle_{name}" for name in FCD_ATTRIBUTES)]
-    rows, parts = list[tuple[Any, ...]](), list[pd.DataFrame]()
+    rows, frames = list[tuple[Any, ...]](), list[pd.DataFrame]()
 
-    def store_rows() -> None:  # as columns, which take a tenth of the memory
-        parts.append(pd.DataFrame(rows, columns=[*names, "line"]))
+    def store_rows() -> None:  # columns of a frame take a tenth of the memory of the rows
+        frames.append(pd.DataFrame(rows, columns=[*names, "line"]))
         rows.clear()
 
     def on_start(tag: str, attributes: XmlAttributes) -> None:
@@ -158,7 +160,7 @@ def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
         if tag == "timestep":
             time = attributes.get("time", "")
         elif tag == "vehicle":
-            if len(parts) * FCD_PART_ROWS + len(rows) == MAX_FCD_VEHICLES:
+            if len(frames) * FCD_PART_ROWS + len(rows) == MAX_FCD_VEHICLES:
                 raise _unreadable_file_error(path, f"it has more than {MAX_FCD_VEHICLES:,} elements 'vehicle'")
             rows.append((time, *map(attributes.get, FCD_ATTRIBUTES), parser.CurrentLineNumber))
             if len(rows) == FCD_PART_ROWS:
@@ -167,7 +169,7 @@ def _read_fcd_xml(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     parser.StartElementHandler = on_start
     parse_xml(path, parser, iter(lambda: file.read(HEAD_BYTES), b""))
     store_rows()
-    return pd.concat(parts, ignore_index=True).dropna(axis="columns", how="all")
+    return pd.concat(frames, ignore_index=True).dropna(axis="columns", how="all")
 
 
 def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
@@ -185,16 +187,17 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
     if all(re.fullmatch(r"\s*-?[\d.eE+-]+\s*", cell) for cell in cells):
         if len(cells) not in HEADERLESS_COLUMNS:
             raise _unreadable_file_error(path, "its first line is not the names of its columns")
-        header, options = -1, {"names": HEADERLESS_COLUMNS[len(cells)], "header": None}
+        names = HEADERLESS_COLUMNS[len(cells)]
+        header, options = -1, {"names": names, "header": None}
     else:
-        check_unique(path, cells if separator == r"\s+" else next(csv.reader([lines[header]], delimiter=separator)))
+        names = cells if separator == r"\s+" else next(csv.reader([lines[header]], delimiter=separator))
+        check_unique_columns(path, names)
     rows = "\n".join(lines[header + 1 :])
     if separator != "," and re.search(r"\d,\d", rows) and not re.search(r"\d\.\d", rows):
         options["decimal"] = ","
     width = 0 if separator == r"\s+" else max(map(len, csv.reader(lines[header + 1 :], delimiter=separator)), default=0)
-    surplus = [f"surplus {number}" for number in range(width - len(cells))]
-    if surplus:  # pandas would take the first columns for an index, and shift all others
-        names = options.get("names") or next(csv.reader([lines[header]], delimiter=separator))
+    surplus = [f"surplus {index}" for index in range(width - len(cells))]
+    if surplus:  # pandas would use the first columns as an index, and shift the names of the others
         options = {"header": 0, **options, "names": [*names, *surplus]}
     frame = pd.read_csv(file, sep=separator, encoding="utf-8-sig", skipinitialspace=True, **options)
     if (is_filled := frame[surplus].notna().any(axis=1)).any():
@@ -208,9 +211,9 @@ def _read_csv(path: Path, file: Any, head: bytes) -> pd.DataFrame:
 
 
 def _find_header(lines: list[str]) -> tuple[int, dict[Hashable, str]]:
-    """Return the number of lines above the header of a CSV file, and their content; only OpenACC's files have some."""
-    for number, line in enumerate(lines):
+    """Return the number of lines above the header of a CSV file, and their content; only files of OpenACC have some."""
+    for count, line in enumerate(lines):
         if re.match(r"time\s*[,;\t]\s*speed1\b", line.strip(), re.IGNORECASE):
-            above = [line.strip().partition(",") for line in lines[:number]]
-            return number, {key.strip(" :").lower(): value.strip(",\" '") for key, _, value in above}
+            above = [line.strip().partition(",") for line in lines[:count]]
+            return count, {key.strip(" :").lower(): value.strip(",\" '") for key, _, value in above}
     return 0, {}

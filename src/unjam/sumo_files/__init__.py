@@ -127,14 +127,14 @@ def store_answer(file: str, answer: dict[str, Any]) -> SumoFiles:
     copy_sources = fields["copy_sources"].items()
     fields["copy_sources"] = {Path(original): tuple(map(Path, sources)) for original, sources in copy_sources}
     fields["used_types"], options = frozenset(fields["used_types"]), fields["options"]
-    kinds = {name: classify_option(path.name, name, value) for name, value in options.items()}
-    fields["options"] = {name: value for name, value in options.items() if kinds[name] == "passed"}
+    treatments = {name: classify_option(path.name, name, value) for name, value in options.items()}
+    fields["options"] = {name: value for name, value in options.items() if treatments[name] == "passed"}
     for name, value in fields["options"].items():
         if variable := UNKNOWN_VARIABLE.search(value):
             raise invalid_value(f"{path.name}: {name}", variable[0], ALLOWED_VARIABLES)
-    dropped = [f"option {name}" for name in options if kinds[name] == "dropped"]
+    dropped = [f"option {name}" for name in options if treatments[name] == "dropped"]
     fields["dropped_items"] = (*dropped, *fields["dropped_items"])
-    fields["replaced_options"] = tuple(name for name in options if kinds[name] == "replaced")
+    fields["replaced_options"] = tuple(name for name in options if treatments[name] == "replaced")
     files = SumoFiles(path, **fields)
     _read_files[path], _answers[file] = (stamps, files), answer
     return files

@@ -64,7 +64,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
     options = _read_options(path)
     if options.get("mesosim", "").lower() in TRUE_VALUES:
         raise BrokenFileError(
-            f"{path.name}: mesosim: true is not allowed; allowed: false, as its vehicles obey no commands"
+            f"{path.name}: mesosim: true is not allowed; allowed: false, as vehicles obey no commands"
         )
     networks, additional, routes, weights = (
         [_resolve_file_name(path, option, name.strip()) for name in options.pop(option, "").split(",") if name.strip()]
@@ -92,6 +92,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
     end = _read_seconds(path, options, "end", None)
     if end is not None and end <= begin:
         raise BrokenFileError(f"{path.name}: end: {end:g} s is not allowed; allowed: after begin, {begin:g} s")
+    copied_files = {file: xml_reader.sources for file, xml_reader in readers.items() if xml_reader.needs_copy}
     return {
         "network": str(network),
         "additional_files": list(map(str, additional)),
@@ -99,11 +100,7 @@ def _read_configuration(path: Path) -> dict[str, Any]:
         "weight_files": list(map(str, weights)),
         "options": options,
         "dropped_items": sorted({item for xml_reader in readers.values() for item in xml_reader.dropped_items}),
-        "copy_sources": {
-            str(file): list(map(str, xml_reader.sources))
-            for file, xml_reader in readers.items()
-            if xml_reader.needs_copy
-        },
+        "copy_sources": {str(file): list(map(str, sources)) for file, sources in copied_files.items()},
         "begin": begin,
         "end": end,
         "first_departure": demand.first_departure,

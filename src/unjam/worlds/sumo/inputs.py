@@ -132,17 +132,13 @@ def _user_network_types_xml(scenario: Scenario, road: UserNetworkRoad) -> str:
     return "\n".join(["<additional>", *lines, "</additional>"])
 
 
-def _derived_type_xml(
-    name: str, attributes: XMLAttributes, car_following: XMLAttributes, parameters: dict[str, str]
-) -> str:
+def _derived_type_xml(name: str, attributes: XMLAttributes, model: XMLAttributes, parameters: dict[str, str]) -> str:
     """Return the XML of a user's vehicle type with another car-following model, and without harmful attributes."""
     keys = filter(reader.is_harmless_attribute, attributes.keys() - CAR_FOLLOWING_ATTRIBUTES)
-    other_attributes = {key: attributes[key] for key in sorted(keys)}
+    common = {key: attributes[key] for key in sorted(keys)}
     if attributes.get("carFollowModel") == "W99":  # its acceleration has another name
-        other_attributes["accel"] = attributes.get("cc8", W99_ACCELERATION)
-    element = xml_element(
-        "vType", **{**other_attributes, "speedFactor": 1.0, "speedDev": 0.0, **car_following, "id": name}
-    )
+        common["accel"] = attributes.get("cc8", W99_ACCELERATION)
+    element = xml_element("vType", **{**common, "speedFactor": 1.0, "speedDev": 0.0, **model, "id": name})
     harmless = filter(reader.is_harmless_parameter, parameters)
     nested = "".join(xml_element("param", key=key, value=parameters[key]) for key in harmless)
     return f"{element.removesuffix('/>')}>{nested}</vType>"

@@ -34,7 +34,7 @@ def neighbor_state(
 ) -> LocalState:
     """Return the local states of the vehicles in `rows`.
 
-    `leaders` and `followers` are rows of their neighbors; -1: none. `leader_gaps` returns gaps [m] of rows to rows.
+    `leaders` and `followers` are the rows of their neighbors, or -1. `leader_gaps` returns the gaps between rows [m].
     """
     fields = [speeds[rows]]
     for neighbors, gaps in ((leaders, leader_gaps(rows, leaders)), (followers, leader_gaps(followers, rows))):
@@ -49,9 +49,9 @@ class ActiveVehicles:
         self.is_cav: dict[str, bool] = {}
         """whether each vehicle on the road is a CAV, in order of entry"""
         self.teleported: dict[str, bool] = {}
-        """whether each vehicle is a CAV that SUMO has teleported and not yet reinserted"""
+        """vehicles that SUMO has teleported and not yet reinserted, and whether each is a CAV"""
         self.off_road: dict[str, bool] = {}
-        """whether each vehicle is a CAV that SUMO is removing, but lists as arrived or teleported only later"""
+        """vehicles that SUMO is removing, but lists as arrived or teleported only later, and whether each is a CAV"""
         self._removed_unlisted = set[str]()
         """vehicles that were removed in a collision, and that SUMO has not yet listed as arrived"""
         self.collided_vehicles = set[str]()
@@ -164,6 +164,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         return {name: self._log.traffic.snapshots(name, columns) for name in names}
 
     def _branches(self, vehicles: Sequence[str]) -> Sequence[str]:
+        """Return the names of the branches on which vehicles enter; empty on roads with one entrance."""
         return [""] * len(vehicles)
 
     def _column_groups(self, vehicles: Sequence[str]) -> Sequence[Hashable]:
@@ -198,7 +199,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         self._vehicles.arrivals = self._vehicles.teleports = 0
         self._vehicles.collided_vehicles.clear()
         self._log = self._make_log()
-        self._log_moment()
+        self._log_control_step()
 
     def exact_state(self) -> LocalState:
         """Return the exact current local state of the CAVs."""
@@ -230,10 +231,10 @@ class OpenTraffic(Traffic[OpenRoadT]):
             if self.has_crashed or self.stop_reason:
                 break
         self.control_steps += 1
-        self._log_moment()
+        self._log_control_step()
         if not (self.is_controlled and is_exact):  # use actual accelerations, zero for vehicles that have left
-            new = dict(zip(self._log.traffic.names, self.speeds, strict=True))
-            changes = (new.get(vehicle_id, old) - old for vehicle_id, old in zip(ids, previous_speeds, strict=True))
+            speeds = dict(zip(self._log.traffic.names, self.speeds, strict=True))
+            changes = (speeds.get(vehicle_id, old) - old for vehicle_id, old in zip(ids, previous_speeds, strict=True))
             requested = [change / scenario.control_step for change in changes]
         means = [sum(values) / scenario.steps_per_control_step * is_exact for values in reductions.values()]
         trips.applied_accelerations.append([value - mean for value, mean in zip(requested, means, strict=True)])
@@ -251,6 +252,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         return speeds, safe
 
     def _simulate(self, cav_speeds: dict[str, float]) -> None:
+        """Simulate one step, given the commanded speeds of CAVs [m/s]."""
         self._command_humans()
         self._command_cavs(cav_speeds)
         self._simulation.step()
@@ -270,7 +272,7 @@ class OpenTraffic(Traffic[OpenRoadT]):
         self._controlled_cavs.difference_update(entered)  # a new vehicle may have the id of one that has left
         self._update_vehicles(left, entered)
 
-    def _log_moment(self) -> None:
+    def _log_control_step(self) -> None:
         """Take control of the CAVs that have entered, and log the state after a control step."""
         simulation, scenario, previous = self._simulation, self.scenario, set(self.cav_ids)
         rows = [row for row, vehicle_id in enumerate(self.cav_ids) if vehicle_id in self._vehicles.is_cav]
@@ -282,9 +284,8 @@ class OpenTraffic(Traffic[OpenRoadT]):
         if self.is_controlled:
             new = [vehicle_id for vehicle_id in new if vehicle_id not in self._controlled_cavs]
             self._controlled_cavs.update(new)
-            parameters = lane_change_parameters(scenario)
-            template = self._cav_type_template
-            simulation.take_control(new, scenario.actuation, scenario.right_of_way, template, parameters)
+            settings = scenario.actuation, scenario.right_of_way, self._cav_type_template
+            simulation.take_control(new, *settings, lane_change_parameters(scenario))
         ids, self.speeds = self._ids_and_speeds()
         log, states = self._log, self._local_states(self.cav_ids)
         log.traffic.add(ids, self.speeds)

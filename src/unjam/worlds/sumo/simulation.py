@@ -113,10 +113,8 @@ class Simulation(AbstractContextManager["Simulation"]):
         self._get_speed, self._get_lane = get_function("vehicle", "getSpeed"), get_function("vehicle", "getLaneID")
         self._get_lane_position = get_function("vehicle", "getLanePosition")
         self._get_allowed_speed = get_function("vehicle", "getAllowedSpeed")
-        self._set_speed, self._set_previous_speed = (
-            get_function("vehicle", "setSpeed"),
-            get_function("vehicle", "setPreviousSpeed"),
-        )
+        self._set_speed = get_function("vehicle", "setSpeed")
+        self._set_previous_speed = get_function("vehicle", "setPreviousSpeed")
 
         def make_list_reader(name: str) -> Callable[[Sequence[str]], list[float]]:
             function = get_function("vehicle", name)
@@ -185,11 +183,11 @@ class Simulation(AbstractContextManager["Simulation"]):
             self._library.end()  # then SUMO's message is in its log, and the next episode can start
             logs = [self._error_log, *([self._stdout_log] if self._stdout_log else [])]
             message = next(filter(None, map(last_error_message, logs)), "")
-            error_class = SumoInputError if message or self.transport != "gui" else EpisodeError  # no screen
+            error_class = SumoInputError if message or self.transport != "gui" else EpisodeError  # without a screen
             raise error_class(f"SUMO cannot start: {message or ' '.join(str(error).split())}") from error
 
     def _readable_path(self, path: Path, inputs: SumoInputs) -> str:
-        """Return the path that SUMO reads: of the file itself, or of its harmless copy, which is written if needed."""
+        """Return the path that SUMO reads: of the file, or of its harmless copy, which is written if needed."""
         if path not in inputs.copied_files:
             return str(path)
         new_copy = Path(self._folder.name) / f"{len(self._harmless_copies)}.xml"
@@ -271,11 +269,13 @@ class Simulation(AbstractContextManager["Simulation"]):
         return NeighborStates(leader if speeds_and_gaps[1] < max_distance else "", *speeds_and_gaps)
 
     def vehicles_on_opposite_lanes(self, ids: Sequence[str]) -> list[str]:
-        """Return those of the vehicles that overtake on a lane of the opposite direction."""
+        """Return the vehicles among `ids` that overtake on a lane of the opposite direction."""
         edges = [self._sumo.lane.getEdgeID(lane) if lane else "" for lane in map(self._get_lane, ids)]
         rows = zip(ids, edges, self.remaining_routes(ids), strict=True)
         return [
-            vehicle for vehicle, edge, route in rows if edge not in ("", *route[:1]) and edge[0] != INTERNAL_EDGE_PREFIX
+            vehicle
+            for vehicle, edge, route in rows
+            if edge and edge not in route[:1] and edge[0] != INTERNAL_EDGE_PREFIX
         ]
 
     def is_in_contact(self, vehicle_id: str, leader: str) -> bool:
@@ -346,7 +346,7 @@ class Simulation(AbstractContextManager["Simulation"]):
         self._sumo.vehicle.setStop(vehicle_id, edge, pos=position, laneIndex=0)
 
     def end_stop(self, vehicle_id: str, edge: str, position: float) -> None:
-        """End or cancel the stop of a vehicle, which stands there or has not yet reached it."""
+        """End the stop of a standing vehicle, or cancel the stop that a vehicle has not yet reached."""
         if self._sumo.vehicle.isStopped(vehicle_id):
             self._sumo.vehicle.resume(vehicle_id)
         else:

@@ -33,19 +33,19 @@ def find_lateral_neighbors(sumo: Any, vehicle_id: str, max_distance: float) -> L
     for index, lane in enumerate(_lanes_ahead(sumo, vehicle_id)):
         if leader[0] or offset >= max_distance:
             break
-        for other, lateral in _vehicles_of_edge(sumo, lane):
-            distance = offset + vehicle.getLanePosition(other)
-            if other == vehicle_id or abs(lateral - center) >= half_width + vehicle.getWidth(other) / 2.0:
+        for neighbor, lateral in _vehicles_of_edge(sumo, lane):
+            distance = offset + vehicle.getLanePosition(neighbor)
+            if neighbor == vehicle_id or abs(lateral - center) >= half_width + vehicle.getWidth(neighbor) / 2.0:
                 continue
             if distance > 0.0:
-                leader = min(leader, (other, distance - vehicle.getLength(other)), key=_gap)
+                leader = min(leader, (neighbor, distance - vehicle.getLength(neighbor)), key=_gap)
             elif index == 0:
-                follower = min(follower, (other, -length - distance), key=_gap)
+                follower = min(follower, (neighbor, -length - distance), key=_gap)
         offset += sumo.lane.getLength(lane)
     if not follower[0]:
-        other, gap = vehicle.getFollower(vehicle_id, max_distance)
-        if other and vehicle.getRoadID(other) != vehicle.getRoadID(vehicle_id):
-            follower = other, min(gap + vehicle.getMinGap(other), max_distance)
+        neighbor, gap = vehicle.getFollower(vehicle_id, max_distance)
+        if neighbor and vehicle.getRoadID(neighbor) != vehicle.getRoadID(vehicle_id):
+            follower = neighbor, min(gap + vehicle.getMinGap(neighbor), max_distance)
     return LateralNeighbors(*leader, *follower)
 
 

@@ -69,7 +69,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
 
     @property
     def expects_cavs(self) -> bool:
-        """Whether a CAV may still enter: unjam cannot tell as long as any vehicle may enter."""
+        """Whether a CAV may still enter: vehicles may enter, and there are fewer CAVs than allowed."""
         return not self.is_finished and self._may_add_cav()
 
     @property
@@ -171,9 +171,7 @@ class UserNetworkTraffic(MultiLaneTraffic[UserNetworkRoad]):
     def _safe_speeds(self, accelerations: dict[str, float]) -> tuple[dict[str, float], dict[str, float]]:
         """Return the results of `OpenTraffic._safe_speeds`, with speeds up to those that the road allows."""
         speeds, safe = super()._safe_speeds(accelerations)
-        if (
-            self.scenario.actuation == "cruise"
-        ):  # SUMO limits the speed itself, and counts set-speed caps as limits of the road
+        if self.scenario.actuation == "cruise":  # SUMO limits speeds, and counts set-speed caps as limits of the road
             return speeds, safe
         allowed = self._simulation.allowed_speeds(list(speeds))
         return dict(zip(speeds, np.fmin([*speeds.values()], allowed).tolist(), strict=True)), safe
