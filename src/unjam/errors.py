@@ -137,7 +137,7 @@ def unknown_name(field: str, value: object, names: Iterable[str]) -> InputError:
 
 
 @contextmanager
-def naming(prefix: str) -> Iterator[None]:
+def prefix_errors(prefix: str) -> Iterator[None]:
     """Let the message of an `InputError` in the block begin with `prefix`."""
     try:
         yield
