@@ -167,7 +167,7 @@ def make_folder(path: Path) -> None:
             if protected_root(absolute) == absolute:
                 path.mkdir(parents=True, exist_ok=True)
             else:
-                with open_folder(absolute, make=True):
+                with open_folder(absolute, create=True):
                     pass
         except OSError:
             if path.is_symlink():

@@ -93,14 +93,14 @@ def _open_by_name(path: Path, name: Path | str, parent: int | None) -> Iterator[
 
 
 @contextmanager
-def open_folder(path: Path, make: bool = False) -> Iterator[Folder]:
-    """Open a folder, or make a missing protected one; `InputError` for a link, or `..`, inside a protected folder."""
+def open_folder(path: Path, create: bool = False) -> Iterator[Folder]:
+    """Open a folder, or create a missing protected one; `InputError` for a link, or `..`, inside a protected folder."""
     path = path.absolute()
     root = protected_root(path)
     with ExitStack() as stack:
         folder = stack.enter_context(_open_by_name(root, root, None))
         for name in path.relative_to(root).parts:
-            if make:
+            if create:
                 with suppress(FileExistsError):
                     os.mkdir(folder.entry_path(name), dir_fd=folder.handle)
             folder = stack.enter_context(folder.enter(name))
