@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from unjam.errors import InputError
-from unjam.text import one_line
+from unjam.text import to_one_line
 
 _SEPARATOR = re.compile(r"\+(?=[^\W\d]|[./~])")  # + between two names, but not that in 1e+5
 _MAX_LENGTH = 4096  # letters of a path, the limit of Linux
@@ -19,7 +19,9 @@ def split_names(text: str, folder: Path = Path()) -> list[str]:
     names = list[str]()
     while separator := _SEPARATOR.search(text, len(_existing_path(text, folder))):
         if len(names) == MAX_NAMES - 1:
-            raise InputError(f"names: {one_line(text, 60)!r} and those before it; allowed: at most {MAX_NAMES} names")
+            raise InputError(
+                f"names: {to_one_line(text, 60)!r} and those before it; allowed: at most {MAX_NAMES} names"
+            )
         names.append(text[: separator.start()])
         text = text[separator.end() :]
     return [*names, text]

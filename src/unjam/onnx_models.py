@@ -15,7 +15,7 @@ from threading import Timer
 from typing import Any
 
 from unjam.errors import InputError, import_optional, invalid_value
-from unjam.text import one_line
+from unjam.text import to_one_line
 
 _OPERATORS = """
 Abs Add And BatchNormalization Cast Ceil Clip Concat Constant Cos Div Elu Equal Erf Exp Expand Flatten Floor Gather
@@ -60,7 +60,7 @@ def parse_model(content: bytes) -> Any:
     try:
         return onnx.load_model_from_string(content)
     except Exception as error:  # protobuf has its own error classes
-        raise InputError(f"graph: cannot be read: {one_line(error)}") from None
+        raise InputError(f"graph: cannot be read: {to_one_line(error)}") from None
 
 
 def remove_texts(message: Any) -> None:
@@ -159,7 +159,7 @@ def run_session(session: Any, outputs: list[str] | None, values: dict[str, Any])
 
 
 def _run_error(error: Exception) -> InputError:
-    return InputError(f"graph: cannot be run: {one_line(error)}")
+    return InputError(f"graph: cannot be run: {to_one_line(error)}")
 
 
 _run_options: ContextVar[Any] = ContextVar("run_options", default=None)

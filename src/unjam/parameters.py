@@ -17,7 +17,7 @@ from pydantic.dataclasses import dataclass
 from pydantic.errors import PydanticUserError
 
 from unjam.errors import InputError, invalid_value
-from unjam.text import one_line, spelling_hint
+from unjam.text import spelling_hint, to_one_line
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 """configuration of parameter dataclasses, of which `unjam drivers` and the documentation show the texts under fields"""
@@ -124,7 +124,7 @@ def _apply_decorator(cls: type[Any]) -> None:
         try:
             parameter_dataclass(frozen=True, config=config)(cls)
         except (TypeError, ValueError, PydanticUserError) as error:
-            raise InputError(f"class {cls.__name__}: {one_line(error)}") from error
+            raise InputError(f"class {cls.__name__}: {to_one_line(error)}") from error
 
 
 def is_packaged(kind: type[Any]) -> bool:

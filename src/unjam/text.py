@@ -13,7 +13,7 @@ INVISIBLE_LETTERS = {
 """letters and marks that are not shown, although Unicode does not count them as control characters"""
 
 
-def one_line(value: object, length: int = 200) -> str:
+def to_one_line(value: object, length: int = 200) -> str:
     """Return a text of a stranger without control characters on one line, cut to `length` letters with `…`."""
     text = printable(" ".join(str(value).split()))
     return text if len(text) <= length else f"{text[: length - 1]}…"

@@ -12,7 +12,7 @@ import platformdirs
 
 from unjam.errors import InputError, UnjamError
 from unjam.files import atomic_write, changed_file_error, make_folder, sha256_of
-from unjam.text import one_line
+from unjam.text import to_one_line
 from unjam.user_code import UserCode, read_code
 
 TRUSTED_VARIABLE = "UNJAM_TRUSTED"  # keys of trusted code, in addition to the remembered ones
@@ -135,7 +135,7 @@ def _code_files(context: str, text: str) -> Iterator[tuple[str, Path]]:
     starts = [0, *(index + 1 for index, letter in enumerate(text) if letter == "+")]
     ends = [index for index, letter in enumerate(text) if letter == ":"]
     if len(starts) * len(ends) > MAX_NAMED_FILES:
-        raise InputError(f"{context}: {one_line(text, 60)!r} has too many parts; allowed: fewer + and :")
+        raise InputError(f"{context}: {to_one_line(text, 60)!r} has too many parts; allowed: fewer + and :")
     for name in dict.fromkeys(text[start:end] for start in starts for end in ends if start < end):
         yield os.path.join(os.getcwd(), name), Path(os.path.realpath(name))
 

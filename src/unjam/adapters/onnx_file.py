@@ -19,7 +19,7 @@ from unjam.errors import InputError, invalid_value, prefix_errors, unknown_name
 from unjam.folders import open_folder
 from unjam.onnx_models import MAX_MODEL_BYTES, parse_model
 from unjam.parameters import build_dataclass, parse_toml, split_parameters
-from unjam.text import one_line
+from unjam.text import to_one_line
 
 GRAPH_SUFFIX, DESCRIPTION_SUFFIX = ".onnx", ".toml"
 DESCRIPTION_KEY = "unjam"  # key of the description among the metadata of a graph
@@ -98,4 +98,4 @@ def _parse_description(content: bytes, name: str) -> dict[str, Any]:
     try:
         return parse_toml(content.decode())
     except (ValueError, RecursionError) as error:
-        raise InputError(f"driver {name}: not TOML: {one_line(error)}") from None
+        raise InputError(f"driver {name}: not TOML: {to_one_line(error)}") from None

@@ -8,7 +8,7 @@ import numpy as np
 
 from unjam.errors import InputError
 from unjam.physics.arrays import Array, Floats, clip, namespace
-from unjam.text import one_line
+from unjam.text import to_one_line
 
 
 class Command(NamedTuple):
@@ -47,7 +47,7 @@ def as_numbers(answer: Any, label: str, allowed: str = "", to_array: Callable[[A
     try:
         return to_array(answer)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # the last for tensors with a gradient
-        reason = f"{label} is not numbers: {one_line(repr(answer), 60)}"
+        reason = f"{label} is not numbers: {to_one_line(repr(answer), 60)}"
         raise InputError(f"{reason}; allowed: {allowed}" if allowed else reason) from None
 
 

@@ -38,7 +38,7 @@ from unjam.reports.html import write_report_page
 from unjam.reports.results import CONTROLLER_FILE, read_progress
 from unjam.scenarios.file_watch import watch_files
 from unjam.seeds import VALIDATION_SEED
-from unjam.text import one_line
+from unjam.text import to_one_line
 from unjam.training import run_folder
 from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
 from unjam.training.evaluate import EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert
@@ -215,7 +215,7 @@ class Trainer:
             try:
                 self._restore(*checkpoint)
             except UNREADABLE_ERRORS as error:
-                reason = f"is none of this run: {type(error).__name__}: {one_line(error)}"
+                reason = f"is none of this run: {type(error).__name__}: {to_one_line(error)}"
                 raise InputError(f"checkpoint: that of {str(folder)!r} {reason}; allowed: remove it") from None
             run_folder.append_lineage(folder, self.collector.iteration)
 
