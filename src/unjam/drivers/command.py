@@ -51,7 +51,7 @@ def as_numbers(answer: Any, label: str, allowed: str = "", to_array: Callable[[A
         raise InputError(f"{reason}; allowed: {allowed}" if allowed else reason) from None
 
 
-def answer_as_array(
+def to_answer_array(
     answer: Any, rows: int, context: str, quantity: str = "acceleration", row_name: str = "CAV"
 ) -> Floats:
     """Return the answer of a driver or a reward as an array; raise `InputError` unless its shape is (rows,)."""
@@ -81,7 +81,7 @@ def commanded_accelerations(command: Command | None, limits: Limits, names: Sequ
     if is_float and isfinite(found):  # the fast path, in every step of a simulator
         return [limits.clip(found)]
     context = f"driver: step {step}"
-    values = answer_as_array([found] if is_float else found, rows, context)
+    values = to_answer_array([found] if is_float else found, rows, context)
     if not all(map(isfinite, values.tolist())):  # faster than NumPy for few vehicles
         _raise_not_finite(values, names, f"{context}: acceleration", "finite")
     return limits.clip(values).tolist()
@@ -95,7 +95,7 @@ def commanded_time_gaps(command: Command | None, min_time_gap: float, names: Seq
     if command is None or command.time_gap is None:
         return [min_time_gap] * len(names)
     context = f"driver: step {step}"
-    found = np.fmax(answer_as_array(command.time_gap, len(names), context, "time gap"), min_time_gap)  # drops NaN
+    found = np.fmax(to_answer_array(command.time_gap, len(names), context, "time gap"), min_time_gap)  # drops NaN
     if not np.isfinite(found).all():
         _raise_not_finite(found, names, f"{context}: time gap", "finite, or NaN")
     return found.tolist()

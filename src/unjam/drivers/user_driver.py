@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from unjam.drivers.command import answer_as_array
+from unjam.drivers.command import to_answer_array
 from unjam.drivers.driver import Driver, Memory, check_memory, label_with_parameters
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.requirements import Requirements, RoadInterface
@@ -226,14 +226,14 @@ class UserDriver(Driver):
         found = self._call_method("act", state, memory)
         if not (isinstance(found, tuple) and len(found) == 2):
             raise InputError(f"{label}: act() returns {found!r:.60}; allowed: (accelerations, memory)")
-        numbers, after = answer_as_array(found[0], rows, label), check_memory(found[1], rows, f"{label}: act()")
+        numbers, after = to_answer_array(found[0], rows, label), check_memory(found[1], rows, f"{label}: act()")
         is_single = getattr(found[0], "dtype", None) == np.float32  # stays so: rows may differ by its rounding
         return numbers.astype(np.float32) if is_single else numbers, after
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time gaps of the user's driver, if it has `time_gaps`."""
         found, rows = self._call_method("time_gaps", state, memory) if np.size(state.speed) else None, len(state.speed)
-        return None if found is None else answer_as_array(found, rows, self.describe(), "time gap")
+        return None if found is None else to_answer_array(found, rows, self.describe(), "time gap")
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the memory features of the user's driver, if it has `memory_features`."""
