@@ -42,13 +42,14 @@ def _as_doubles(answer: Any) -> Floats:
     return array.astype(np.float64, copy=False)
 
 
-def as_numbers(answer: Any, label: str, allowed: str = "", to_array: Callable[[Any], Array] = _as_doubles) -> Floats:
+def as_numbers(
+    answer: Any, label: str, allowed: str = "real numbers", to_array: Callable[[Any], Array] = _as_doubles
+) -> Floats:
     """Return the answer of a user's code as an array, made by `to_array`; raise `InputError` unless it is numbers."""
     try:
         return to_array(answer)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # the last for tensors with a gradient
-        reason = f"{label} is not numbers: {to_one_line(repr(answer), 60)}"
-        raise InputError(f"{reason}; allowed: {allowed}" if allowed else reason) from None
+        raise InputError(f"{label} is not numbers: {to_one_line(repr(answer), 60)}; allowed: {allowed}") from None
 
 
 def to_answer_array(
@@ -66,7 +67,8 @@ def batch_commanded_accelerations(command: Command | None, limits: Limits, rows:
     """Return the commands within the limits, shape (rows,) [m/s2]; `InputError` unless they are finite, one a row."""
     found: Any = () if command is None else command.acceleration
     if np.shape(found) != (rows,) or not bool(namespace(found).isfinite(found).all()):
-        raise InputError(f"driver: step {step}: not {rows} accelerations that are finite")
+        allowed = f"{rows} finite numbers, one for each CAV"
+        raise InputError(f"driver: step {step}: acceleration is not allowed; allowed: {allowed}")
     return limits.clip(found)
 
 
