@@ -103,7 +103,7 @@ def expected_code_environment() -> dict[str, str]:
 
 
 @contextmanager
-def expecting_code() -> Iterator[None]:
+def forget_expected_code() -> Iterator[None]:
     """Forget the hashes at the end of the block: the user can change the code, and name it again."""
     try:
         yield

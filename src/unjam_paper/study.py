@@ -17,7 +17,7 @@ from unjam.controller import make_driver
 from unjam.drivers.driver import Driver
 from unjam.errors import InputError, raise_failure
 from unjam.files import atomic_write, make_folder, read_json_object, remove
-from unjam.manifest import manifest, without_folders
+from unjam.manifest import manifest, strip_folders
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
 from unjam.measures.metric_table import estimate_cell, use_no_break_spaces
 from unjam.measures.metrics import measure
@@ -216,7 +216,7 @@ def write_manifest(folder: Path, **metadata: Any) -> None:
     """Write the manifest of a study: that of its first call with this `metadata`, and all resumptions."""
     make_folder(folder)
     about, file = manifest(), folder / "manifest.json"
-    about["command"] = without_folders(about["command"])
+    about["command"] = strip_folders(about["command"])
     if file.is_file():
         resumption = {name: about[name] for name in ("commit", "started")}
         about = read_json_object(file)

@@ -29,7 +29,7 @@ from unjam.drivers.registry import driver_recipe, is_serializable, user_code_rec
 from unjam.drivers.user_driver import DriverLike, as_driver, code_hashes
 from unjam.errors import InputError, invalid_value, raise_failure, unknown_name
 from unjam.files import make_folder, sha256_of, sha256_of_file, to_json
-from unjam.manifest import manifest, without_folders
+from unjam.manifest import manifest, strip_folders
 from unjam.measures.gain import EpisodeRows
 from unjam.measures.metric_table import HUMAN_LABEL
 from unjam.measures.metrics import measure
@@ -101,12 +101,12 @@ def benchmark(
     origin = manifest()
     result = BenchmarkResult(
         suite=suite,
-        driver=to_one_line(without_folders([label])[0] or first.describe(), MAX_LABEL_CHARACTERS),
+        driver=to_one_line(strip_folders([label])[0] or first.describe(), MAX_LABEL_CHARACTERS),
         sha256=_driver_hash(label, first),
         training_steps=_recorded_steps(label) or training_steps,
         manifest={
             **origin,
-            "command": without_folders(origin["command"]),
+            "command": strip_folders(origin["command"]),
             "backend": backend,
             "backend_sha256": next(iter(code_hashes([str(backend)]).values()), None),
         },

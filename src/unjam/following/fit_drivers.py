@@ -20,7 +20,7 @@ from unjam.following.calibration import (
     calibrate_groups,
     calibrate_idm,
 )
-from unjam.manifest import manifest, without_folders
+from unjam.manifest import manifest, strip_folders
 from unjam.parameters import STRICT, NonNegativeInt, PositiveInt, build_dataclass, nest_keys, parameter_dataclass
 from unjam.physics.idm import IDMParameters
 from unjam.recordings.loaders import ReadOptions, read_trajectories
@@ -134,7 +134,7 @@ def fit_drivers_from_files(
     population = fit_drivers(trajectories, settings, on_progress)
     origin = manifest()
     # Populations are published: they do not name folders of this machine.
-    origin["command"] = without_folders(origin["command"])
+    origin["command"] = strip_folders(origin["command"])
     metadata = {"data": [file.name for file in files], "filters": filters or {}, "manifest": origin}
     return FittedDrivers(replace(population, metadata={**population.metadata, **metadata}), notes)
 

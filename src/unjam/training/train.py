@@ -50,7 +50,7 @@ from unjam.training.random_state import exclusive_random_state
 from unjam.training.string_limit import find_operating_points
 from unjam.training.task_sampling import TaskSampler, make_episodes, warm_up_iterations
 from unjam.tree import unpack
-from unjam.trust import expecting_code
+from unjam.trust import forget_expected_code
 from unjam.worlds.batch.run import run_batched_if_supported
 from unjam.worlds.worker_pool import WorkerPool
 
@@ -162,7 +162,7 @@ def train_in_process(
         run_folder.read_config(folder)
     else:
         run_folder.make_new_folder(folder, f", or --resume {folder}")
-    with run_folder.removing_if_empty(folder), expecting_code(), lock_folder(folder):
+    with run_folder.removing_if_empty(folder), forget_expected_code(), lock_folder(folder):
         (run_folder.resume_run_folder if resume else run_folder.create_run_folder)(folder, config)
         refusals = nullcontext() if resume else run_folder.discarding_refused(folder)
         with refusals, ExitStack() as locks, WorkerPool(config.workers) as workers:
