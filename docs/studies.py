@@ -9,7 +9,7 @@ import pandas as pd
 from tables import RESULTS, driver_rows, metric_table, results_part
 
 from unjam.measures.feasibility import FEASIBLE
-from unjam.measures.metric_table import HUMAN_LABEL, with_no_break_spaces
+from unjam.measures.metric_table import HUMAN_LABEL, use_no_break_spaces
 from unjam.measures.statistics import estimate_over_trainings
 from unjam_paper.comparison import COMPARISON_METRICS, estimate_metrics
 from unjam_paper.feasible import GAP_PI_IDEAL_LABEL, GAP_PI_JAMMED_LABEL
@@ -144,7 +144,7 @@ def paper_convention_table(study: str, road: str) -> pd.DataFrame:
             for label, rows in versions.items():
                 measured = rows[name]["paper_convention"][key]
                 text = f"{measured['mean']:.{digits}f} ± {measured['std']:.{digits}f}"
-                cells[f"{heading}, {label}"] = with_no_break_spaces(text)
+                cells[f"{heading}, {label}"] = use_no_break_spaces(text)
         table.append(cells)
     return pd.DataFrame(table)
 

@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from unjam.measures.feasibility import overall_feasibility
-from unjam.measures.metric_table import choose_baseline, estimate_cell, with_no_break_spaces
+from unjam.measures.metric_table import choose_baseline, estimate_cell, use_no_break_spaces
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate, metric_estimate, paired_difference
 from unjam.reports.model import error_text
@@ -336,7 +336,7 @@ def _cell_text(cell: Any, digits: int) -> str:
     text = text.replace("\n", " ").replace("|", r"\|")
     if not text.startswith("`"):
         text = re.sub(r",(?=\w+=)", ", ", text)
-    return re.sub(r"\[[^\[\]]*\]", lambda found: with_no_break_spaces(found[0]), text)
+    return re.sub(r"\[[^\[\]]*\]", lambda found: use_no_break_spaces(found[0]), text)
 
 
 def markdown_table(texts: pd.DataFrame) -> str:

@@ -9,7 +9,7 @@ import unjam
 from unjam.drivers.registry import driver_from_name
 from unjam.errors import InputError, invalid_value
 from unjam.scenarios import make_scenario
-from unjam.text import format_count, one_line, printable
+from unjam.text import format_count, printable, to_one_line
 from unjam.training.config import load_config
 from unjam.worlds.reward import make_reward
 
@@ -69,7 +69,7 @@ def test_a_value_of_several_lines_is_shown_on_one() -> None:
 
 
 def test_a_long_text_is_cut_visibly() -> None:
-    assert [one_line(f" a\n{'b' * count}", 6) for count in (4, 5)] == ["a bbbb", "a bbb…"]
+    assert [to_one_line(f" a\n{'b' * count}", 6) for count in (4, 5)] == ["a bbbb", "a bbb…"]
 
 
 @pytest.mark.parametrize(

@@ -15,5 +15,7 @@ def test_names_are_split_at_plus_but_not_within_paths_of_files(tmp_path: Path) -
 
 def test_too_many_names_are_refused_at_once() -> None:
     assert len(split_names("+".join(["pi"] * MAX_NAMES))) == MAX_NAMES
-    with pytest.raises(InputError, match=r"^names: '.{0,60}' and those before it; allowed: at most 100 names$"):
+    with pytest.raises(
+        InputError, match=r"^names: '.{0,60}' and the names before it are not allowed; allowed: at most 100 names$"
+    ):
         split_names("+".join(["pi"] * 100_000))

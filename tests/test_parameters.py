@@ -135,7 +135,7 @@ def test_numbers_are_read_as_written(value: float) -> None:
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"needed": 2**64}, "it.needed: a number of 65 bits is not allowed; allowed: at most 63"),
+        ({"needed": 2**64}, "it.needed: a number of 65 bits is not allowed; allowed: at most 63 bits"),
         ({"needed": 1.0, "inner": {"size": -(2**70)}}, "it.inner.size: a number of 71 bits is not"),
         ({"needed": 1.0, "names": ["a", "b\0"]}, r"it.names: 'b\x00' is not allowed; allowed: a text without NUL"),
     ],

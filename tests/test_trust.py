@@ -19,7 +19,7 @@ from unjam.trust import (
     TRUSTED_VARIABLE,
     check_trusted,
     check_trusted_values,
-    expecting_code,
+    forget_expected_code,
     is_all_code_trusted,
     remember_trusted,
     trusting_code,
@@ -213,7 +213,7 @@ def test_code_that_changes_after_it_was_checked_does_not_run(changed: str, code:
     ran = subprocess.run(command, env=child_environment(), capture_output=True, text=True, check=False)
     assert "InputError: code+1.py: has changed since" in ran.stderr
     assert not canary.exists()
-    with expecting_code():
+    with forget_expected_code():
         pass
     FileReference(code, "late").load_object()()  # its user names it again
     assert canary.exists()

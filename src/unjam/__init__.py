@@ -5,16 +5,16 @@
     print(result.mean["time_to_dissolve"], result.report)
 
 The import registers the environments `unjam/Ring-v0`, `unjam/FigureEight-v0`, `unjam/Merge-v0`, `unjam/OnRamp-v0`,
-`unjam/Recorded-v0` and `unjam/UserNetwork-v0` (your own SUMO network) with Gymnasium; `parallel_env` has several CAVs.
+`unjam/Recorded-v0` and `unjam/UserNetwork-v0` (your own SUMO network) with Gymnasium. `parallel_env` is for PettingZoo.
 
-`drive` compares drivers, `train` learns a residual on an expert, `export_controller` makes a file of it that
-`verify_controller` checks and `load_controller` loads, `run_episode` and `measure` are for one episode.
-The same on the command line, with tuning, calibration and assessment of your own network: `unjam --help`.
+`drive` compares drivers, and `train` learns a residual on an expert. `export_controller` writes a controller into a
+file, `verify_controller` checks it, and `load_controller` loads it. `run_episode` and `measure` are for one episode.
+The command line also tunes experts, and calibrates and assesses your own network: `unjam --help`.
 """
 
 import sys
 
-# `python -m unjam` searches the working folder first, which can be a downloaded one. `unjam` does not.
+# `python -m unjam` imports from the working folder first, which can be a downloaded one; `unjam` does not.
 if sys.argv[:1] == ["-m"] and sys.orig_argv[-len(sys.argv)].endswith("unjam") and not sys.flags.safe_path:
     del sys.path[0]
 
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from unjam.trust import trusting_code
     from unjam.worlds.episode import run_episode
 
-# Imported when first used: workers must stay free of torch, and the command line quick.
+# These are imported at their first use: workers must not import torch, and the command line must start quickly.
 _LAZY_IMPORTS = {
     **{"Driver": "unjam.drivers", "LocalState": "unjam.drivers", "check_driver": "unjam.drivers"},
     **{"make_scenario": "unjam.scenarios", "load_controller": "unjam.controller"},

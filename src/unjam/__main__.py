@@ -1,4 +1,4 @@
-"""`python -m unjam` is `unjam`."""
+"""Run the command line as `python -m unjam`."""
 
 from unjam.cli import main
 

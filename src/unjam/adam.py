@@ -1,4 +1,4 @@
-"""Adam without the compiler that torch would load."""
+"""Adam without the compiler of torch."""
 
 from collections.abc import Callable
 from inspect import unwrap
@@ -10,7 +10,7 @@ _adam = torch.optim.Adam
 
 
 class Adam(_adam):
-    """torch's Adam with identical results, but without its compiler, which takes a second; not for `torch.compile`."""
+    """Adam of torch that does not load the compiler, which takes a second; not for `torch.compile`."""
 
     add_param_group = cast(Callable[..., None], unwrap(_adam.add_param_group))
     zero_grad = cast(Callable[..., None], unwrap(_adam.zero_grad))

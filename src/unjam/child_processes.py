@@ -1,6 +1,6 @@
-"""Start Python child processes that import nothing from the working folder, or from a script's folder.
+"""Start Python child processes that import nothing from the working folder or from the folder of a script.
 
-`python -m` and `python -c` search the working folder first, and that can be a downloaded one.
+`python -m` and `python -c` search the working folder first, which can be a downloaded one.
 """
 
 import os
@@ -16,7 +16,7 @@ from unjam.trust import expected_code_environment
 from unjam.user_code import is_package_folder
 
 PACKAGE_PARENT = str(Path(__file__).parents[1])  # folder from which unjam itself is imported
-DATA_FOLDER = Path(__file__).with_name("controllers")  # without Python modules and settings of libraries
+DATA_FOLDER = Path(__file__).with_name("controllers")  # contains no Python modules and no settings of libraries
 
 
 def python_command(*arguments: str) -> list[str]:
@@ -25,12 +25,12 @@ def python_command(*arguments: str) -> list[str]:
 
 
 def child_environment(**changes: str) -> dict[str, str]:
-    """Return the environment of a child that ends with this process; its own children are isolated too."""
+    """Return the environment of a child that ends with this process; its children are isolated too."""
     return bind_to_parent({**os.environ, **_isolation_variables(), **expected_code_environment(), **changes})
 
 
 def child_import_path() -> list[str]:
-    """Return the folders of `sys.path` that a child may search: not the working folder, nor the script's."""
+    """Return the folders of `sys.path` without the working folder and the folder of the script."""
     script = getattr(sys.modules["__main__"], "__file__", None) or sys.argv[0]
     excluded = {os.path.realpath(os.curdir), os.path.realpath(os.path.dirname(script))}
     return [
@@ -41,55 +41,56 @@ def child_import_path() -> list[str]:
 
 
 def isolate_children() -> None:
-    """Isolate all Python processes that this one starts from now on."""
+    """Isolate all Python processes that this process starts from now on."""
     os.environ.update(_isolation_variables())
 
 
 @contextmanager
 def isolated_start(import_path: Iterable[str]) -> Iterator[None]:
-    """Isolate Python processes that a library starts within the block, and give them this import path."""
-    path, before = sys.path[:], {name: os.environ.get(name) for name in _isolation_variables()}
+    """Isolate Python processes that a library starts within the block, and set their import path."""
+    original_path = sys.path[:]
+    original_variables = {name: os.environ.get(name) for name in _isolation_variables()}
     sys.path[:] = import_path
     isolate_children()
     try:
         yield
     finally:
-        sys.path[:] = path
-        for name, value in before.items():
+        sys.path[:] = original_path
+        for name, value in original_variables.items():
             os.environ.pop(name)
             os.environ.update({} if value is None else {name: value})
 
 
 @contextmanager
-def outside_working_folder() -> Iterator[None]:
-    """Leave the working folder within the block: some libraries read it, or let their processes import from it."""
+def leave_working_folder() -> Iterator[None]:
+    """Change to a safe folder within the block: some libraries read settings or import from the working folder."""
     with chdir(DATA_FOLDER):
         yield
 
 
 class _MatplotlibFinder(MetaPathFinder):
-    """Finds matplotlib and loads it outside the working folder: it would read the `matplotlibrc` there first."""
+    """Loads matplotlib outside the working folder, so that it does not read the `matplotlibrc` there."""
 
     def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
         spec = PathFinder.find_spec(fullname) if fullname == "matplotlib" else None
         if spec is not None and spec.loader is not None:
-            spec.loader.exec_module = outside_working_folder()(spec.loader.exec_module)
+            spec.loader.exec_module = leave_working_folder()(spec.loader.exec_module)
         return spec
 
 
 def isolate_matplotlib() -> None:
-    """Let matplotlib ignore settings in the working folder, if this process has not imported it yet."""
+    """Let matplotlib ignore settings in the working folder; it must not be imported yet."""
     sys.meta_path.insert(0, _MatplotlibFinder())
 
 
 def initialize_pool_process(parent: int) -> None:
-    """Initialize a process of a pool, which ends with its parent."""
+    """Initialize a process of a pool, so that it ends with its parent."""
     follow_parent(parent)
     isolate_matplotlib()
 
 
 def _isolation_variables() -> dict[str, str]:
-    """Return the variables that isolate a Python process: relative folders lie below the working folder."""
+    """Return environment variables that keep the working folder and folders relative to it out of the import path."""
     folders = [folder for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep) if folder]
-    safe = [folder for folder in folders if os.path.isabs(folder) or os.path.abspath(folder) == PACKAGE_PARENT]
-    return {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(map(os.path.abspath, safe))}
+    safe_folders = [folder for folder in folders if os.path.isabs(folder) or os.path.abspath(folder) == PACKAGE_PARENT]
+    return {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(map(os.path.abspath, safe_folders))}

@@ -1,4 +1,4 @@
-"""Errors that a user can cause or correct: one clear line, no traceback, and an exit code of the command line."""
+"""Errors that a user can cause or correct: a message of one line and an exit code, without a traceback."""
 
 import errno
 import shlex
@@ -11,7 +11,7 @@ from unjam.text import spelling_hint
 
 
 class UnjamError(Exception):
-    """An error with a message of one line for users; `exit_code` is that of the command line."""
+    """An error with a message of one line for users; the command line exits with `exit_code`."""
 
     exit_code = 1
 
@@ -23,7 +23,7 @@ class InputError(UnjamError):
 
 
 class RowError(InputError):
-    """An invalid value in a row of CAVs; the loop that drives them adds the name of the CAV and the step."""
+    """An invalid value in a row of CAVs; the driving loop adds the name of the CAV and the control step."""
 
     def __init__(self, message: str, row: int = 0) -> None:
         super().__init__(message)
@@ -45,11 +45,14 @@ EXTRAS = {
     **dict.fromkeys(("onnx", "onnxscript", "onnxruntime"), "train"),
     **{"optuna": "tune", "imageio_ffmpeg": "video", "cryptography": "sign", "pettingzoo": "marl", "ray": "ray"},
 }
-"""extra of unjam that installs each optional package; `drive` and `assess` need none of them"""
+"""extra of unjam that installs each optional package; `drive` and `assess` need no extra"""
 
 
 def missing_package_error(error: ImportError, name: str | None = None) -> MissingPartError:
-    """Return the error for a package of an extra (`name`, or else the error's) or a shared library; raise any other."""
+    """Return the error for a package of an extra or a shared library that cannot be imported; else raise `error`.
+
+    `name` is that of the package; None: the name in `error`.
+    """
     package = (name or error.name or "").partition(".")[0]
     reason = f"cannot be imported ({' '.join(str(error).split())})"
     if package not in EXTRAS:
@@ -62,7 +65,7 @@ def missing_package_error(error: ImportError, name: str | None = None) -> Missin
 
 
 def import_optional(name: str) -> Any:
-    """Return a package of an extra; raise `MissingPartError`, which names the extra, if it cannot be imported."""
+    """Import a package of an extra and return it; raise `MissingPartError`, which names the extra, if this fails."""
     try:
         return import_module(name)
     except ImportError as error:
@@ -80,7 +83,7 @@ class EpisodeError(UnjamError):
 
 
 class SumoInputError(EpisodeError):
-    """SUMO refuses its input files; the message is its reason."""
+    """SUMO refuses its input files; the message is the reason that SUMO gives."""
 
     exit_code = 2
 
@@ -98,14 +101,14 @@ def disk_error(error: OSError, path: object) -> DiskError:
 
 
 def error_from_name(name: str, message: str) -> UnjamError:
-    """Return the error that another process reported; for an unknown class an `UnjamError`."""
+    """Return an error of the class `name`, which another process reported; an `UnjamError` for an unknown class."""
     parents = UnjamError, InputError, EpisodeError
     classes = {error.__name__: error for parent in parents for error in parent.__subclasses__()}
     return classes.get(name, UnjamError)(message)
 
 
 def raise_failure(rows: Sequence[dict[str, Any]]) -> None:
-    """Raise the first failure among the rows of episodes, as the original kind of error."""
+    """Raise the error of the first failed episode among metric rows, with its original class."""
     for row in rows:
         if row["status"] == "failed":
             seed = "" if row["error"] == InputError.__name__ else f" (seed {row['seed']})"
@@ -113,32 +116,32 @@ def raise_failure(rows: Sequence[dict[str, Any]]) -> None:
 
 
 def as_unjam_error(error: Exception) -> UnjamError:
-    """Return any error as an `UnjamError`, to report it to another process."""
+    """Convert any error to an `UnjamError`, to report it to another process."""
     if isinstance(error, OSError) and error.errno in DISK_ERRNOS:
         return disk_error(error, error.filename or "a temporary file")
     if isinstance(error, UnjamError):
         return error
-    line = " ".join(str(error).split())
+    message = " ".join(str(error).split())
     if type(error).__module__.partition(".")[0] in ("libsumo", "traci"):
-        return EpisodeError(f"SUMO cannot go on: {line}")
-    return UnjamError(f"{type(error).__name__}: {line}")
+        return EpisodeError(f"SUMO cannot go on: {message}")
+    return UnjamError(f"{type(error).__name__}: {message}")
 
 
 def invalid_value(field: str, value: object, allowed: str) -> InputError:
-    """Return the error for an invalid value, in the form that all of unjam uses."""
-    shown = " ".join(repr(value).splitlines())  # arrays have several lines
-    return InputError(f"{field}: {shown} is not allowed; allowed: {allowed}")
+    """Return the error for an invalid value, in the common form of messages."""
+    text = " ".join(repr(value).splitlines())  # arrays have several lines
+    return InputError(f"{field}: {text} is not allowed; allowed: {allowed}")
 
 
 def unknown_name(field: str, value: object, names: Iterable[str]) -> InputError:
     """Return the error for a name that is not among `names`, with a suggestion."""
-    known = list(names)
-    return invalid_value(field, value, f"{', '.join(known)}{spelling_hint(value, known)}")
+    known_names = list(names)
+    return invalid_value(field, value, f"{', '.join(known_names)}{spelling_hint(value, known_names)}")
 
 
 @contextmanager
-def naming(prefix: str) -> Iterator[None]:
-    """Let the message of an `InputError` in the block begin with `prefix`."""
+def prefix_errors(prefix: str) -> Iterator[None]:
+    """Put `prefix` before the message of an `InputError` from the block, unless the message begins with it."""
     try:
         yield
     except InputError as error:

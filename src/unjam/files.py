@@ -1,6 +1,6 @@
-"""Write files so that nothing is lost or half-written, and nothing outside is written through a link.
+"""Write files completely or not at all, and never through a link out of a folder.
 
-All of unjam writes, renames and removes through these functions. They raise `InputError` for a link, or for a path
+All of unjam writes, renames and removes files with these functions. They raise `InputError` for a link, or for a path
 through a link inside a protected folder (`unjam.folders`), and `DiskError` if the disk is full or cannot be written.
 """
 
@@ -29,15 +29,15 @@ PACKAGED_PREFIX = "unjam:"  # beginning of the names of controllers and populati
 INVALID_DATA_ERRORS = (
     *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError),
     SafetensorError,
-)  # of reading JSON and arrays that unjam did not write
+)  # raised by reading JSON and arrays that unjam did not write
 UNREADABLE_ERRORS = (*INVALID_DATA_ERRORS, zipfile.BadZipFile, zlib.error, EOFError, MemoryError, RuntimeError)
-"""errors of reading a damaged file; zipfile raises `RuntimeError` for an unknown kind of compression"""
+"""raised by reading a damaged file; zipfile raises `RuntimeError` for an unknown compression"""
 APPEND_FLAGS = os.O_WRONLY | os.O_APPEND | os.O_CREAT  # create a missing file, too
 
 
 @contextmanager
 def reject_damaged(name: str) -> Iterator[None]:
-    """Raise `InputError` if what is read within the block is damaged, or was not written by unjam."""
+    """Raise `InputError` if the block reads data that are damaged or that unjam did not write."""
     try:
         yield
     except UNREADABLE_ERRORS as error:
@@ -46,7 +46,7 @@ def reject_damaged(name: str) -> Iterator[None]:
 
 @contextmanager
 def _disk_errors(path: Path, *extra_errnos: int) -> Iterator[None]:
-    """Raise `DiskError` instead of an `OSError` of the disk, or with one of these error numbers."""
+    """Raise `DiskError` instead of an `OSError` of the disk, or of one with these error numbers."""
     try:
         yield
     except OSError as error:
@@ -56,18 +56,18 @@ def _disk_errors(path: Path, *extra_errnos: int) -> Iterator[None]:
 
 
 def atomic_write(path: Path, content: bytes | str) -> None:
-    """Write a complete file, or keep the previous one: under a temporary name, synced to the disk, then renamed.
+    """Write a complete file, or keep the previous one: write and sync a temporary file, then rename it.
 
-    The rights of the previous file stay.
+    The file has the permissions of the previous one.
     """
-    name, temporary = path.name or ".", f".{secrets.token_hex(8)}.part"  # it cannot be guessed, see `is_leftover`
+    name, temporary = path.name or ".", f".{secrets.token_hex(8)}.part"  # nobody can guess it; see `is_leftover`
     with _disk_errors(path), open_folder(path.parent) as folder:
         folder.check_writable(name)
         try:
             descriptor = folder.create(temporary)
-            if rights := folder.mode(name) & 0o777:
-                with suppress(OSError):  # the file system has none
-                    os.fchmod(descriptor, rights)
+            if permissions := folder.mode(name) & 0o777:
+                with suppress(OSError):  # a file system without permissions
+                    os.fchmod(descriptor, permissions)
             _write_and_sync(descriptor, content)
             folder.rename(temporary, name)
         except OSError:
@@ -77,7 +77,7 @@ def atomic_write(path: Path, content: bytes | str) -> None:
 
 
 def write_new_file(path: Path, content: bytes, mode: int) -> None:
-    """Write a complete new file or none, with this `mode` from its first byte on; `InputError` if it exists."""
+    """Write a complete new file, created with this `mode`, or none; raise `InputError` if it exists."""
     try:
         with _disk_errors(path), open_folder(path.parent) as folder:
             descriptor = folder.create(path.name, mode)
@@ -92,7 +92,7 @@ def write_new_file(path: Path, content: bytes, mode: int) -> None:
 
 
 def is_leftover(path: Path) -> bool:
-    """Return whether a file is an unfinished one, which a killed process has left."""
+    """Return whether a file is an unfinished one of a killed process."""
     return path.name.startswith(".") and path.name.endswith(".part")
 
 
@@ -105,15 +105,15 @@ def _write_and_sync(descriptor: int, content: bytes | str) -> None:
 
 
 def open_in_place(path: Path, flags: int, mode: int = 0o666) -> int:
-    """Open a regular file with flags of `os.open`; `InputError` if one to be written has other names."""
+    """Open a regular file with flags of `os.open`; raise `InputError` for writing a file with several hard links."""
     with open_folder(path.parent) as folder:
         folder.check_writable(path.name)
         descriptor = folder.open(path.name, flags, mode)
-    names = os.fstat(descriptor).st_nlink
-    if names > 1 and flags & (os.O_WRONLY | os.O_RDWR):
+    link_count = os.fstat(descriptor).st_nlink
+    if link_count > 1 and flags & (os.O_WRONLY | os.O_RDWR):
         os.close(descriptor)
-        why = f"has {names} names (hard links), and writing it would change the others"
-        raise InputError(f"file: {str(path)!r} {why}; allowed: a file with one name, such as a copy")
+        reason = f"has {link_count} names (hard links), and writing it would change the others"
+        raise InputError(f"file: {str(path)!r} {reason}; allowed: a file with one name, such as a copy")
     return descriptor
 
 
@@ -130,7 +130,7 @@ def remove(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path, min_age: float = -math.inf) -> None:
-    """Remove unfinished files older than `min_age` [s], which killed processes have left in a folder, if possible."""
+    """Remove unfinished files of killed processes from a folder if possible, and if older than `min_age` [s]."""
     for leftover in filter(is_leftover, [*folder.glob(".*")]):
         with suppress(FileNotFoundError, DiskError):  # another process has just removed it
             if time.time() - leftover.lstat().st_mtime > min_age:
@@ -144,7 +144,7 @@ def remove_if_empty(folder: Path) -> None:
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """Return the objects in a file of JSON lines; damaged lines, or lines cut short by a crash, are left out."""
+    """Return the objects in a file of JSON lines, without damaged lines and lines that a crash has cut short."""
     rows = []
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
         with suppress(ValueError, RecursionError):
@@ -167,7 +167,7 @@ def make_folder(path: Path) -> None:
             if protected_root(absolute) == absolute:
                 path.mkdir(parents=True, exist_ok=True)
             else:
-                with open_folder(absolute, make=True):
+                with open_folder(absolute, create=True):
                     pass
         except OSError:
             if path.is_symlink():
@@ -176,7 +176,7 @@ def make_folder(path: Path) -> None:
 
 
 def claim_folder(folder: Path) -> bool:
-    """Make a folder and its parents; return False if it exists: only one of several processes can claim it."""
+    """Make a folder and its parents for this process alone; return False if the folder exists."""
     make_folder(folder.parent)
     with suppress(OSError):  # the function that writes into it reports the reason
         try:
@@ -192,7 +192,7 @@ def read_json_object(path: Path) -> dict[str, Any]:
         content = parse_json(path.read_bytes())
         if isinstance(content, dict):
             return content
-        reason = "it has no object"
+        reason = "it contains no JSON object"
     except (ValueError, RecursionError) as error:
         reason = str(error)
     raise InputError(f"{path}: the file is damaged: {reason}; allowed: the file as unjam wrote it")
@@ -208,16 +208,16 @@ def parse_json(content: bytes | str) -> Any:
     try:
         return json.loads(
             text,
-            object_pairs_hook=_unique_keys,
-            parse_float=_finite_number,
-            parse_int=_integer_64_bits,
-            parse_constant=_finite_number,
+            object_pairs_hook=_table_with_unique_keys,
+            parse_float=_parse_finite_number,
+            parse_int=_parse_64_bit_integer,
+            parse_constant=_parse_finite_number,
         )
     except RecursionError:
         raise ValueError("it is nested too deep") from None
 
 
-def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _table_with_unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     table = dict(pairs)
     if len(table) < len(pairs):
         ((key, _),) = Counter(key for key, _ in pairs).most_common(1)
@@ -225,13 +225,13 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return table
 
 
-def _finite_number(text: str) -> float:
+def _parse_finite_number(text: str) -> float:
     if not math.isfinite(value := float(text)):
         raise ValueError(f"the number {text[:20]} is not finite")
     return value
 
 
-def _integer_64_bits(text: str) -> int:
+def _parse_64_bit_integer(text: str) -> int:
     if len(text) > MAX_INTEGER_LENGTH or not -(2**63) <= (value := int(text)) < 2**63:
         raise ValueError(f"the integer {text[:20]}... has more than 64 bits")
     return value
@@ -243,43 +243,43 @@ def sha256_of(content: bytes) -> str:
 
 
 def sha256_of_file(path: Path) -> str:
-    """Return the SHA-256 of a file, without reading it into memory as a whole."""
+    """Return the SHA-256 of a file in hexadecimal digits, without reading the complete file into memory."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 class FileWatch:
-    """Notices when the content of files changes, or which they are, so that no result mixes two versions of them."""
+    """Detects files that change, appear or disappear, so that no result mixes two versions of them."""
 
     def __init__(self, list_files: Callable[[], Iterable[Path]]) -> None:
         self._list_files = list_files
-        self._files = {path: (_stamp(path), sha256_of_file(path)) for path in list_files()}
+        self._versions = {path: (_file_stamp(path), sha256_of_file(path)) for path in list_files()}
 
     def check(self) -> None:
-        """Raise `InputError` if a file has changed since the watch began."""
-        changed = [path for path, known in self._files.items() if not _is_unchanged(path, *known)]
-        if changed := changed or sorted(self._files.keys() ^ set(self._list_files())):
+        """Raise `InputError` if a file has changed, appeared or disappeared since the watch began."""
+        changed = [path for path, version in self._versions.items() if not _is_unchanged(path, *version)]
+        if changed := changed or sorted(self._versions.keys() ^ set(self._list_files())):
             raise changed_file_error(changed[0].name)
 
 
 def changed_file_error(name: str) -> InputError:
     """Return the error for a file that has changed while a command ran."""
-    return InputError(f"{name}: has changed since the start; allowed: files that stay as they are")
+    return InputError(f"{name}: has changed since the start; allowed: files that do not change meanwhile")
 
 
 def _is_unchanged(path: Path, stamp: tuple[int, ...], sha256: str) -> bool:
     with suppress(OSError):
-        return _stamp(path) == stamp or sha256_of_file(path) == sha256
+        return _file_stamp(path) == stamp or sha256_of_file(path) == sha256
     return False
 
 
-def _stamp(path: Path) -> tuple[int, ...]:
+def _file_stamp(path: Path) -> tuple[int, ...]:
     status = path.stat()
     return status.st_mtime_ns, status.st_ctime_ns, status.st_size
 
 
 def to_json(value: Any, indent: int | None = None) -> str:
-    """Return `value` as strict JSON: NaN and infinities become null, and arrays lists."""
+    """Return `value` as strict JSON: NaN and infinities become null, and arrays become lists."""
     return json.dumps(_replace_nonfinite(value), indent=indent, allow_nan=False)
 
 
@@ -290,8 +290,8 @@ def _replace_nonfinite(value: Any) -> Any:
         return [_replace_nonfinite(entry) for entry in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    to_list = getattr(value, "tolist", None)  # of NumPy and torch
+    to_list = getattr(value, "tolist", None)  # arrays of NumPy and torch
     if to_list is None:
         return value
     listed = to_list()
-    return _replace_nonfinite(float(value) if type(listed) is type(value) else listed)  # a long double lists itself
+    return _replace_nonfinite(float(value) if type(listed) is type(value) else listed)  # `tolist` keeps long doubles

@@ -1,7 +1,7 @@
-"""Folders that are opened without following links that a stranger may have planted in them.
+"""Open folders without following links that another person may have placed in them.
 
-Links on the way to a folder that the user names are the user's own choice. Inside a protected one no link is followed:
-each part of a path is opened from the handle of its parent, or on Windows checked before.
+Links in the path of a folder that the user names are followed. Inside a protected folder no link is followed: each
+folder of a path is opened relative to the handle of its parent; on Windows it is only checked before.
 """
 
 import json
@@ -14,25 +14,25 @@ from pathlib import Path
 
 from unjam.errors import DiskError, InputError
 
-PROTECTED_FOLDERS_VARIABLE = "UNJAM_PROTECTED_FOLDERS"  # folders that the parent processes protect
+PROTECTED_FOLDERS_VARIABLE = "UNJAM_PROTECTED_FOLDERS"  # variable with the folders of parent processes
 NO_FOLLOW_FLAGS = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
-"""flags of `os.open`: follow no link, and do not wait for a pipe; not every system has all of them"""
+"""flags of `os.open`: follow no link, and do not wait for a pipe; some systems lack some of the flags"""
 FOLDER_FLAGS = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0)
 _protected: list[Path] = []
 
 
 class Folder:
-    """An open folder; its entries are named relative to its handle, None on systems without such handles."""
+    """An open folder; entries are opened relative to `handle`, or by path if the system has no such handles."""
 
     def __init__(self, path: Path, handle: int | None) -> None:
         self.path, self.handle = path, handle
 
     def entry_path(self, name: str) -> str:
-        """Return the name of an entry for a system call with `dir_fd`."""
+        """Return the name of an entry relative to `handle`, for a system call with `dir_fd`, or else its path."""
         return name if self.handle is not None else str(self.path / name)
 
     def mode(self, name: str) -> int:
-        """Return the mode of an entry, of a link itself; 0: there is none."""
+        """Return the mode of an entry, of a link instead of its target; 0: there is no such entry."""
         try:
             return os.stat(self.entry_path(name), dir_fd=self.handle, follow_symlinks=False).st_mode
         except FileNotFoundError:
@@ -55,14 +55,14 @@ class Folder:
 
     @contextmanager
     def enter(self, name: str) -> Iterator["Folder"]:
-        """Open a folder in this one; raise `InputError` if it is a link, or leads out."""
+        """Open a subfolder; raise `InputError` if it is a link or `..`."""
         if name == ".." or stat.S_ISLNK(self.mode(name)):
             raise link_error(self.path / name)
-        with _open_by_name(self.path / name, name, self.handle) as inner:
-            yield inner
+        with _open_by_name(self.path / name, name, self.handle) as subfolder:
+            yield subfolder
 
     def rename(self, source: str, target: str) -> None:
-        """Rename an entry, replace another file of that name, and sync it to the disk."""
+        """Rename an entry, replace the file named `target` if it exists, and sync the folder to the disk."""
         os.replace(self.entry_path(source), self.entry_path(target), src_dir_fd=self.handle, dst_dir_fd=self.handle)
         self.sync()
 
@@ -74,14 +74,14 @@ class Folder:
             os.unlink(self.entry_path(name), dir_fd=self.handle)
 
     def sync(self) -> None:
-        """Sync the names of the entries to the disk; Windows does so itself."""
+        """Sync the names of the entries to the disk; Windows does this itself."""
         if self.handle is not None:
             os.fsync(self.handle)
 
 
 @contextmanager
 def _open_by_name(path: Path, name: Path | str, parent: int | None) -> Iterator[Folder]:
-    """Open a folder by its name in the open folder `parent`, or by its path if that is None."""
+    """Open a folder by its `name` in the folder with the handle `parent`; None: `name` is a path."""
     if os.open not in os.supports_dir_fd:
         yield Folder(path, None)
         return
@@ -93,14 +93,17 @@ def _open_by_name(path: Path, name: Path | str, parent: int | None) -> Iterator[
 
 
 @contextmanager
-def open_folder(path: Path, make: bool = False) -> Iterator[Folder]:
-    """Open a folder, or make a missing protected one; `InputError` for a link, or `..`, inside a protected folder."""
+def open_folder(path: Path, create: bool = False) -> Iterator[Folder]:
+    """Open a folder; raise `InputError` for a link or `..` in its path inside a protected folder.
+
+    `create` makes missing folders inside a protected folder.
+    """
     path = path.absolute()
     root = protected_root(path)
     with ExitStack() as stack:
         folder = stack.enter_context(_open_by_name(root, root, None))
         for name in path.relative_to(root).parts:
-            if make:
+            if create:
                 with suppress(FileExistsError):
                     os.mkdir(folder.entry_path(name), dir_fd=folder.handle)
             folder = stack.enter_context(folder.enter(name))
@@ -108,7 +111,7 @@ def open_folder(path: Path, make: bool = False) -> Iterator[Folder]:
 
 
 def protected_root(path: Path) -> Path:
-    """Return the outermost protected folder that contains an absolute path; else the path itself."""
+    """Return the outermost protected folder that contains an absolute path, or else the path itself."""
     roots = [root for root in protected_folders() if path.is_relative_to(root)]
     return min(roots, key=lambda root: len(root.parts), default=path)
 
@@ -120,7 +123,7 @@ def protected_folders() -> list[Path]:
 
 @contextmanager
 def protect_folder(folder: Path) -> Iterator[None]:
-    """Protect a folder: inside it no link is followed within the block; `InputError` if one of its entries is one."""
+    """Follow no links inside a folder within the block; raise `InputError` if an entry of the folder is a link."""
     with os.scandir(folder) as entries:
         for entry in entries:
             if entry.is_symlink():
@@ -136,14 +139,14 @@ def protect_folder(folder: Path) -> Iterator[None]:
 def reject_unsafe_files(folder: Path) -> None:
     """Raise `InputError` if a folder contains a file that must not be read.
 
-    A pipe, a socket or a device could wait forever; a link out of the folder could name a secret for a report.
+    Reading a pipe, a socket or a device could wait forever. A link could copy a secret from elsewhere into a report.
     """
     root = os.path.realpath(folder)
     for parent, subfolders, names in os.walk(folder):
         for path in (Path(parent) / name for name in (*subfolders, *names)):
             if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(root):
                 raise InputError(f"file: {_short_path(path)!r} is a link out of its folder; allowed: the file itself")
-            with suppress(OSError):  # a broken link, or removed meanwhile
+            with suppress(OSError):  # the link is broken, or the file was removed meanwhile
                 mode = path.stat().st_mode
                 if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
                     raise InputError(f"file: {_short_path(path)!r} is a special file; allowed: regular files")
@@ -151,10 +154,10 @@ def reject_unsafe_files(folder: Path) -> None:
 
 def link_error(path: Path) -> InputError:
     """Return the error for a path that leads out of a folder through a link or `..`."""
-    why = "is a symbolic link or leads out of its folder, so nothing is written there"
-    return InputError(f"file: {_short_path(path)!r} {why}; allowed: a file or folder itself, or a new name")
+    reason = "is a symbolic link or leads out of its folder, so nothing is written there"
+    return InputError(f"file: {_short_path(path)!r} {reason}; allowed: a file or folder itself, or a new name")
 
 
 def _short_path(path: Path) -> str:
-    """Return a path relative to the working folder, if it is inside."""
+    """Return a path inside the working folder relative to it, and other paths unchanged."""
     return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)

@@ -1,10 +1,10 @@
-"""The same bits on every x86-64 machine with AVX2: the kernels with which NumPy and torch compute.
+"""Select kernels of NumPy and torch that compute the same bits on every x86-64 machine with AVX2.
 
-Each kernel rounds in its own way. `pin_kernels` selects those that every processor with AVX2 has, before NumPy is
-imported; `UNJAM_KERNELS=native` changes nothing. docs/training.md says which processors were tested.
+Kernels round differently. `pin_kernels` selects kernels that every processor with AVX2 has, before NumPy is imported;
+with `UNJAM_KERNELS=native` it changes nothing. docs/training.md lists the processors that were tested.
 
-MKL's square roots begin with an estimate that depends on the processor's maker, in every mode: so Adam is fused, and
-square roots of tensors are those of `unjam.physics.arrays`.
+Square roots of MKL depend on the maker of the processor in every mode. Therefore Adam is fused, and
+`unjam.physics.arrays` computes square roots of tensors.
 """
 
 import ctypes
@@ -21,21 +21,21 @@ from typing import Any
 KERNELS_VARIABLE = "UNJAM_KERNELS"
 KERNEL_SETTINGS = {
     "OPENBLAS_CORETYPE": "Haswell",
-    # Threads round products of thousands of rows by the number of cores, and small products only wait for them.
+    # With several threads, products of thousands of rows depend on the number of cores; small products become slower.
     "OPENBLAS_NUM_THREADS": "1",
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
     "ATEN_CPU_CAPABILITY": "avx2",
-    # AVX2 would be valid on Intel's processors alone: on others MKL silently replaces it by COMPATIBLE.
+    # AVX2 has an effect only on processors of Intel: on others MKL silently uses COMPATIBLE.
     "MKL_CBWR": "COMPATIBLE",
 }
-"""NumPy's products and their cores, its functions, torch's functions, its products and long functions"""
+"""environment variables for products of NumPy and their threads, functions of NumPy, functions of torch, and MKL"""
 OLD_NUMPY_FEATURES = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
-"""names of these features in NumPy before 2.4"""
+"""value of NPY_DISABLE_CPU_FEATURES for NumPy before 2.4"""
 KERNEL_LIBRARIES = ("numpy", "torch")
 
 
 def pin_kernels() -> None:
-    """Set the variables, for this process and its children."""
+    """Set the environment variables that select the kernels, for this process and its children."""
     global _unpinned_reason
     requested = os.environ.get(KERNELS_VARIABLE, "")
     if requested not in ("", "native"):
@@ -60,7 +60,7 @@ def needs_new_process() -> bool:
 
 
 def kernel_settings() -> dict[str, str]:
-    """Return the variables for the installed NumPy, which warns of unknown names."""
+    """Return the environment variables for the installed version of NumPy, which warns of unknown features."""
     with suppress(PackageNotFoundError, ValueError):
         if tuple(map(int, version("numpy").split(".")[:2])) < (2, 4):
             return {**KERNEL_SETTINGS, "NPY_DISABLE_CPU_FEATURES": OLD_NUMPY_FEATURES}
@@ -70,20 +70,20 @@ def kernel_settings() -> dict[str, str]:
 def kernel_info() -> dict[str, Any]:
     """Return the processor and the active kernels of the loaded libraries, for manifests."""
     numpy, torch = (sys.modules.get(name) for name in KERNEL_LIBRARIES)
-    core = sys.modules["numpy._core._multiarray_umath"] if numpy else None
+    umath = sys.modules["numpy._core._multiarray_umath"] if numpy else None
     return {
         "processor": processor_info().get("model name", platform.processor() or platform.machine()),
         "pinned": has_pinned_kernels(),
         "unpinned_reason": _unpinned_reason,
         "settings": {name: os.environ.get(name) for name in KERNEL_SETTINGS},
         "openblas": _openblas_core(numpy) if numpy else None,
-        "numpy": [name for name in core.__cpu_dispatch__ if core.__cpu_features__.get(name)] if core else None,
+        "numpy": [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__.get(name)] if umath else None,
         "torch": torch.backends.cpu.get_cpu_capability() if torch else None,
     }
 
 
 def processor_info() -> dict[str, str]:
-    """Return Linux's description of the first processor; empty on other systems."""
+    """Return the description of the first processor by Linux; empty on other systems."""
     with suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
         entries = (line.partition(":") for line in takewhile(lambda line: ":" in line, lines))
         return {name.strip(): value.strip() for name, _, value in entries}
@@ -91,7 +91,7 @@ def processor_info() -> dict[str, str]:
 
 
 def _find_obstacle() -> str | None:
-    """Return why kernels cannot be pinned here; None: they can."""
+    """Return the reason why this machine cannot pin kernels; None if it can."""
     if os.environ.get(KERNELS_VARIABLE) == "native":
         return f"{KERNELS_VARIABLE}=native"
     if platform.machine() not in ("x86_64", "AMD64"):
@@ -102,7 +102,7 @@ def _find_obstacle() -> str | None:
 
 
 def _openblas_core(numpy: Any) -> str | None:
-    """Return the processor for which NumPy's own OpenBLAS has chosen kernels; None: another BLAS."""
+    """Return the processor type for which the OpenBLAS in NumPy has selected kernels; None: another BLAS."""
     for library in (Path(numpy.__file__).parents[1] / "numpy.libs").glob("libscipy_openblas64_*"):
         with suppress(OSError, AttributeError):
             core_name = ctypes.CDLL(str(library)).scipy_openblas_get_corename64_

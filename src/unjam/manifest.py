@@ -17,7 +17,7 @@ RECORDED_PACKAGES = ("libsumo", "eclipse-sumo", "numpy", "torch", "stable-baseli
 
 
 def manifest() -> dict[str, Any]:
-    """Return what is needed to repeat a result that this process makes now."""
+    """Return the versions, machine, commit and command that are needed to repeat a result of this process."""
     return {
         "unjam": __version__,
         "commit": _source_commit(),
@@ -31,7 +31,7 @@ def manifest() -> dict[str, Any]:
 
 
 def strip_folders(command: list[str]) -> list[str]:
-    """Return a command for publication: paths of the machine become names of files."""
+    """Return a command for publication: names of files replace paths of the machine."""
     return [Path(word).name if "/" in word else word for word in command]
 
 
@@ -47,7 +47,7 @@ def package_versions() -> dict[str, str | None]:
 def _source_commit() -> str | None:
     """Return the commit of the source tree, with `+` if it was changed; None outside a checkout."""
     root = Path(__file__).parents[2]
-    if not (root / ".git").exists():  # the settings of another repository can name programs
+    if not (root / ".git").exists():  # git settings of a repository around it could run programs
         return None
     describe = ["git", "describe", "--always", "--abbrev=12", "--dirty=+"]
     try:

@@ -1,7 +1,7 @@
-"""ONNX models of strangers: their allowed content, and their execution with little memory.
+"""Check untrusted ONNX models, and run them with limited memory.
 
-An untrusted model is only data if it is pure arithmetic: ONNX has loops, functions, operators of other domains, and
-tensors in external files. Therefore anything that is not listed here is refused, at any depth.
+ONNX has loops, functions, operators of other domains, and tensors in external files. To allow only arithmetic, all
+content that is not listed here is refused, at any depth.
 """
 
 import logging
@@ -15,7 +15,7 @@ from threading import Timer
 from typing import Any
 
 from unjam.errors import InputError, import_optional, invalid_value
-from unjam.text import one_line
+from unjam.text import to_one_line
 
 _OPERATORS = """
 Abs Add And BatchNormalization Cast Ceil Clip Concat Constant Cos Div Elu Equal Erf Exp Expand Flatten Floor Gather
@@ -26,7 +26,7 @@ Softsign Split Sqrt Squeeze Sub Sum Tan Tanh ThresholdedRelu Transpose Unsqueeze
 """
 ALLOWED_OPERATORS = set(_OPERATORS.split())  # arithmetic, without subgraphs
 VALUE_FIELDS = {"INT": "i", "FLOAT": "f", "STRING": "s", "TENSOR": "t", "INTS": "ints"}  # by attribute type
-REFUSED_ATTRIBUTES = {"value_string", "value_ints", "saturate", "round_mode"}  # no policy needs them
+REFUSED_ATTRIBUTES = {"value_string", "value_ints", "saturate", "round_mode"}  # policies do not need these
 TENSOR_KINDS = "double", "float", "int32", "int64"
 ALLOWED_FIELDS = {
     "ModelProto": {"ir_version", "producer_name", "producer_version", "opset_import", "graph"},
@@ -40,10 +40,10 @@ ALLOWED_FIELDS = {
     "Tensor": {"elem_type", "shape"},
     "TensorShapeProto": {"dim"},
     "Dimension": {"dim_param", "dim_value"},
-}  # all fields that messages of a model may set: no function, subgraph, sparse or external tensor, metadata
+}  # fields that messages of a model may set: no functions, subgraphs, sparse tensors, metadata
 ONNX_DOMAINS = "", "ai.onnx"  # both names of the domain of ONNX itself
 TEXT_FIELDS = {"doc_string", "metadata_props", "model_version", "producer_name", "producer_version", "denotation"}
-"""fields with texts for readers, which change no number"""
+"""fields with texts for readers, which have no effect on numbers"""
 EXPORT_NOTE = "the first axis is the row of the CAV"
 """part of the note in a graph that `unjam export` writes"""
 MAX_MODEL_BYTES = 64 * 2**20
@@ -53,64 +53,64 @@ MAX_RUN_BYTES = 256 * 2**20  # memory of all models that run in this process
 
 
 def parse_model(content: bytes) -> Any:
-    """Return the message of a model, unchecked; raise `InputError` if it cannot be read."""
+    """Parse a model without checking it, and return its protobuf message; raise `InputError` if this fails."""
     if len(content) > MAX_MODEL_BYTES:
         raise InputError(f"graph: {len(content):,} bytes are not allowed; allowed: at most {MAX_MODEL_BYTES:,}")
     onnx = import_optional("onnx")
     try:
         return onnx.load_model_from_string(content)
     except Exception as error:  # protobuf has its own error classes
-        raise InputError(f"graph: cannot be read: {one_line(error)}") from None
+        raise InputError(f"graph: cannot be read: {to_one_line(error)}") from None
 
 
 def remove_texts(message: Any) -> None:
-    """Remove the texts of a message, and of all messages nested in it."""
-    for each, value in message.ListFields():
-        # `onnx.save` states of constants that their data are in the graph.
-        if each.name in TEXT_FIELDS or (each.name == "data_location" and value == message.DEFAULT):
-            message.ClearField(each.name)
-        elif each.message_type is not None:
-            for inner in (value,) if hasattr(value, "ListFields") else value:
-                remove_texts(inner)
+    """Remove the texts of a message and of all messages nested in it."""
+    for field, value in message.ListFields():
+        # `onnx.save` adds to each constant that its data are in the graph.
+        if field.name in TEXT_FIELDS or (field.name == "data_location" and value == message.DEFAULT):
+            message.ClearField(field.name)
+        elif field.message_type is not None:
+            for nested in (value,) if hasattr(value, "ListFields") else value:
+                remove_texts(nested)
 
 
 def check_model(model: Any, size: int, opsets: range, ir_versions: range) -> None:
-    """Raise `InputError` unless a model of `size` bytes has only arithmetic, and these versions of ONNX."""
+    """Raise `InputError` unless a model of `size` bytes has only arithmetic, in these versions of ONNX."""
     _check_fields(model)
     model.DiscardUnknownFields()
     if model.ByteSize() != size:
         raise InputError("graph: it contains bytes that ONNX does not know; allowed: fields of ONNX, each once")
     if model.ir_version not in ir_versions:
         raise invalid_value("graph: ir_version", model.ir_version, f"{ir_versions[0]} to {ir_versions[-1]}")
-    imported = [(entry.domain, entry.version) for entry in model.opset_import]
-    if len(imported) != 1 or imported[0][0] not in ONNX_DOMAINS or imported[0][1] not in opsets:
+    model_opsets = [(entry.domain, entry.version) for entry in model.opset_import]
+    if len(model_opsets) != 1 or model_opsets[0][0] not in ONNX_DOMAINS or model_opsets[0][1] not in opsets:
         allowed = f"[('', {opsets[0]})]" + (f" to [('', {opsets[-1]})]" if len(opsets) > 1 else "")
-        raise invalid_value("graph: opset_import", imported, allowed)
+        raise invalid_value("graph: opset_import", model_opsets, allowed)
     graph = model.graph
-    if fixed := {tensor.name for tensor in graph.initializer} & {tensor.name for tensor in graph.input}:
-        raise invalid_value("graph: initializer", min(fixed), "constants, not inputs")
-    measured = {tensor.name for tensor in graph.input}  # what depends on values of inputs, not on their shapes alone
+    input_dependent = {tensor.name for tensor in graph.input}  # on values of inputs, not only on shapes
+    if constant_inputs := {tensor.name for tensor in graph.initializer} & input_dependent:
+        raise invalid_value("graph: initializer", min(constant_inputs), "constants, not inputs")
     for node in graph.node:
-        _check_node(node, imported[0][1])
-        if node.op_type != "Shape" and measured.intersection(node.input):
-            measured.update(node.output)
-        if node.op_type == "Expand" and measured.intersection(node.input[1:]):
+        _check_node(node, model_opsets[0][1])
+        if node.op_type != "Shape" and input_dependent.intersection(node.input):
+            input_dependent.update(node.output)
+        if node.op_type == "Expand" and input_dependent.intersection(node.input[1:]):
             raise invalid_value("graph: shape of Expand", node.input[1], "one that does not depend on observed values")
 
 
 def _check_fields(message: Any) -> None:
-    """Raise `InputError` if a message, or one nested in it, sets a field that is not allowed."""
+    """Raise `InputError` if a message, or a message nested in it, sets a field that is not allowed."""
     kind = message.DESCRIPTOR.name
     if kind == "TensorProto" and message.data_location != message.DEFAULT:
         allowed = "in the graph, as torch.onnx.export(..., external_data=False) writes it"
         raise invalid_value("graph: data of a constant", "in another file", allowed)
-    for each, value in message.ListFields():
-        if each.name not in ALLOWED_FIELDS.get(kind, ()):
+    for field, value in message.ListFields():
+        if field.name not in ALLOWED_FIELDS.get(kind, ()):
             allowed = ", ".join(sorted(ALLOWED_FIELDS.get(kind, ()))) or "no message of this kind"
-            raise InputError(f"graph: {kind}.{each.name} is not allowed; allowed: {allowed}")
-        if each.message_type is not None:
-            for inner in (value,) if hasattr(value, "ListFields") else value:
-                _check_fields(inner)
+            raise InputError(f"graph: {kind}.{field.name} is not allowed; allowed: {allowed}")
+        if field.message_type is not None:
+            for nested in (value,) if hasattr(value, "ListFields") else value:
+                _check_fields(nested)
     if kind == "TensorProto" and (min(message.dims, default=0) < 0 or prod(message.dims) > MAX_TENSOR_NUMBERS):
         allowed = f"at most {MAX_TENSOR_NUMBERS:,} numbers"
         raise invalid_value(f"graph: shape of constant {message.name!r}", [*message.dims], allowed)
@@ -122,12 +122,12 @@ def _check_node(node: Any, opset: int) -> None:
         operator = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
         raise InputError(f"graph: operator {operator!r} is not allowed; allowed: arithmetic")
     attributes = schemas.get_schema(node.op_type, opset).attributes.items()
-    types = {name: each.type for name, each in attributes if name not in REFUSED_ATTRIBUTES}
+    types = {name: schema.type for name, schema in attributes if name not in REFUSED_ATTRIBUTES}
     types = {name: kind for name, kind in types.items() if kind.name in VALUE_FIELDS}
     seen = set[str]()
     for attribute in node.attribute:
         name, kind = attribute.name, types.get(attribute.name)
-        fields = {each.name for each, _ in attribute.ListFields()}
+        fields = {field.name for field, _ in attribute.ListFields()}
         if kind is None or name in seen or fields != {"name", "type", VALUE_FIELDS[kind.name]}:
             raise invalid_value(f"graph: attribute of {node.op_type}", name, f"{', '.join(types) or 'none'}, each once")
         if attribute.type != kind.value:
@@ -136,14 +136,14 @@ def _check_node(node: Any, opset: int) -> None:
 
 
 def open_session(content: bytes) -> Any:
-    """Return the session of onnxruntime for a checked model, on one thread and with at most `MAX_RUN_BYTES`."""
+    """Return a session of onnxruntime for a checked model, with one thread and at most `MAX_RUN_BYTES`."""
     runtime = import_optional("onnxruntime")
     _limit_memory()
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
     options.add_session_config_entry("session.use_env_allocators", "1")
-    providers, disabled = ["CPUExecutionProvider"], ["ConstantFolding"]  # it would not obey the memory limit
+    providers, disabled = ["CPUExecutionProvider"], ["ConstantFolding"]  # folding ignores the memory limit
     try:
         return runtime.InferenceSession(content, options, providers=providers, disabled_optimizers=disabled)
     except Exception as error:  # the runtime has its own error classes
@@ -151,7 +151,7 @@ def open_session(content: bytes) -> Any:
 
 
 def run_session(session: Any, outputs: list[str] | None, values: dict[str, Any]) -> list[Any]:
-    """Return the outputs (None: all) for the values of the inputs; raise `InputError` if it fails."""
+    """Run a model on the values of its inputs, and return the named outputs (None: all); `InputError` if it fails."""
     try:
         return session.run(outputs, values, _run_options.get())
     except Exception as error:  # the runtime has its own error classes
@@ -159,7 +159,7 @@ def run_session(session: Any, outputs: list[str] | None, values: dict[str, Any])
 
 
 def _run_error(error: Exception) -> InputError:
-    return InputError(f"graph: cannot be run: {one_line(error)}")
+    return InputError(f"graph: cannot be run: {to_one_line(error)}")
 
 
 _run_options: ContextVar[Any] = ContextVar("run_options", default=None)
@@ -167,7 +167,7 @@ _run_options: ContextVar[Any] = ContextVar("run_options", default=None)
 
 @contextmanager
 def time_limit() -> Iterator[None]:
-    """Within the context, end all runs of models after `MAX_TRIAL_SECONDS` together, with `InputError`."""
+    """Raise `InputError` if all runs of models within the block take more than `MAX_TRIAL_SECONDS` together."""
     options = import_optional("onnxruntime").RunOptions()
     timer = Timer(MAX_TRIAL_SECONDS, setattr, (options, "terminate", True))
     timer.daemon = True
@@ -178,7 +178,7 @@ def time_limit() -> Iterator[None]:
     except InputError:
         if options.terminate:
             reason = f"it has not answered within {MAX_TRIAL_SECONDS:g} s of trial runs"
-            raise InputError(f"graph: {reason}; allowed: a policy that answers at once") from None
+            raise InputError(f"graph: {reason}; allowed: a policy that answers within milliseconds") from None
         raise
     finally:
         _run_options.reset(token)
@@ -187,7 +187,7 @@ def time_limit() -> Iterator[None]:
 
 @cache
 def _limit_memory() -> None:
-    """Register the memory that all sessions of this process share."""
+    """Register the limited memory that all sessions of this process share."""
     runtime = import_optional("onnxruntime")
     memory = runtime.OrtMemoryInfo("Cpu", runtime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, runtime.OrtMemType.DEFAULT)
     grow_as_requested = 1
@@ -197,7 +197,7 @@ def _limit_memory() -> None:
 
 @contextmanager
 def quiet_onnx_export() -> Iterator[None]:
-    """Silence what torch logs while it exports a graph: optional packages that it does not find."""
+    """Silence messages of torch about missing optional packages while it exports a graph."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

@@ -1,11 +1,11 @@
-"""What other installed packages add to unjam through entry points of their metadata.
+"""Load commands and presets that other installed packages add to unjam as entry points.
 
-The groups, with what an entry point of each names:
+Groups of entry points:
 
-- `unjam.commands`: `NAME = "module:function"`, the function of the command `unjam NAME`, with typer's annotations.
-- `unjam.presets`: `NAME = "module:mapping"`, changes to the run configuration by the name of the preset.
+- `unjam.commands`: `NAME = "module:function"`, the function of the command `unjam NAME`, with annotations of typer.
+- `unjam.presets`: `NAME = "module:mapping"`, a mapping from names of presets to changes of the run configuration.
 
-The studies of the paper (`unjam_paper`) are such a package. Its metadata is that of unjam itself.
+The studies of the paper (`unjam_paper`) are such a package, with entry points in the metadata of unjam.
 """
 
 import logging
@@ -18,12 +18,12 @@ PluginGroup = Literal["unjam.commands", "unjam.presets"]
 
 
 def plugin_names(group: PluginGroup) -> list[str]:
-    """Return the names of the entry points of a group, sorted; none of them is imported."""
+    """Return the sorted names of the entry points of a group, without importing them."""
     return sorted({point.name for point in entry_points(group=group)})
 
 
 def load_plugins(group: PluginGroup, *names: str) -> dict[str, Any]:
-    """Return the objects of a group by name, all or `names`; a broken one is left out, with a warning."""
+    """Return the objects of a group by name, all or only `names`; warn of entry points that cannot be loaded."""
     loaded: dict[str, Any] = {}
     for point in sorted(entry_points(group=group)):
         if not names or point.name in names:

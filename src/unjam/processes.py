@@ -1,4 +1,4 @@
-"""Processes that end with their parent, and folders that only one process at a time can write."""
+"""Processes that end with their parent, and locks of folders for one process at a time."""
 
 import atexit
 import ctypes
@@ -24,26 +24,26 @@ from unjam.files import open_in_place, remove
 from unjam.folders import PROTECTED_FOLDERS_VARIABLE, protect_folder, protected_folders
 from unjam.sandbox import confine_process, limit_resources
 
-PARENT_VARIABLE = "UNJAM_PARENT"  # environment variable with the id of the process with which a child ends
-TRACI_VARIABLES = "LIBSUMO_AS_TRACI", "LIBTRACI_AS_TRACI"  # replace traci by a library that prints this
+PARENT_VARIABLE = "UNJAM_PARENT"  # variable with the id of the parent, with which a child ends
+TRACI_VARIABLES = "LIBSUMO_AS_TRACI", "LIBTRACI_AS_TRACI"  # with them traci is replaced by a library that prints so
 LOCK_FILE = ".lock"  # the file that locks a folder for its writer
-HEARTBEAT_INTERVAL, MAX_MISSED_HEARTBEATS = 10.0, 6  # of a folder's owner [s], and how many it may miss
+HEARTBEAT_INTERVAL, MAX_MISSED_HEARTBEATS = 10.0, 6  # of the owner of a folder [s], and how many may be missing
 PRIVATE_FOLDER_PREFIX, PRIVATE_LOCK_FILE = "unjam-", ".temporary"
-"""beginning of the names of private temporary folders, and the file that locks one for its process"""
+"""beginning of the names of private temporary folders, and the file that locks such a folder for its process"""
 PR_SET_PDEATHSIG = 1  # Linux's option of prctl
-MAX_CHILD_MEMORY, MAX_CHILD_TIME = 8 * 2**30, 600  # limits of reading an untrusted file [bytes, s]
+MAX_CHILD_MEMORY, MAX_CHILD_TIME = 8 * 2**30, 600  # for reading an untrusted file [bytes, s]
 _is_command_line = False
 
 
 def bind_to_parent(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment of a process of unjam that ends with this one, and protects the same folders."""
-    kept = {name: value for name, value in environment.items() if name not in TRACI_VARIABLES}
+    """Return the environment of a child of unjam that ends with this process, and protects the same folders."""
+    variables = {name: value for name, value in environment.items() if name not in TRACI_VARIABLES}
     folders = json.dumps(list(map(str, protected_folders())))
-    return {**kept, PROTECTED_FOLDERS_VARIABLE: folders, PARENT_VARIABLE: str(os.getpid())}
+    return {**variables, PROTECTED_FOLDERS_VARIABLE: folders, PARENT_VARIABLE: str(os.getpid())}
 
 
 def mark_as_command_line() -> None:
-    """Mark this process as the command line, whose standard output is for results alone."""
+    """Mark this process as the command line, which prints only results on standard output."""
     global _is_command_line
     _is_command_line = True
     for name in TRACI_VARIABLES:
@@ -51,18 +51,18 @@ def mark_as_command_line() -> None:
 
 
 def redirect_user_output() -> AbstractContextManager[object]:
-    """Return a context for loading code of users: the command line sends its output to standard error."""
+    """Return a context for code of users: in the command line its output goes to standard error."""
     return redirect_stdout(sys.stderr) if _is_command_line else nullcontext()
 
 
 class ForkGuard(AbstractContextManager[None]):
-    """Ends a fork that users' code makes within the block, where it would go on with the episode of this process."""
+    """Ends forks made by code of users at the end of the block, where they would continue the episode."""
 
     def __enter__(self) -> None:
-        self._process = os.getpid()
+        self._process_id = os.getpid()
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        if os.getpid() == self._process:
+        if os.getpid() == self._process_id:
             return
         code = error.code if isinstance(error, SystemExit) else int(error is not None)
         for stream in (sys.stdout, sys.stderr):
@@ -71,20 +71,20 @@ class ForkGuard(AbstractContextManager[None]):
 
 
 def exit_with_parent(signum: int) -> None:
-    """Let Linux signal this process, even a busy one, when its parent ends, if the parent used `bind_to_parent`."""
+    """Let Linux send this process a signal when its parent ends, if the parent used `bind_to_parent`."""
     parent = os.environ.pop(PARENT_VARIABLE, "")
     if not parent or sys.platform != "linux":
         return
-    with suppress(OSError, AttributeError):  # a C library without it
+    with suppress(OSError, AttributeError):  # a C library without prctl
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signum, 0, 0, 0)
-    if _has_ended(int(parent)):  # before this process asked for the signal
+    if _has_ended(int(parent)):  # it ended before the call of prctl
         os.kill(os.getpid(), signum)
 
 
 def _has_ended(process: int) -> bool:
-    """Return whether a process has ended, even if its own parent has not yet asked for its exit code."""
+    """Return whether a process has ended, even if its parent has not yet read the exit code."""
     try:
-        with suppress(PermissionError):  # it is of another user
+        with suppress(PermissionError):  # a process of another user
             os.kill(process, 0)
         return Path(f"/proc/{process}/stat").read_text().rpartition(") ")[2][:1] in ("Z", "X")
     except (ProcessLookupError, OverflowError):
@@ -94,7 +94,7 @@ def _has_ended(process: int) -> bool:
 
 
 def follow_parent(parent: int) -> None:
-    """Let this child end when its parent does; the parent alone handles interrupts of the terminal."""
+    """Let this child end with its parent; only the parent handles interrupts from the terminal."""
     os.environ[PARENT_VARIABLE] = str(parent)
     exit_with_parent(signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -102,24 +102,24 @@ def follow_parent(parent: int) -> None:
 
 @contextmanager
 def capture_stderr(path: Path) -> Iterator[None]:
-    """Write the standard error of this process, its libraries included, to a file within the block."""
-    before, descriptor = os.dup(2), open_in_place(path, os.O_WRONLY | os.O_CREAT)
+    """Write the standard error of this process and its libraries to a file within the block."""
+    original_stderr, descriptor = os.dup(2), open_in_place(path, os.O_WRONLY | os.O_CREAT)
     os.ftruncate(descriptor, 0)
     os.dup2(descriptor, 2)
     os.close(descriptor)
     try:
         yield
     finally:
-        os.dup2(before, 2)
-        os.close(before)
+        os.dup2(original_stderr, 2)
+        os.close(original_stderr)
 
 
 def continue_in_limited_child(description: str, *writable: Path) -> None:
-    """Continue in a child with limited resources, which reads untrusted files; this process waits for it.
+    """Continue in a child with limited resources, to read untrusted files, while this process waits for the child.
 
     If the kernel supports it, the child can write only into the folders `writable`, and has no network. On Windows
-    nothing changes. This process exits with the child's code, or raises `InputError` if the child took too much memory
-    or time, or crashed.
+    there is no child. This process exits with the code of the child, or raises `InputError` if the child took too much
+    memory or time, or crashed.
     """
     if not hasattr(os, "fork"):
         return
@@ -128,7 +128,7 @@ def continue_in_limited_child(description: str, *writable: Path) -> None:
     parent = os.getpid()
     child = os.fork()
     if child == 0:
-        atexit.unregister(shutil.rmtree)  # this process removes temporary folders of libraries, such as matplotlib's
+        atexit.unregister(shutil.rmtree)  # the parent removes temporary folders of libraries, such as matplotlib
         follow_parent(parent)
         limit_resources(MAX_CHILD_MEMORY, MAX_CHILD_TIME)
         confine_process(*writable)
@@ -146,7 +146,7 @@ def continue_in_limited_child(description: str, *writable: Path) -> None:
 
 
 def kernel_protections() -> list[str]:
-    """Return the protections that the kernel offers for reading untrusted files; tested in a child."""
+    """Test in a child how the kernel can restrict it, and return the available protections."""
     if sys.platform != "linux":
         return []
     with tempfile.TemporaryDirectory() as folder:
@@ -172,10 +172,10 @@ def has_display() -> bool:
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Lock an existing folder for this process; `InputError` if another one has, or if an entry is a link.
+    """Lock an existing folder for this process; raise `InputError` if it is locked already, or if an entry is a link.
 
-    If machines share a folder but not its locks, the age of the lock shows that an owner elsewhere is alive. On
-    Windows there is no lock. Within the block neither this process nor its children follow links inside the folder.
+    If machines share a folder but not its locks, heartbeats in the lock file show that its owner is alive. On Windows
+    there is no lock. Within the block neither this process nor its children follow links inside the folder.
     """
     with protect_folder(folder), lock_file(folder / LOCK_FILE, f"run: {str(folder)!r}"):
         yield
@@ -183,10 +183,10 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def lock_file(path: Path, target: str) -> Iterator[None]:
-    """Lock what messages call `target` for this process, by a file that exists meanwhile; else as `lock_folder`."""
+    """Lock `target`, its name in messages, for this process by a file within the block; see `lock_folder`."""
     with ExitStack() as stack:
         descriptor = _open_locked(path, target)
-        while descriptor is not None and not _is_same_file(path, descriptor):  # its owner has just removed it
+        while descriptor is not None and not _is_same_file(path, descriptor):  # the previous owner has just removed it
             os.close(descriptor)
             descriptor = _open_locked(path, target)
         if descriptor is not None:
@@ -194,22 +194,22 @@ def lock_file(path: Path, target: str) -> Iterator[None]:
             _check_other_machine(descriptor, target)
             os.pwrite(descriptor, f"{platform.node()} {os.getpid()}\n".ljust(300).encode(), 0)
             stop = threading.Event()
-            heart = threading.Thread(target=_send_heartbeats, args=(descriptor, stop), daemon=True)
-            heart.start()
-            stack.callback(remove, path)  # the last of these is called first
-            stack.callback(heart.join)
+            heartbeat_thread = threading.Thread(target=_send_heartbeats, args=(descriptor, stop), daemon=True)
+            heartbeat_thread.start()
+            stack.callback(remove, path)  # callbacks run in reverse order
+            stack.callback(heartbeat_thread.join)
             stack.callback(stop.set)
         yield
 
 
 def _send_heartbeats(descriptor: int, stop: threading.Event) -> None:
     while not stop.wait(HEARTBEAT_INTERVAL):
-        with suppress(OSError):  # a disk that is temporarily unavailable
+        with suppress(OSError):  # the disk is temporarily unavailable
             os.utime(descriptor)
 
 
 def _check_other_machine(descriptor: int, target: str) -> None:
-    """Raise `InputError` if a process of another machine has locked the file and is alive."""
+    """Raise `InputError` if a living process of another machine has locked the file."""
     owner = _recent_owner(descriptor)
     if owner and owner[0] != platform.node():
         allowed = f"one at a time, or {MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL:g} s after its end"
@@ -217,27 +217,27 @@ def _check_other_machine(descriptor: int, target: str) -> None:
 
 
 def _recent_owner(descriptor: int) -> list[str]:
-    """Return machine and process that have locked a file; empty if they have sent no recent heartbeat."""
+    """Return the machine and process id of the owner of a lock file; empty without a recent heartbeat."""
     age = time.time() - os.fstat(descriptor).st_mtime
     is_recent = abs(age) < MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL
     return os.pread(descriptor, 300, 0).decode(errors="replace").split() if is_recent else []
 
 
 def _check_this_machine(descriptor: int, target: str) -> None:
-    """Raise `InputError` if a living process of this machine has named itself in a file that cannot be locked."""
+    """Raise `InputError` if a living process of this machine owns a file on a file system without locks."""
     owner = _recent_owner(descriptor)
     if len(owner) == 2 and owner[0] == platform.node() and owner[1].isdecimal() and not _has_ended(int(owner[1])):
         raise InputError(f"{target} is being written by another process; allowed: one at a time")
 
 
 def check_owner(owner: int, name: str) -> None:
-    """Raise `LostWorkerError` in a fork of the process `owner`: both would read each other's answers."""
+    """Raise `LostWorkerError` in a fork of the process `owner`: each would read the answers for the other."""
     if os.getpid() != owner:
         raise LostWorkerError(f"{name} belongs to another process (os.fork); allowed: to open one after the fork")
 
 
 class PrivateFolder(AbstractContextManager[str]):
-    """A temporary folder, removed at the end of its process, or by a later one if that is killed."""
+    """A temporary folder that its process removes at its end, or a later process if the first is killed."""
 
     def __init__(self) -> None:
         self.name = tempfile.mkdtemp(prefix=PRIVATE_FOLDER_PREFIX)
@@ -245,7 +245,7 @@ class PrivateFolder(AbstractContextManager[str]):
         if lock is not None:
             os.write(lock, _folder_identity(Path(self.name)))
         self.cleanup = finalize(self, _remove_private_folder, Path(self.name), lock, os.getpid())
-        """removes it; may be called twice, and has no effect in a fork of its process"""
+        """removes the folder; may be called twice, and has no effect in a fork"""
 
     def __enter__(self) -> str:
         return self.name
@@ -264,29 +264,29 @@ def _remove_private_folder(folder: Path, lock: int | None, process: int) -> None
 
 @cache
 def remove_stale_private_folders() -> None:
-    """Remove this user's private folders of processes that were killed, once in a process."""
+    """Remove private folders of killed processes of this user; calls after the first have no effect."""
     for folder in Path(tempfile.gettempdir()).glob(f"{PRIVATE_FOLDER_PREFIX}*"):
-        with suppress(OSError, AttributeError, InputError):  # Windows has no users; it is locked
+        with suppress(OSError, AttributeError, InputError):  # Windows has no getuid; the folder is locked
             status, lock = folder.lstat(), folder / PRIVATE_LOCK_FILE
             is_old = time.time() - status.st_mtime >= MAX_MISSED_HEARTBEATS * HEARTBEAT_INTERVAL
-            is_own = status.st_uid == os.getuid() and stat.S_ISDIR(status.st_mode) and lock.is_file()
-            if is_old and is_own and (descriptor := _open_locked(lock, needs_lock=True)) is not None:
+            is_private = status.st_uid == os.getuid() and stat.S_ISDIR(status.st_mode) and lock.is_file()
+            if is_old and is_private and (descriptor := _open_locked(lock, needs_lock=True)) is not None:
                 with suppress(DiskError):
-                    if os.pread(descriptor, 100, 0) == _folder_identity(folder):  # else another program made it
+                    if os.pread(descriptor, 100, 0) == _folder_identity(folder):  # not of another program
                         remove(folder)
                 os.close(descriptor)
 
 
 def _folder_identity(folder: Path) -> bytes:
-    """Return the identity of a folder, which no copy of it has."""
+    """Return the identity of a folder, which differs from that of its copies."""
     status = folder.lstat()
     return f"unjam {status.st_dev} {status.st_ino}".encode()
 
 
 def check_not_locked(folder: Path) -> None:
-    """Raise `InputError` if a process has locked a folder; its lock is only read, never written or made."""
+    """Raise `InputError` if a process has locked a folder; the lock file is only read."""
     path, target = folder / LOCK_FILE, f"run: {str(folder)!r}"
-    with suppress(OSError):  # there is no lock, or it cannot be read
+    with suppress(OSError):  # the lock is missing or cannot be read
         is_file = stat.S_ISREG(path.lstat().st_mode)
         if not is_file or (descriptor := _open_locked(path, target, is_shared=True)) is None:
             return
@@ -306,7 +306,10 @@ def is_locked(folder: Path) -> bool:
 
 
 def _open_locked(path: Path, target: str = "", is_shared: bool = False, needs_lock: bool = False) -> int | None:
-    """Return an open and locked file; None on a platform, and with `needs_lock` on a file system, without locks."""
+    """Open and lock a file, and return its descriptor; None if the platform has no locks.
+
+    On a file system without locks the file is not locked; with `needs_lock` None is returned.
+    """
     try:
         import fcntl
     except ImportError:
@@ -330,7 +333,7 @@ def _open_locked(path: Path, target: str = "", is_shared: bool = False, needs_lo
 
 
 def _is_same_file(path: Path, descriptor: int) -> bool:
-    """Return whether an open file still has that name."""
+    """Return whether `path` still names an open file."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(descriptor))
     except FileNotFoundError:

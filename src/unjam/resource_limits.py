@@ -1,4 +1,4 @@
-"""Python functions that read untrusted files in a resource-limited subprocess, the command line."""
+"""Read untrusted files in a resource-limited subprocess, which runs the command line."""
 
 import json
 import subprocess
@@ -17,17 +17,17 @@ def verify_controller(
 ) -> list[PartCheck]:
     """Return the check of each part of a `.unjam` file or a run folder; only trusted code runs.
 
-    Each is `checked`, `absent`, or `stated` by the maker alone; no part that is there is left unchecked. As in `unjam
-    verify`, a subprocess with little memory and time reads it, if possible without writing and network.
+    A part is `checked`, `absent`, or only `stated` by its author. As in `unjam verify`, a subprocess with limited
+    memory and time reads the file, without writing and network if the system can block them.
 
     Args:
         path: the file, or the folder.
         trust_code: whether Python code that a run folder names may run.
-        signer: file of the public key that must have signed it; None: any signature or none.
+        signer: file of the public key of the required signer; None: any signature or none.
 
     Raises:
-        InputError: the first problem, in one line; also code that is not trusted, or a missing signature of `signer`.
-        MissingPartError: a part could not be checked, as a package is not installed.
+        InputError: the first failed check, code that is not trusted, or a missing signature of `signer`.
+        MissingPartError: a part could not be checked because a package is not installed.
     """
     if not isinstance(trust_code, bool):
         raise invalid_value("trust_code", trust_code, "True or False")
@@ -41,7 +41,7 @@ def verify_controller(
 def write_report(folders: Sequence[Path | str], target: Path | str) -> Path:
     """Write the report of one folder of results, or a comparison of several; return its path.
 
-    As in `unjam report`, a subprocess reads the folders, which can write only into the folder of `target`. Raise
+    As in `unjam report`, a subprocess reads the folders; it can write only into the folder of `target`. Raise
     `InputError` if a folder holds no results or is being written, `DiskError` if the page cannot be written.
     """
     _run_json_command("report", "--out", str(target), "--", *map(str, folders))
@@ -49,7 +49,7 @@ def write_report(folders: Sequence[Path | str], target: Path | str) -> Path:
 
 
 def _run_json_command(name: str, *arguments: str) -> Any:
-    """Return the JSON output of a command of the command line; raise its error if it fails."""
+    """Run a command with `--json` and return its output; raise its error if it fails."""
     command = python_command("-m", "unjam", name, "--json", *arguments)
     process = subprocess.run(command, capture_output=True, text=True, env=child_environment(), check=False)
     if process.returncode == 0:

@@ -1,10 +1,10 @@
 """The family of roads on which one controller is trained and evaluated, divided into training and unseen roads.
 
-Each road draws its size, its human drivers and their noise from the seed. Unseen are whole axes (a density, a
-number of vehicles, human drivers, a demand, a radius) and new combinations of training values; the division was
-fixed before anything was trained or tuned on these roads. Noisy sensors, long actuator delays and calibrated
-populations were added last, as unseen roads. Each road is the scenario `family/NAME`; this module imports nothing of
-unjam, because `import unjam` registers the roads as environments.
+Each road draws its size, its human drivers and their noise from the seed. Unseen roads have a value outside of the
+training values (of density, number of vehicles, human drivers, demand or radius) or a new combination of training
+values. This division was fixed before anything was trained or tuned on these roads. Roads with noisy sensors, long
+actuator delays and calibrated populations were added last, as unseen roads. Each road is the scenario `family/NAME`.
+This module imports nothing of unjam, because `import unjam` registers the roads as environments.
 """
 
 from dataclasses import dataclass, field
@@ -13,24 +13,24 @@ from typing import Any, Literal
 FamilyPart = Literal["training", "combination", "axis"]
 FAMILY_PREFIX = "family/"  # beginning of the names of the family's roads as scenarios
 
-SHORT_WARM_UP, LONG_WARM_UP = 750, 6000  # human-only simulation steps: a wave begins, or is fully developed
+SHORT_WARM_UP, LONG_WARM_UP = (750, 6000)  # human-only simulation steps: a wave begins, or is fully developed
 AGGRESSIVE_IDM = {"time_headway": 0.9, "max_acceleration": 1.3, "comfortable_deceleration": 2.0}
-"""human drivers that follow closer and accelerate harder than the paper's"""
+"""human drivers that follow closer and accelerate harder than those of the paper"""
 NGSIM_IDM = {
     **{"desired_speed": 17.49, "time_headway": 1.355, "minimum_gap": 2.157},
     **{"max_acceleration": 1.243, "comfortable_deceleration": 1.424},
 }
-"""the common IDM of the 325 drivers of the NGSIM pairs, results/field.json"""
+"""IDM parameters fitted to all 325 drivers of the NGSIM pairs together, from results/field.json"""
 NO_LATENCY, LATENCY, LONG_LATENCY = {"lag": 0.0, "delay": 0.0}, {"lag": 0.3, "delay": 0.2}, {"lag": 0.5, "delay": 0.5}
 """lag and delay of actuators [s]: of ideal vehicles, usual cars and slow cars"""
 IDEAL_VEHICLES: dict[str, Any] = {"actuator": NO_LATENCY}
-"""vehicles that obey at once: roads of the family keep them, except those with `delayed` or `delay` in their name"""
+"""vehicles that obey at once, on all roads of the family without `delayed` or `delay` in their name"""
 SENSOR_ERRORS = {"gap_error": 0.5, "speed_error": 0.3}
 NOISY_SENSORS: dict[str, Any] = {"sensors": {**SENSOR_ERRORS, "dropout": 0.1}, "safety": SENSOR_ERRORS}
-"""sensors with errors that lose a tenth of the readings; the safety filter allows for the errors"""
+"""sensors with errors, which lose a tenth of the readings; the safety filter accounts for the errors"""
 NGSIM_DRIVERS: dict[str, Any] = {"population": "unjam:ngsim"}
 ASTAZERO_DRIVERS: dict[str, Any] = {"population": "unjam:astazero"}
-"""populations of recorded drivers; on the on-ramp with a demand that they can serve"""
+"""populations of recorded drivers; on the on-ramp the demand is adapted to their capacity"""
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class FamilyRoad:
     scenario: str
     options: dict[str, Any] = field(default_factory=dict)
     part: FamilyPart = "training"
-    """`training` also covers tuning; unseen: a new `combination` of training values, or a whole `axis`"""
+    """`training`, also for tuning; or unseen: a `combination` of training values, or a new value on an `axis`"""
 
 
 def ring_options(
     vehicles: int, cavs: int, warmup: int, spacing: tuple[float, float] = (10.0, 12.27), **extra: Any
 ) -> dict[str, Any]:
-    """Return the options of a ring of ideal vehicles; `spacing`: road length per vehicle [m], the paper's."""
+    """Return the options of a ring of ideal vehicles; `spacing` is the range of road length per vehicle [m]."""
     length = [round(vehicles * length_per_vehicle) for length_per_vehicle in spacing]
     return {"vehicles": vehicles, "cavs": cavs, "warmup": warmup, "length": length, **IDEAL_VEHICLES, **extra}
 
@@ -97,6 +97,6 @@ FAMILY: dict[str, FamilyRoad] = {
 }
 FAMILY_SCENARIOS = {f"{FAMILY_PREFIX}{name}": road for name, road in FAMILY.items()}  # roads by name of their scenario
 GROUP_BY_SCENARIO = {"ring": "rings", "figure-eight": "figure-eights", "on-ramp": "motorways", "on-ramp-1": "motorways"}
-"""group of roads of each scenario, for which one expert exists"""
-SHARED_RINGS_GROUP, ALL_ROADS_GROUP = "shared-rings", "all-roads"  # rings with several CAVs; all roads
+"""group of the roads of each scenario; one expert is tuned for each group"""
+SHARED_RINGS_GROUP, ALL_ROADS_GROUP = "shared-rings", "all-roads"  # rings with several CAVs, and all roads
 ROAD_GROUPS = (*dict.fromkeys(GROUP_BY_SCENARIO.values()), SHARED_RINGS_GROUP, ALL_ROADS_GROUP)

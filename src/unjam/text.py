@@ -1,4 +1,4 @@
-"""Text for users: counts, durations, lists of names, and texts of strangers without hidden characters."""
+"""Text for users: counts, durations, lists of names, and untrusted texts without hidden characters."""
 
 import re
 from collections.abc import Iterable
@@ -10,17 +10,17 @@ INVISIBLE_LETTERS = {
     *"\u034f\u115f\u1160\u17b4\u17b5\u2800\u3164\uffa0",
     *map(chr, (*range(0x180B, 0x1810), *range(0xFE00, 0xFE10), *range(0xE0100, 0xE01F0))),
 }
-"""letters and marks that are not shown, although Unicode does not count them as control characters"""
+"""invisible letters and marks that Unicode does not count as control characters"""
 
 
-def one_line(value: object, length: int = 200) -> str:
-    """Return a text of a stranger without control characters on one line, cut to `length` letters with `…`."""
+def to_one_line(value: object, length: int = 200) -> str:
+    """Return an untrusted text on one line without control characters, cut with `…` to `length` characters."""
     text = printable(" ".join(str(value).split()))
     return text if len(text) <= length else f"{text[: length - 1]}…"
 
 
 def printable(text: str) -> str:
-    """Return a text with `?` for characters that move the cursor, turn the direction of text or are invisible."""
+    """Replace characters that move the cursor, change the direction of text, or are invisible by `?`."""
     letters = set(text) - {"\n"}
     hidden = {letter for letter in letters if not letter.isprintable() and category(letter) != "Zs"}
     hidden |= letters & INVISIBLE_LETTERS
@@ -28,7 +28,7 @@ def printable(text: str) -> str:
 
 
 def format_count(count: float, noun: str, plural: str = "") -> str:
-    """Return a number with its noun: `1 file`, `2,000 files`; `plural` is for a noun with an irregular one."""
+    """Return a number with its noun: `1 file`, `2,000 files`; `plural` is for a noun with an irregular plural."""
     return f"{count:,.0f} {noun if count == 1 else plural or f'{noun}s'}"
 
 
@@ -46,11 +46,11 @@ def shorten_list(names: Iterable[str], max_names: int = MAX_LISTED_NAMES, max_le
 
 
 def split_label(label: str) -> list[str]:
-    """Return the parts of a name between which a line may break besides spaces: after punctuation."""
+    """Split a name after punctuation, where a line may break in addition to spaces."""
     return re.split(r"(?<=[:,=/_-])", label)
 
 
 def spelling_hint(value: object, names: Iterable[str], similarity: float = 0.6) -> str:
-    """Return `; did you mean 'ring'?`, or an empty text if no name is similar; a `similarity` of 1 is equality."""
-    close = get_close_matches(str(value), list(names), 1, similarity)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    """Return `; did you mean 'ring'?`, or an empty text if no name has the `similarity`, where 1 means equal."""
+    matches = get_close_matches(str(value), list(names), 1, similarity)
+    return f"; did you mean {matches[0]!r}?" if matches else ""

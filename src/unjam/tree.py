@@ -1,8 +1,8 @@
 """Convert records to JSON and arrays, and back: the format of files and of messages to workers.
 
-A tree is made of dataclasses, named tuples, dicts, tuples and lists; its leaves are arrays, paths and plain values.
-`unpack` restores it by the declared types of its records; where that is the base of several classes, the name of the
-class is stored as `kind`. Nothing is ever executed, and what does not fit the declared types is refused.
+A tree consists of dataclasses, named tuples, dicts, tuples and lists; its leaves are arrays, paths and plain values.
+`unpack` restores a tree by the declared types of its records. If a declared type is the base of several classes, the
+name of the class is stored as `kind`. No code is executed, and values that do not fit the declared types are refused.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -17,19 +17,19 @@ import numpy as np
 ValueT = TypeVar("ValueT")
 Arrays = dict[str, np.ndarray]  # arrays by path in the tree, such as `trajectories.0.states.speed`
 ARRAY_KEY = "array"  # key of the JSON object that represents an array; its value is the path
-KIND_KEY = "kind"  # key of the name of a class
-ClassesByBase = Mapping[type, Mapping[str, type]]  # the classes that may stand for a base class, by their names
+KIND_KEY = "kind"  # key of the JSON object for the name of a class
+ClassesByBase = Mapping[type, Mapping[str, type]]  # allowed classes of each base class, by name
 
 
 def select_prefix(prefix: str, values: Mapping[str, ValueT]) -> dict[str, ValueT]:
-    """Return the values with names that begin with `prefix`, without it."""
+    """Return the values with names that begin with `prefix`, by names without the prefix."""
     return {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
 
 
 def pack(tree: Any, path: str = "", classes: ClassesByBase = {}) -> tuple[Any, Arrays]:  # noqa: B006
     """Return a tree as JSON and arrays; `unpack` is the exact inverse."""
     arrays: Arrays = {}
-    kinds = {each: {KIND_KEY: name} for of_base in classes.values() for name, each in of_base.items()}
+    kinds = {cls: {KIND_KEY: name} for derived in classes.values() for name, cls in derived.items()}
 
     def pack_value(value: Any, path: str) -> Any:
         if isinstance(value, np.ndarray):
@@ -49,7 +49,7 @@ def pack(tree: Any, path: str = "", classes: ClassesByBase = {}) -> tuple[Any, A
 
 
 def unpack(kind: Any, packed: Any, arrays: Arrays, classes: ClassesByBase = {}) -> Any:  # noqa: B006
-    """Return the tree of type `kind` that `pack` converted; `ValueError` if a name, a type or an array is wrong."""
+    """Return the tree of type `kind` that `pack` converted; raise `ValueError` for a wrong name, type or array."""
     if isinstance(packed, dict) and packed.keys() == {ARRAY_KEY} and isinstance(packed[ARRAY_KEY], str):
         if packed[ARRAY_KEY] not in arrays or not (kind is Any or np.ndarray in (kind, get_origin(kind))):
             raise ValueError(f"array {packed[ARRAY_KEY]!r} is missing, or has no place")
@@ -63,14 +63,14 @@ def unpack(kind: Any, packed: Any, arrays: Arrays, classes: ClassesByBase = {}) 
         if not isinstance(name, str) or name not in classes[kind]:
             raise ValueError(f"{KIND_KEY}: {name!r:.60} is not allowed; allowed: {', '.join(classes[kind])}")
         kind = classes[kind][name]
-    origin, inner = get_origin(kind), get_args(kind)
+    origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
-        if packed is None and NoneType in inner:
+        if packed is None and NoneType in arguments:
             return None
-        (kind,) = (member for member in inner if member is not NoneType)
+        (kind,) = (member for member in arguments if member is not NoneType)
         return unpack(kind, packed, arrays, classes)
-    if (parts := _record_parts(kind)) is not None:
-        types, required = parts
+    if (declared := _declared_parts(kind)) is not None:
+        types, required = declared
         _check_type(dict, packed, kind)
         unknown, missing = packed.keys() - types.keys(), required - packed.keys()
         if unknown or missing:
@@ -78,13 +78,13 @@ def unpack(kind: Any, packed: Any, arrays: Arrays, classes: ClassesByBase = {}) 
         return kind(**{name: unpack(types[name], part, arrays, classes) for name, part in packed.items()})
     if origin is dict:
         _check_type(dict, packed, kind)
-        return {name: unpack(inner[1], part, arrays, classes) for name, part in packed.items()}
+        return {name: unpack(arguments[1], part, arrays, classes) for name, part in packed.items()}
     if origin in (tuple, list):
         _check_type(list, packed, kind)
-        kinds = (inner[0],) * len(packed) if origin is list or inner[1:] == (...,) else inner
+        kinds = (arguments[0],) * len(packed) if origin is list or arguments[1:] == (...,) else arguments
         if len(kinds) != len(packed):
             raise ValueError(f"{len(packed)} values are not allowed; allowed: {len(kinds)}")
-        return origin(unpack(each, part, arrays, classes) for each, part in zip(kinds, packed, strict=True))
+        return origin(unpack(part_kind, part, arrays, classes) for part_kind, part in zip(kinds, packed, strict=True))
     if kind is float and (packed is None or type(packed) is int):
         return float("nan") if packed is None else float(packed)
     if kind is Path and isinstance(packed, str):
@@ -95,7 +95,7 @@ def unpack(kind: Any, packed: Any, arrays: Arrays, classes: ClassesByBase = {}) 
 
 
 def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each leaf of nested dicts with its path, names joined by dots."""
+    """Yield the path, names joined by dots, and the value of each leaf of nested dicts."""
     if isinstance(tree, dict):
         for name, part in tree.items():
             yield from leaves(part, _join_path(path, name))
@@ -104,14 +104,14 @@ def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def map_leaves(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
-    """Return nested dicts with `function` applied to each leaf and the same leaf of the other trees."""
+    """Return nested dicts with the results of `function` for each leaf and the same leaf of the other trees."""
     if isinstance(tree, dict):
         return {name: map_leaves(function, part, *(other[name] for other in others)) for name, part in tree.items()}
     return function(tree, *others)
 
 
 def replace_leaves(tree: Any, values: dict[str, Any], path: str = "") -> Any:
-    """Return nested dicts like `tree` with new leaves, by the paths of `leaves`."""
+    """Return nested dicts like `tree` with new leaves; `values` has them by their path, as in `leaves`."""
     if isinstance(tree, dict):
         return {name: replace_leaves(part, values, _join_path(path, name)) for name, part in tree.items()}
     return values[path]
@@ -122,7 +122,7 @@ def _join_path(path: str, name: str) -> str:
 
 
 def named_parts(value: Any) -> dict[str, Any] | None:
-    """Return the named parts of a dict or record; None: the value is neither."""
+    """Return the parts of a dict or record by name; None for other values."""
     if isinstance(value, dict):
         return value
     if hasattr(value, "_asdict"):
@@ -133,8 +133,8 @@ def named_parts(value: Any) -> dict[str, Any] | None:
 
 
 @cache
-def _record_parts(kind: Any) -> tuple[dict[str, Any], set[str]] | None:
-    """Return the declared types of a record's parts, and the names of those without a default; None: not a record."""
+def _declared_parts(kind: Any) -> tuple[dict[str, Any], set[str]] | None:
+    """Return the declared types of the parts of a record, and names of parts without a default; None: no record."""
     if is_dataclass(kind):
         hints, parts = get_type_hints(kind), [field for field in fields(kind) if field.init]
         required = {field.name for field in parts if (field.default, field.default_factory) == (MISSING, MISSING)}

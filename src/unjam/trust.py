@@ -1,4 +1,4 @@
-"""Trust in Python code that a folder names: it runs if its user ran the same code at the same place before."""
+"""Trust in Python code that a folder names: it runs if its user has run the same code at the same path before."""
 
 import json
 import os
@@ -12,28 +12,28 @@ import platformdirs
 
 from unjam.errors import InputError, UnjamError
 from unjam.files import atomic_write, changed_file_error, make_folder, sha256_of
-from unjam.text import one_line
+from unjam.text import to_one_line
 from unjam.user_code import UserCode, read_code
 
-TRUSTED_VARIABLE = "UNJAM_TRUSTED"  # keys of trusted code, in addition to the remembered ones
+TRUSTED_VARIABLE = "UNJAM_TRUSTED"  # variable with keys of trusted code, in addition to the remembered keys
 TRUST_ALL = "all"
 TRUST_CODE_OPTION = "--trust-code"
-EXPECTED_CODE_VARIABLE = "UNJAM_EXPECTED_CODE"  # files and hashes of code at the check of a child's configuration
-MAX_NAMED_FILES = 1000  # files that a text can name, whatever its separators mean
+EXPECTED_CODE_VARIABLE = "UNJAM_EXPECTED_CODE"  # variable with files and hashes of code for a child
+MAX_NAMED_FILES = 1000  # files that a text can name, for all meanings of its separators
 _lock = threading.Lock()
 _saved_values: list[str | None] = []
-"""value of the variable before the first of the running blocks of `trusting_code`, for each of them"""
+"""value of `TRUSTED_VARIABLE` before the first running block of `trusting_code`, once for each running block"""
 _checked_files: dict[str, str]
-"""resolved paths by the absolute names that a configuration was checked with: a link can change meanwhile"""
-_expected_hashes: dict[str, str]  # hashes by resolved path; empty: there was no file
+"""resolved paths by absolute name at the check of a configuration: a link can change later"""
+_expected_hashes: dict[str, str]  # hashes of code by resolved path; empty: there was no file
 _checked_files, _expected_hashes = json.loads(os.environ.get(EXPECTED_CODE_VARIABLE, "[{}, {}]"))
 _sent_hashes: dict[str, str] = {}
-"""hashes by resolved path that another process has sent with its request"""
+"""hashes of code by resolved path, from the request of another process"""
 
 
 @contextmanager
 def trusting_code() -> Iterator[None]:
-    """Allow untrusted Python code that folders name to run within the block, and remember it.
+    """Let untrusted Python code that folders name run within the block, and remember it as trusted.
 
     `with unjam.trusting_code(): unjam.drive("ring", "runs/downloaded")`
 
@@ -46,19 +46,19 @@ def trusting_code() -> Iterator[None]:
         yield
     finally:
         with _lock:
-            before = _saved_values.pop()
+            saved = _saved_values.pop()
             if not _saved_values:
                 os.environ.pop(TRUSTED_VARIABLE)
-                os.environ |= {} if before is None else {TRUSTED_VARIABLE: before}
+                os.environ |= {} if saved is None else {TRUSTED_VARIABLE: saved}
 
 
 def is_all_code_trusted() -> bool:
-    """Return whether all code may run."""
+    """Return whether all code may run, also unknown code."""
     return TRUST_ALL in _trusted_keys()
 
 
 def check_trusted(context: str, code: UserCode) -> None:
-    """Raise `InputError` if code that `context` names, with its imports from its folder, is not trusted."""
+    """Raise `InputError` if code that `context` names, including its imports from its folder, is not trusted."""
     if not is_all_code_trusted() and not _is_remembered(_trust_key(code.path, code.sha256)):
         reason = "which you have not run yourself in this version"
         message = f"{context} names Python code ({str(code.path)!r}), {reason}"
@@ -66,7 +66,7 @@ def check_trusted(context: str, code: UserCode) -> None:
 
 
 def check_trusted_values(context: str, values: Any) -> None:
-    """Check all files that texts in `values` can name, as `check_trusted`; other or new code there is then refused."""
+    """Check all files that texts in `values` can name as `check_trusted` does, and expect the same code from now on."""
     if isinstance(values, str) and not is_all_code_trusted():
         for name, path in _code_files(context, values):
             code = read_code(path) if os.path.isfile(path) else None
@@ -79,32 +79,32 @@ def check_trusted_values(context: str, values: Any) -> None:
 
 
 def resolve_code_path(name: str) -> Path:
-    """Return the path of a file without links: the one that was checked if a configuration has named it."""
+    """Return the path of a file without links; for a file that a configuration names, the path that was checked."""
     return Path(_checked_files.get(os.path.join(os.getcwd(), name)) or os.path.realpath(name))
 
 
 def check_code_unchanged(code: UserCode) -> None:
-    """Raise `InputError` if code has changed since a configuration that names it was checked, or a request was made."""
+    """Raise `InputError` if code has changed since the check of a configuration that names it, or since a request."""
     if _sent_hashes.get(str(code.path), code.sha256) != code.sha256:
         raise changed_file_error(code.path.name)
     if _expected_hashes.get(str(code.path), code.sha256) != code.sha256 and not is_all_code_trusted():
-        allowed = f"allowed: as it was then, or {TRUST_CODE_OPTION}"
+        allowed = f"allowed: the code as checked, or {TRUST_CODE_OPTION}"
         raise InputError(f"{code.path.name}: has changed since the configuration was checked; {allowed}")
 
 
 def expect_code(hashes: Mapping[str, str]) -> None:
-    """Refuse other code than that with these hashes, by resolved path, in the rest of this process."""
+    """Refuse code with other hashes than these, by resolved path, from now on in this process."""
     _sent_hashes.update(hashes)
 
 
 def expected_code_environment() -> dict[str, str]:
-    """Return the environment variable for a child with the files and hashes that code must have."""
+    """Return the environment variable that tells a child the expected files and hashes of code."""
     return {EXPECTED_CODE_VARIABLE: json.dumps([_checked_files, _expected_hashes])}
 
 
 @contextmanager
-def expecting_code() -> Iterator[None]:
-    """Forget the hashes at the end of the block: the user can change the code, and name it again."""
+def forget_expected_code() -> Iterator[None]:
+    """Forget the expected code at the end of the block, so that the user can change it and name it again."""
     try:
         yield
     finally:
@@ -113,10 +113,13 @@ def expecting_code() -> Iterator[None]:
 
 
 def remember_trusted(code: Path, sha256: str = "") -> None:
-    """Remember that this user runs this code, or else the current one, here; if that fails, for children alone."""
+    """Remember that this user trusts code with this hash, by default the present code, at this path.
+
+    If it cannot be stored, only this process and its children remember it.
+    """
     try:
         key = _trust_key(code, sha256 or read_code(code).sha256)
-    except OSError:  # loading it will report the error
+    except OSError:  # loading the code will report the error
         return
     if _is_remembered(key):
         return
@@ -129,13 +132,13 @@ def remember_trusted(code: Path, sha256: str = "") -> None:
 
 
 def _code_files(context: str, text: str) -> Iterator[tuple[str, Path]]:
-    """Yield name and path of each file that a text can name as `path.py:name`; the name is absolute and keeps links."""
+    """Yield the absolute name and the path without links of each file that a text can name as `path.py:name`."""
     if ".py:" not in text or "\0" in text:
         return
     starts = [0, *(index + 1 for index, letter in enumerate(text) if letter == "+")]
     ends = [index for index, letter in enumerate(text) if letter == ":"]
     if len(starts) * len(ends) > MAX_NAMED_FILES:
-        raise InputError(f"{context}: {one_line(text, 60)!r} has too many parts; allowed: fewer + and :")
+        raise InputError(f"{context}: {to_one_line(text, 60)!r} has too many parts; allowed: fewer + and :")
     for name in dict.fromkeys(text[start:end] for start in starts for end in ends if start < end):
         yield os.path.join(os.getcwd(), name), Path(os.path.realpath(name))
 

@@ -1,7 +1,7 @@
-"""Users' Python files: read once with the modules that they import from their folder, hashed, and run as read.
+"""Read Python files of users, with the modules that they import from their folder, hash them, and run them as read.
 
 Bytecode in the folder is neither read nor written, and replacing a file after reading has no effect. Modules of
-several folders can have the same names: in `sys.modules` these begin with one that belongs to the file.
+several folders can have the same names; in `sys.modules` their names have a prefix for each file.
 """
 
 import ast
@@ -22,23 +22,23 @@ from typing import Any
 from unjam.errors import InputError
 from unjam.files import sha256_of
 
-USER_MODULE_PREFIX = "unjam_user_"  # beginning of the names of users' modules in `sys.modules`
+USER_MODULE_PREFIX = "unjam_user_"  # beginning of names in `sys.modules`
 INIT_FILE = "__init__.py"
 _compile_source = lru_cache(1024)(InspectLoader.source_to_code)
 
 
 @dataclass(frozen=True)
 class UserCode:
-    """A Python file and the modules of its folder that it imports, also in functions, as read."""
+    """Source of a Python file, and of the modules of its folder that it imports, also in functions."""
 
     path: Path
     modules: Mapping[str, tuple[Path, bytes]]
-    """path and source by the name within the folder; the file's own name is empty; a folder without `__init__.py` is a
-    package without source"""
+    """path and source by module name in the folder; the name of the file itself is empty, and the source of a folder
+    without `__init__.py` is empty"""
 
     @property
     def sha256(self) -> str:
-        """The hash of all code that can run; for a single file, that of its bytes."""
+        """The hash of all code that can run; for a single file, the hash of its bytes."""
         hashes = {name: sha256_of(source) for name, (_, source) in self.modules.items()}
         if len(hashes) == 1:
             return hashes[""]
@@ -46,12 +46,12 @@ class UserCode:
         return sha256_of("".join(lines).encode())
 
     def run(self) -> ModuleType:
-        """Run the file and return its module; its imports from its folder run again too."""
+        """Run the file, and its imports from its folder, again, and return its module."""
         return _Modules(self).run()
 
 
 def read_code(path: Path) -> UserCode:
-    """Read a Python file and the modules of its folder that its import statements name, unless a package is installed.
+    """Read a Python file, and modules of its folder that import statements name unless they are installed packages.
 
     Raise `InputError` for a compiled module of the folder, `OSError` if a file cannot be read.
     """
@@ -63,20 +63,20 @@ def read_code(path: Path) -> UserCode:
         for imported in _imported_names(source, _package_name(name, file)):
             parts = imported.split(".")
             for end in range(1, len(parts) + 1):
-                inner, parent = ".".join(parts[:end]), ".".join(parts[: end - 1])
-                if inner in modules:
+                module, parent = ".".join(parts[:end]), ".".join(parts[: end - 1])
+                if module in modules:
                     continue
                 if parent and not _is_package(modules[parent][0]):
                     break
-                if (file := _find_source(path, inner)) is None:
+                if (file := _find_source(path, module)) is None:
                     break
-                modules[inner] = file, file.read_bytes() if file.suffix == ".py" else b""
-                unread.append(inner)
+                modules[module] = file, file.read_bytes() if file.suffix == ".py" else b""
+                unread.append(module)
     return UserCode(path, modules)
 
 
 def _find_source(path: Path, name: str) -> Path | None:
-    """Return the source of a module in a file's folder, or the folder of a package without source."""
+    """Return the source file of a module in the folder of `path`, or the folder of a package without source."""
     base = path.parent.joinpath(*name.split("."))
     sources = [file for file in (base / INIT_FILE, base.with_name(f"{base.name}.py")) if file.is_file()]
     compiled = [
@@ -98,21 +98,21 @@ def _find_source(path: Path, name: str) -> Path | None:
 def _is_installed(name: str) -> bool:
     """Return whether a module belongs to unjam, the standard library, or an installed package."""
     spec = PathFinder.find_spec(name, list(filter(is_package_folder, sys.path)))
-    is_package = spec is not None and spec.origin is not None  # not only a folder
+    is_package = spec is not None and spec.origin is not None  # a folder alone has no origin
     return is_package or name == "unjam" or name in sys.stdlib_module_names
 
 
 def is_package_folder(folder: str) -> bool:
-    """Return whether a folder of `sys.path` is one for installed packages."""
+    """Return whether a folder of `sys.path` is for installed packages."""
     return Path(folder).name in ("site-packages", "dist-packages")
 
 
 @lru_cache(1024)
 def _imported_names(source: bytes, package: str) -> tuple[str, ...]:
-    """Return all names that the import statements of a source can mean; `package` is empty outside packages."""
+    """Return all modules that import statements of a source can mean; `package` is empty outside packages."""
     try:
         tree = ast.parse(source)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):  # running it reports the error
+    except (SyntaxError, ValueError, RecursionError, MemoryError):  # running the code reports the error
         return ()
     names = dict[str, None]()
     for node in ast.walk(tree):
@@ -136,7 +136,7 @@ def _package_name(name: str, path: Path) -> str:
 
 
 class _Modules(InspectLoader):
-    """The modules of one run of a file; `import` in them finds and runs modules of the folder."""
+    """Modules of one run of a file; `import` in these modules finds and runs modules of the folder."""
 
     def __init__(self, code: UserCode) -> None:
         self._code = code
@@ -146,10 +146,10 @@ class _Modules(InspectLoader):
         self._builtins = {**vars(builtins), "__import__": self._import}
 
     def run(self) -> ModuleType:
-        """Run the file; meanwhile its modules have their short names too, for other ways to import."""
+        """Run the file; meanwhile its modules also have their short names, for other ways to import them."""
         for name in list(sys.modules):
             if f"{name}.".startswith(f"{self._root}."):
-                del sys.modules[name]  # of the previous run
+                del sys.modules[name]  # from the previous run
         missing = [name for name in self._code.modules if name and name not in sys.modules]
         self._is_running = True
         try:
@@ -173,26 +173,26 @@ class _Modules(InspectLoader):
 
     def is_package(self, fullname: str) -> bool:
         """Return whether a module is a package."""
-        inner = self._local_name(fullname)
-        return bool(inner) and _is_package(self._code.modules[inner][0])
+        local_name = self._local_name(fullname)
+        return bool(local_name) and _is_package(self._code.modules[local_name][0])
 
     def _local_name(self, fullname: str) -> str:
         return fullname[len(self._root) + 1 :]
 
     def _load(self, local_name: str) -> ModuleType:
-        """Return a module; it runs at its first import."""
-        parent, _, own = local_name.rpartition(".")
+        """Return a module, and run it at its first import."""
+        parent, _, short_name = local_name.rpartition(".")
         if parent:
             self._load(parent)
         if local_name in self._modules:
             return self._modules[local_name]
         path, _ = self._code.modules[local_name]
         name = f"{self._root}.{local_name}" if local_name else self._root
-        below = [str(path.parent if path.name == INIT_FILE else path)] if self.is_package(name) else None
-        spec = importlib.util.spec_from_file_location(name, path, loader=self, submodule_search_locations=below)
+        folders = [str(path.parent if path.name == INIT_FILE else path)] if self.is_package(name) else None
+        spec = importlib.util.spec_from_file_location(name, path, loader=self, submodule_search_locations=folders)
         assert spec is not None
-        if below is not None:
-            spec.submodule_search_locations = []  # otherwise Python would search the folder, unhashed
+        if folders is not None:
+            spec.submodule_search_locations = []  # Python must not import files that are not hashed
         module = importlib.util.module_from_spec(spec)
         module.__dict__["__builtins__"] = self._builtins
         self._modules[local_name] = sys.modules[name] = module
@@ -204,7 +204,7 @@ class _Modules(InspectLoader):
             del self._modules[local_name], sys.modules[name]
             raise
         if parent:
-            setattr(self._modules[parent], own, module)
+            setattr(self._modules[parent], short_name, module)
         return module
 
     def _import(
@@ -215,24 +215,24 @@ class _Modules(InspectLoader):
         fromlist: Sequence[str] | None = (),
         level: int = 0,
     ) -> ModuleType:
-        """Do what `import` does in these modules: first from the folder, then as usual."""
-        inner = name
+        """Import a module for these modules: first from the folder, then as usual."""
+        local_name = name
         if level:
-            own = self._local_name(str((globals or {})["__name__"]))
-            package = _package_name(own, self._code.modules[own][0])
+            importer = self._local_name(str((globals or {})["__name__"]))
+            package = _package_name(importer, self._code.modules[importer][0])
             if not package:
                 raise ImportError("attempted relative import with no known parent package")
-            inner = importlib.util.resolve_name("." * level + name, package)
-        top = inner.partition(".")[0]
-        if top not in self._code.modules:
+            local_name = importlib.util.resolve_name("." * level + name, package)
+        top_name = local_name.partition(".")[0]
+        if top_name not in self._code.modules:
             return builtins.__import__(name, globals, locals, fromlist or (), level)
         with self._lock:
-            if inner not in self._code.modules:
-                raise ModuleNotFoundError(f"No module named {inner!r}", name=inner)
-            module = self._load(inner)
+            if local_name not in self._code.modules:
+                raise ModuleNotFoundError(f"No module named {local_name!r}", name=local_name)
+            module = self._load(local_name)
             if not fromlist:
-                return self._load(top)
+                return self._load(top_name)
             for item in getattr(module, "__all__", ()) if "*" in fromlist else fromlist:
-                if f"{inner}.{item}" in self._code.modules and not hasattr(module, item):
-                    self._load(f"{inner}.{item}")
+                if f"{local_name}.{item}" in self._code.modules and not hasattr(module, item):
+                    self._load(f"{local_name}.{item}")
             return module

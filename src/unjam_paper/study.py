@@ -19,7 +19,7 @@ from unjam.errors import InputError, raise_failure
 from unjam.files import atomic_write, make_folder, read_json_object, remove
 from unjam.manifest import manifest, strip_folders
 from unjam.measures.feasibility import FEASIBLE, feasibility_by_driver
-from unjam.measures.metric_table import estimate_cell, with_no_break_spaces
+from unjam.measures.metric_table import estimate_cell, use_no_break_spaces
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import Estimate, estimate, estimate_on_shared_seeds, estimate_over_trainings, format_ci
 from unjam.reports.results import CONTROLLER_FILE, EVALUATION_FILE, is_outdated, read_evaluation, read_rows
@@ -363,4 +363,4 @@ def interval_text(entries: Mapping[str, Any], digits: int, sign: str = "") -> st
     values: dict[str, Any] = {name: nan if value is None else value for name, value in entries.items()}
     stored = Estimate(**{field.name: values[field.name] for field in fields(Estimate) if field.name in values})
     ci = format_ci(stored, f"{sign}.{digits}f")
-    return with_no_break_spaces(f"{number_text(stored.mean, digits, sign)} {ci}".strip())
+    return use_no_break_spaces(f"{number_text(stored.mean, digits, sign)} {ci}".strip())

@@ -39,7 +39,7 @@ def test_checks_have_details(checks: dict[str, HealthCheck]) -> None:
 
 def test_optional_parts_are_not_required(checks: dict[str, HealthCheck]) -> None:
     assert {name for name, check in checks.items() if not check.is_required} == {
-        *("traci", "display", "mp4 video (imageio-ffmpeg)", "reading foreign files"),
+        *("traci", "display", "mp4 video (imageio-ffmpeg)", "reading untrusted files"),
         "SUMO of the results",
         *("torch", "stable-baselines3", "sb3-contrib", "optuna", "cryptography"),
     }
@@ -110,7 +110,7 @@ def test_a_missing_cache_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_a_failed_episode_has_its_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("UNJAM_CACHE", str(tmp_path / "file" / "cache"))
-    check = diagnostics._try_check("an episode in a worker", diagnostics._run_test_episode, "see the message")
+    check = diagnostics._call_check("an episode in a worker", diagnostics._run_test_episode, "see the message")
     assert not check.is_ok
     assert str(tmp_path) in check.detail
     assert "\n" not in check.detail

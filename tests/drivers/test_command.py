@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from unjam.drivers.command import Command, Limits, commanded_accelerations, commanded_time_gaps
+from unjam.drivers.command import (
+    Command,
+    Limits,
+    batch_commanded_accelerations,
+    commanded_accelerations,
+    commanded_time_gaps,
+)
 from unjam.errors import InputError
 
 LIMITS = Limits(-1.0, 0.5)
@@ -38,6 +44,20 @@ def test_no_command_is_right_where_there_is_nobody() -> None:
     assert commanded_accelerations(None, LIMITS, [], 0) == []
     with pytest.raises(InputError, match=r"driver: step 2: acceleration has shape \(0,\); allowed: \(2,\)"):
         commanded_accelerations(None, LIMITS, "ab", 2)
+
+
+@pytest.mark.parametrize("command", [None, Command(0.0), Command(np.zeros(3)), Command(np.array([0.0, np.nan]))])
+def test_a_batch_requires_a_finite_acceleration_for_each_cav(command: Command | None) -> None:
+    with pytest.raises(InputError) as caught:
+        batch_commanded_accelerations(command, LIMITS, 2, 4)
+    message = "driver: step 4: acceleration is not allowed; allowed: 2 finite numbers, one for each CAV"
+    assert str(caught.value) == message
+
+
+def test_an_answer_without_numbers_is_refused_with_the_allowed_values() -> None:
+    with pytest.raises(InputError) as caught:
+        commanded_accelerations(Command("fast"), LIMITS, "a", 4)
+    assert str(caught.value) == "driver: step 4: acceleration is not numbers: 'fast'; allowed: real numbers"
 
 
 def test_an_acc_keeps_at_least_its_own_time_headway() -> None:

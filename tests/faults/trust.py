@@ -42,7 +42,7 @@ from unjam.scenarios import Ring, make_scenario
 from unjam.training import run_folder
 from unjam.training.fingerprint import fingerprint
 from unjam.training.run_folder import create_run_folder, restore_newest_checkpoint
-from unjam.trust import check_trusted_values, expecting_code, remember_trusted
+from unjam.trust import check_trusted_values, forget_expected_code, remember_trusted
 from unjam.user_code import read_code
 from unjam.worlds.episode import run_episode
 from unjam.worlds.sumo import networks
@@ -291,7 +291,7 @@ def replacements(count: int, folder: Path, generator: np.random.Generator) -> Ou
         file = place / f"{generator.choice(['main', 'neighbor', 'later', 'package/inner'])}.py"
         changed_code = f"open({str(place / 'ran')!r}, 'w').close()\n{file.read_text()}"
         moment = str(generator.choice(["bytecode", "after it was read", "after it was checked"]))
-        with expecting_code():
+        with forget_expected_code():
             if moment == "bytecode":
                 plant_bytecode(file, str(generator.choice(["by time", "by an unchecked hash"])))
                 late = FileReference(main, "late").load_object()

@@ -152,7 +152,8 @@ def test_unusable_original_network_is_reported(corridor: Corridor, tmp_path: Pat
     demand = path.with_name("demand.rou.xml")
     demand.write_text(demand.read_text().replace('route="along"', 'route="astray"'))
     broken = load_corridor(str(path), corridor.detectors)
-    with DetectorPool(1) as counting, pytest.raises(UnjamError, match=r"as it is: SUMO cannot start.*astray"):
+    message = r"^\S+\.sumocfg: the original network cannot be simulated: SUMO cannot start.*astray"
+    with DetectorPool(1) as counting, pytest.raises(UnjamError, match=message):
         calibrate(broken, tmp_path / "out", counting, SPACE, 2, seeds_per_trial=1)
 
 

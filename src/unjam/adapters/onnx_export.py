@@ -15,7 +15,7 @@ from unjam.drivers.registry import driver_from_name
 from unjam.errors import InputError, import_optional, invalid_value
 from unjam.files import atomic_write, check_parent_folder
 from unjam.onnx_models import quiet_onnx_export
-from unjam.text import one_line
+from unjam.text import to_one_line
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -76,7 +76,7 @@ def _check_shapes(network: "nn.Module", observations: "Tensor") -> None:
     try:
         shape = tuple(network(observations).shape)
     except (RuntimeError, TypeError, AttributeError, IndexError) as error:
-        raise InputError(f"network: it does not take {size} inputs: {one_line(error, 120)}") from None
+        raise InputError(f"network: it does not take {size} inputs: {to_one_line(error, 120)}") from None
     if shape not in ((rows,), (rows, 1)):
         raise invalid_value(f"network: shape of its output for {rows} rows", shape, f"({rows},), ({rows}, 1)")
 

@@ -15,11 +15,11 @@ from unjam.drivers.onnx_policy import OnnxDriver
 from unjam.drivers.policy import PolicyDescription
 from unjam.drivers.registry import DRIVERS, driver_from_name
 from unjam.drivers.user_driver import DriverLike, as_driver
-from unjam.errors import InputError, invalid_value, naming, unknown_name
+from unjam.errors import InputError, invalid_value, prefix_errors, unknown_name
 from unjam.folders import open_folder
 from unjam.onnx_models import MAX_MODEL_BYTES, parse_model
 from unjam.parameters import build_dataclass, parse_toml, split_parameters
-from unjam.text import one_line
+from unjam.text import to_one_line
 
 GRAPH_SUFFIX, DESCRIPTION_SUFFIX = ".onnx", ".toml"
 DESCRIPTION_KEY = "unjam"  # key of the description among the metadata of a graph
@@ -47,7 +47,7 @@ def onnx_driver(
     """
     path = Path(file)
     content, table = _read_described(path) if description is None else (_read(path, MAX_MODEL_BYTES), {})
-    with naming(f"driver {path.name}: "):
+    with prefix_errors(f"driver {path.name}: "):
         name = table.pop("expert", Constant.name)
         if not isinstance(name, str) or split_parameters(name)[0] not in DRIVERS:
             raise unknown_name("expert", name, DRIVERS)
@@ -70,7 +70,7 @@ def _read_described(path: Path) -> tuple[bytes, dict[str, Any]]:
             raise invalid_value(f"driver {description_file.name}: graph", name, f"{path.name}, which was given")
         return _read(path.with_name(name), MAX_MODEL_BYTES), table
     content = _read(path, MAX_MODEL_BYTES)
-    with naming(f"driver {path.name}: "):
+    with prefix_errors(f"driver {path.name}: "):
         texts = {entry.key: entry.value for entry in parse_model(content).metadata_props}
     if DESCRIPTION_KEY not in texts:
         needed = f"{description_file.name}, with the inputs and the output of the graph"
@@ -98,4 +98,4 @@ def _parse_description(content: bytes, name: str) -> dict[str, Any]:
     try:
         return parse_toml(content.decode())
     except (ValueError, RecursionError) as error:
-        raise InputError(f"driver {name}: not TOML: {one_line(error)}") from None
+        raise InputError(f"driver {name}: not TOML: {to_one_line(error)}") from None

@@ -16,7 +16,7 @@ from unjam.drivers.observation import FeatureLike, as_features, observation_size
 from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyOutput, TensorPolicyDriver
 from unjam.drivers.user_driver import DriverLike, UserFunction, as_driver, object_label
 from unjam.errors import InputError, invalid_value
-from unjam.text import one_line
+from unjam.text import to_one_line
 
 
 def policy_driver(
@@ -56,7 +56,7 @@ def policy_driver(
     if hasattr(policy, "predict"):
         _check_model(label, policy)
         exported = getattr(policy, "unjam", {})  # by `unjam export --sb3`
-        added_to, repeat = one_line(exported.get("expert", Constant.name)), exported.get("action_repeat")
+        added_to, repeat = to_one_line(exported.get("expert", Constant.name)), exported.get("action_repeat")
         if policy_time_step is None and isinstance(repeat, int) and repeat > 1:
             policy_time_step = repeat * time_step
         if expert is None and added_to != Constant.name:

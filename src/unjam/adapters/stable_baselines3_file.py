@@ -16,7 +16,7 @@ from gymnasium.spaces import Box
 
 from unjam.errors import InputError, MissingPartError, import_optional
 from unjam.physics.arrays import Floats
-from unjam.text import one_line
+from unjam.text import to_one_line
 
 DATA_PART, POLICY_PART, PICKLE_SUFFIX = "data", "policy.pth", ".pkl"
 MAX_ARCHIVE_BYTES = 64 * 2**20
@@ -104,7 +104,7 @@ def read_policy(path: Path) -> SavedPolicy:
         raise
     except Exception as error:  # damaged files cause any error, also in torch
         hint = "allowed: an MlpPolicy of Stable-Baselines3 with a Box of one action; others as Python objects"
-        raise InputError(f"driver {path.name}: {type(error).__name__}: {one_line(error)}; {hint}") from None
+        raise InputError(f"driver {path.name}: {type(error).__name__}: {to_one_line(error)}; {hint}") from None
     return SavedPolicy(observed, acted, layers, activation, is_squashed, exported)
 
 

@@ -8,7 +8,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from unjam.benchmarks.result import BenchmarkResult, read_result
-from unjam.errors import InputError, naming
+from unjam.errors import InputError, prefix_errors
 from unjam.measures.statistics import format_ci
 from unjam.reports.figures import CAV_PLOT_COLOR, MUTED_COLOR, PLOT_STYLE, TEXT_COLOR, new_figure, short_label
 
@@ -20,7 +20,7 @@ def read_leaderboard(paths: Sequence[Path]) -> dict[str, BenchmarkResult]:
     results = list[BenchmarkResult]()
     for path in paths:
         results.append(result := read_result(path))
-        with naming(f"{path}: "):
+        with prefix_errors(f"{path}: "):
             result.check_comparable()
             if result.suite != (suite := results[0].suite):
                 raise InputError(f"suite: {result.suite} is not allowed; allowed: {suite}, as in {paths[0]}")

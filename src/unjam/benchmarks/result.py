@@ -11,7 +11,7 @@ from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr
 
 from unjam.benchmarks.suites import Suite, find_suite, references
 from unjam.controller.manifest import first_difference, short_text
-from unjam.errors import InputError, invalid_value, naming, unknown_name
+from unjam.errors import InputError, invalid_value, prefix_errors, unknown_name
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, parse_json, to_json
 from unjam.measures import gain
 from unjam.measures.feasibility import FEASIBLE, overall_feasibility
@@ -186,7 +186,7 @@ def read_result(path: Path) -> BenchmarkResult:
 
     Raise `InputError` if it is not a result of a suite of this version, or contradicts itself.
     """
-    with naming(f"{path}: "):
+    with prefix_errors(f"{path}: "):
         try:
             if not path.is_file():
                 reason = "it is not a file" if path.exists() else "there is no such file"

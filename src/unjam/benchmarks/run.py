@@ -38,7 +38,7 @@ from unjam.processes import lock_file
 from unjam.road_family import FAMILY_PREFIX
 from unjam.scenarios import make_scenario
 from unjam.scenarios.scenario import Scenario
-from unjam.text import format_count, one_line
+from unjam.text import format_count, to_one_line
 from unjam.training.run_folder import check_controllers
 from unjam.worlds.backend import BackendLike, check_support, open_backend
 from unjam.worlds.batch.run import run_batches
@@ -101,7 +101,7 @@ def benchmark(
     origin = manifest()
     result = BenchmarkResult(
         suite=suite,
-        driver=one_line(strip_folders([label])[0] or first.describe(), MAX_LABEL_CHARACTERS),
+        driver=to_one_line(strip_folders([label])[0] or first.describe(), MAX_LABEL_CHARACTERS),
         sha256=_driver_hash(label, first),
         training_steps=_recorded_steps(label) or training_steps,
         manifest={
@@ -129,7 +129,7 @@ def benchmark(
             used, rows = human_used, baseline = _drive_road(scenario, human, backend, pool)
             if (road_driver := drivers.get(name)) != human:
                 used, rows = _drive_road(scenario, road_driver, backend, pool) if road_driver else (human_used, [])
-            record = RoadRecord(used, to_columns(baseline), to_columns(rows), one_line(reasons.get(name, "")))
+            record = RoadRecord(used, to_columns(baseline), to_columns(rows), to_one_line(reasons.get(name, "")))
             result = replace(result, roads={**result.roads, name: record})
             if path is not None:
                 write_result(path, result)

@@ -1,4 +1,4 @@
-"""The command line: `unjam COMMAND`. Commands on the same subject share a module of this package."""
+"""The command line: `unjam COMMAND`. Related commands share a module of this package."""
 
 import logging
 import os
@@ -38,11 +38,11 @@ COMMANDS = {
 CODE_RUNNING_COMMANDS = {
     *("drive", "assess", "benchmark", "train", "evaluate", "model", "search", "export", "certify", "verify", "watch")
 }
-"""commands with the option --trust-code: they read folders, which can name Python code"""
+"""commands with the option --trust-code, because they read folders that can name Python code"""
 
 
 class _CommandGroup(TyperGroup):
-    """The commands of unjam, and those of plugins; each is imported on demand."""
+    """Commands of unjam and of plugins, imported on demand."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*COMMANDS, *plugin_names("unjam.commands")]
@@ -56,9 +56,9 @@ class _CommandGroup(TyperGroup):
             raise unknown_name("command", cmd_name, self.list_commands(ctx))
         if isinstance(command, typer.Typer):
             return typer.main.get_command(command)
-        single = typer.Typer(rich_markup_mode="markdown", add_completion=False)
-        single.command(cmd_name)(with_trust_option(command) if cmd_name in CODE_RUNNING_COMMANDS else command)
-        return typer.main.get_command(single)
+        command_app = typer.Typer(rich_markup_mode="markdown", add_completion=False)
+        command_app.command(cmd_name)(with_trust_option(command) if cmd_name in CODE_RUNNING_COMMANDS else command)
+        return typer.main.get_command(command_app)
 
 
 app = typer.Typer(
@@ -79,7 +79,7 @@ def _print_version(is_requested: bool) -> None:
 
 
 @app.callback()
-def _root(
+def _global_options(
     version: Annotated[
         bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
@@ -87,23 +87,23 @@ def _root(
     pass
 
 
-class _Terminated(BaseException):
+class _TerminationSignal(BaseException):
     """The process received SIGTERM, or SIGHUP because its terminal was closed."""
 
 
 def _terminate(signum: int, frame: FrameType | None) -> None:
-    raise _Terminated(signum)
+    raise _TerminationSignal(signum)
 
 
 class _LineFormatter(logging.Formatter):
-    """Formats a log message as one line without control characters, which names in files can have."""
+    """Formats a log message as one line without the control characters that names in files can have."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(" ".join(super().format(record).split()))
 
 
-def _format_warning(message: Warning | str, category: type[Warning], *place: Any) -> str:
-    """Return a warning without control characters, and without the place in the code."""
+def _format_warning(message: Warning | str, category: type[Warning], *location: Any) -> str:
+    """Return a warning without control characters and without its location in the code."""
     return printable(f"{category.__name__}: {' '.join(str(message).split())}\n")
 
 
@@ -113,10 +113,10 @@ TOO_LITTLE_MEMORY = "memory: there is not enough for this command"
 def main() -> None:
     """Run the command line; print every error that a user can correct as one line, and exit with its code."""
     for stream, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, stream) is None:  # a closed stream must not become the next file that is opened
+        if getattr(sys, stream) is None:  # else the next file that is opened replaces a closed stream
             setattr(sys, stream, open(os.devnull, mode))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # letters outside of an encoding must not end a command
+        if isinstance(stream, TextIOWrapper):  # characters that the encoding lacks must not end a command
             stream.reconfigure(errors="replace")
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_LineFormatter())
@@ -159,7 +159,7 @@ def _run_app() -> int:
         return _print_error(TOO_LITTLE_MEMORY, InputError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return _print_error("interrupted", INTERRUPTED_EXIT_CODE)
-    except _Terminated as error:
+    except _TerminationSignal as error:
         return _print_error("terminated", 128 + error.args[0])
     except Exception as error:
         if isinstance(error, RuntimeError) and "start new thread" in str(error):
@@ -170,24 +170,24 @@ def _run_app() -> int:
 
 
 def _call_app() -> int:
-    """Run the command and return its exit code; an interruption is raised even if other code has replaced it."""
+    """Run the command and return its exit code; raise an interruption even if another error has replaced it."""
     try:
         return app(standalone_mode=False) or 0
     except Exception as error:
         cause: BaseException | None = error
-        while cause := cause.__cause__ or cause.__context__:  # Python replaces it while it defines classes
-            if isinstance(cause, KeyboardInterrupt | _Terminated):
+        while cause := cause.__cause__ or cause.__context__:  # Python replaces errors while it defines classes
+            if isinstance(cause, KeyboardInterrupt | _TerminationSignal):
                 raise cause from None
         raise
 
 
 def _usage_text(error: Any) -> str:
-    """Return the message of an error of typer about the command line, with the value of the option or a hint."""
-    words = getattr(getattr(error, "param", None), "opts", ())
-    values = [f"; given: {value!r}" for word, value in pairwise(sys.argv) if word in words and value]
+    """Return the message of an error by typer, with the value of the wrong option, or a hint at a setting."""
+    option_names = getattr(getattr(error, "param", None), "opts", ())
+    values = [f"; given: {value!r}" for word, value in pairwise(sys.argv) if word in option_names and value]
     command: Any = getattr(getattr(error, "ctx", None), "command", None)
-    known = [word for parameter in getattr(command, "params", ()) for word in parameter.opts]
-    if "--set" in known and getattr(error, "option_name", "--set") not in known:
+    known_options = [name for parameter in getattr(command, "params", ()) for name in parameter.opts]
+    if "--set" in known_options and getattr(error, "option_name", "--set") not in known_options:
         from unjam.cli.catalog import suggest_setting  # imported late: it imports all scenarios
 
         return error.format_message() + suggest_setting(error.option_name, command.name)

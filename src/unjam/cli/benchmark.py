@@ -1,4 +1,4 @@
-"""`unjam benchmark` drives a suite of roads with fixed test seeds, and compares results of such files."""
+"""`unjam benchmark` measures a driver on a suite of roads with fixed test seeds, and compares files of results."""
 
 import re
 from pathlib import Path
@@ -29,7 +29,7 @@ def benchmark_command(
     out: Annotated[
         Path | None,
         Option(
-            help="File for the result, which a second call continues; with --compare, an .svg or .png file.",
+            help="File for the result; repeat the command to continue it. With --compare, an .svg or .png file.",
             show_default="under runs/",
         ),
     ] = None,
@@ -42,12 +42,12 @@ def benchmark_command(
         int | None,
         Option(
             min=0,
-            help="Environment steps of the training: control steps, the calls of env.step of all environments. "
-            "The driver's own file has priority.",
+            help="Environment steps of the training: calls of env.step in all environments together. "
+            "A value in the file of the driver has priority.",
         ),
     ] = None,
     roads: Annotated[
-        str, Option(help="Roads of the suite for a trial, joined by commas. Only with --out it can be continued.")
+        str, Option(help="Roads of the suite for a trial, joined by commas. Only a trial with --out can be continued.")
     ] = "",
     json: opt.JsonOption = False,
 ) -> None:
@@ -62,19 +62,19 @@ def benchmark_command(
     - unjam benchmark --compare gentle.json results/benchmark/*.json
     """
     if compare:
-        _compare(names or [], out or Path("runs") / "leaderboard.svg", json)
+        _print_leaderboard(names or [], out or Path("runs") / "leaderboard.svg", json)
         return
     if len(names or []) > 1:
         raise invalid_value("driver", " ".join(names or []), "one driver, or files with --compare")
     from unjam.benchmarks.run import benchmark
 
     driver = (names or [DEFAULT_DRIVER])[0]
-    chosen = [name.strip() for name in roads.split(",")] if roads else []
-    if out is None and not chosen:
+    selected_roads = [name.strip() for name in roads.split(",")] if roads else []
+    if out is None and not selected_roads:
         slug = re.sub(r"[^\w-]+", "-", Path(driver).stem)[:40].strip("-")
         out = Path("runs") / f"benchmark-{suite}-{slug}.json"
-    line = (lambda text: None) if json else (lambda text: err_console.print(text, soft_wrap=True))
-    result = benchmark(driver, suite, out, workers, backend, training_steps, line, chosen)
+    on_message = (lambda text: None) if json else (lambda text: err_console.print(text, soft_wrap=True))
+    result = benchmark(driver, suite, out, workers, backend, training_steps, on_message, selected_roads)
     trial = {"missing_roads": result.missing_roads, "gains": result.road_rows()} if result.missing_roads else {}
     if json:
         print_json(trial | result.document())
@@ -89,14 +89,14 @@ def benchmark_command(
         err_console.print(f"result: {out}", soft_wrap=True)
     if trial:
         total = format_count(len(result.roads) + len(result.missing_roads), "road")
-        driven = f"{len(result.roads)} of {total} of {suite}"
-        err_console.print(f"trial: {driven}; the same command without --roads drives all", soft_wrap=True)
+        progress = f"{len(result.roads)} of {total} of {suite}"
+        err_console.print(f"trial: {progress}; the same command without --roads drives all", soft_wrap=True)
     else:
         print_next_command("compare it", "benchmark", "--compare", out, "OTHER.json")
 
 
-def _compare(names: list[str], out: Path, json: bool) -> None:
-    """Print the leaderboard of files, and draw it."""
+def _print_leaderboard(names: list[str], out: Path, json: bool) -> None:
+    """Print the leaderboard of result files, and draw it into a file."""
     if not names:
         raise InputError("compare: no files; allowed: results of `unjam benchmark`")
     if out.suffix not in (".svg", ".png"):

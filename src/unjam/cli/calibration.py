@@ -27,7 +27,7 @@ CALIBRATION_COLUMNS = {
     "speed_rmse": ("speed error (RMSE)", "m/s", 2),
     "score": ("score", "", 3),
 }
-"""label, unit and number of digits of each metric"""
+"""label, unit and number of decimals of each metric"""
 
 
 @opt.with_options(changes=opt.scenario_changes)
@@ -89,13 +89,13 @@ def tune_command(
     changes = opt.merge_settings(changes, opt.parse_settings(settings))
     if scenario in ROAD_GROUPS:
         if reward:
-            raise InputError(f"reward: with {scenario} no reward is allowed; the objective is the mean normalized gain")
+            raise InputError(f"reward: not allowed with {scenario}; there the objective is the mean normalized gain")
         roads = family_scenarios(scenario, "training", changes=changes)
     else:
         roads = {scenario: make_scenario(scenario, changes)}
-    first = next(iter(roads.values()))
-    make_reward(reward or first.reward)
-    space = default_search_space(expert, first.control_step)
+    first_road = next(iter(roads.values()))
+    make_reward(reward or first_road.reward)
+    space = default_search_space(expert, first_road.control_step)
     space = expert_search_space(vary, space) if vary else space
     folder = opt.new_folder(out, f"tune-{Path(scenario).stem}")
     on_message = (lambda line: None) if json else err_console.print

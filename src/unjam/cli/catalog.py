@@ -29,10 +29,10 @@ from unjam.scenarios.road import format_drawn_values
 from unjam.worlds.backend import WorldOptions
 from unjam.worlds.sumo.backend import SumoBackend
 
-FAMILY_GROUP = FAMILY_PREFIX.rstrip("/")  # argument that lists the roads of the family
+FAMILY_GROUP = FAMILY_PREFIX.rstrip("/")  # argument to list the roads of the family
 MIN_TABLE_WIDTH = 100
-"""width from which the list of scenarios is a table [characters]"""
-PICTURE_SECONDS = 60.0  # simulated time after which an open road is drawn [s]; at the start it is almost empty
+"""minimum width of a terminal for a table of scenarios [characters]"""
+PICTURE_SECONDS = 60.0  # simulated time until an open road is drawn [s]; at first it is almost empty
 
 
 def scenarios_command(
@@ -76,7 +76,7 @@ def scenarios_command(
 
 
 def _print_scenarios(scenarios: Mapping[str, Any]) -> None:
-    """Print the main facts on scenarios as a table, in a narrow terminal as a list."""
+    """Print the main properties of scenarios as a table, or in a narrow terminal as a list."""
     headings = "road", "vehicles", "limit", "control steps", "warm-up"
     table = new_table(("scenario", *headings))
     for key, scenario in scenarios.items():
@@ -142,28 +142,28 @@ def drivers_command(
         for key in names
     }
     parameters = {key: parameter_entries(DRIVERS[key]()) if key in DRIVERS else [] for key in names}
-    briefs = {key: text.partition("\n")[0] for key, text in descriptions.items()}
+    summaries = {key: text.partition("\n")[0] for key, text in descriptions.items()}
     if json:
-        print_json({key: {"description": briefs[key], "parameters": parameters[key]} for key in names})
+        print_json({key: {"description": summaries[key], "parameters": parameters[key]} for key in names})
     elif name is None:
         table = new_table(("driver", "description"))
-        for row in briefs.items():
+        for row in summaries.items():
             table.add_row(*row)
         console.print(table)
         console.print("Parameters: unjam drivers NAME. Your own driver: --driver path.py:name, a function or a class.")
     else:
         console.print(f"[bold]{name}[/bold]", markup=True)
-        console.print(re.sub(r"(?<!\n)\n(?!\n)", " ", descriptions[name]))  # paragraphs of any width
+        console.print(re.sub(r"(?<!\n)\n(?!\n)", " ", descriptions[name]))  # joins the lines of a paragraph
         if rows := [row for row in parameters[name] if row["name"] != "time_step"]:
             _print_parameters(rows, f"parameters (--driver {name}:parameter=value)")
 
 
 def _packaged_summary(name: str, is_brief: bool) -> str:
-    """Return a packaged controller with its measured performance; a brief one has no parameters of its expert."""
+    """Return a text on a packaged controller and its performance; if brief, without parameters of the expert."""
     controller = read_controller(name)
     manifest = controller.manifest
-    described = manifest.get("expert", "")
-    expert = described.partition(":")[0] if is_brief else described
+    full_expert = manifest.get("expert", "")
+    expert = full_expert.partition(":")[0] if is_brief else full_expert
     if tuning := manifest.get("tuning"):
         best, default = (f"{tuning[key]['score']:.4g}" for key in ("best", "default"))
         score = tuning["reward"] if tuning["reward"] == MEAN_GAIN else "return"
@@ -171,13 +171,13 @@ def _packaged_summary(name: str, is_brief: bool) -> str:
     if summary := manifest.get("summary"):
         return summary if is_brief else f"{summary}\n\n{controller.driver.describe()}"
     metrics, label = manifest["metrics"], f"{expert} + residual, trained on {manifest['run']['scenario']}"
-    speed, expert_speed = (metrics[name]["mean_speed"]["mean"] for name in ("trained", described))
+    speed, expert_speed = (metrics[name]["mean_speed"]["mean"] for name in ("trained", full_expert))
     seeds = f"{metrics['trained']['episodes']} test seeds"
     return f"{label}: mean speed {speed:.2f} m/s on {seeds}, expert {expert_speed:.2f} m/s"
 
 
 def suggest_setting(option: str, command: str) -> str:
-    """Return a hint at the scenario parameters with the name of an unknown option, such as `--delay`; or nothing."""
+    """Return a hint that lists scenario parameters with the name of an unknown option, such as `--delay`, if any."""
     name, prefix = option.lstrip("-").replace("-", "_"), "scenario_options." if command in ("train", "search") else ""
     recipes = (scenario_recipe(example_scenario(name)) for name in SCENARIOS)
     keys = dict.fromkeys(key for recipe in recipes for key in flatten_keys(recipe) if f".{key}".endswith(f".{name}"))
@@ -196,26 +196,26 @@ def parameter_entries(instance: Any) -> list[dict[str, Any]]:
 
 
 def _field_docstrings(kind: type) -> dict[str, str]:
-    """Return the docstring below each field of a class, from its source."""
+    """Return the docstring below each field of a class, by the name of the field."""
     try:
         (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
     except (OSError, TypeError):
-        return {}  # a class without a file
+        return {}  # the class has no source file
     texts = {}
-    for line, below in pairwise(getattr(definition, "body", [])):
-        match line, below:
+    for statement, next_statement in pairwise(getattr(definition, "body", [])):
+        match statement, next_statement:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
                 texts[name] = inspect.cleandoc(text)
     return texts
 
 
 def _print_parameters(rows: list[dict[str, Any]], title: str) -> None:
-    """Print the name, default and meaning of each parameter, wrapped."""
+    """Print the name, default and meaning of each parameter in wrapped lines."""
     console.print(f"{title}, their defaults and meanings", style="dim", soft_wrap=True)
     for row in rows:
         name, value = row["name"], row["default"]
-        values = {f"{name}.{key}": each for key, each in value.items()} if isinstance(value, dict) else {name: value}
-        texts = {key: "(none)" if each is None else setting_text(each) or '""' for key, each in values.items()}
+        values = {f"{name}.{key}": entry for key, entry in value.items()} if isinstance(value, dict) else {name: value}
+        texts = {key: "(none)" if entry is None else setting_text(entry) or '""' for key, entry in values.items()}
         defaults = " ".join(f"{key}={text}" for key, text in texts.items())
         meaning = " ".join(row["description"].split())
         print_wrapped(f"  {defaults}" + (f": {meaning}" if meaning else ""))

@@ -46,7 +46,7 @@ def export_command(
         bool, Option("--sb3", help="Write the residual as a model of Stable-Baselines3, too: a .zip file.")
     ] = False,
     scenario: Annotated[
-        str, Option(help="Scenario that defines control step and limits of a plain driver.", show_default="ring")
+        str, Option(help="Scenario that defines the control step and limits of a driver.", show_default="ring")
     ] = "",
     settings: ScenarioSettingsOption = None,
     json: JsonOption = False,
@@ -63,7 +63,7 @@ def export_command(
     - unjam export pi:window=30 --scenario merge --out pi.unjam
     - unjam export unjam:ring-best --set actuator.delay=0.4 --out my-car.unjam     (with the filter for this car)
     """
-    if onnx:  # messages of the exporter are of no use to users
+    if onnx:  # its messages do not help users
         warnings.simplefilter("ignore")
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     changes = parse_settings(settings)
@@ -75,10 +75,10 @@ def export_command(
         return
     for file in filter(None, (result.file, result.graph, result.model)):
         console.print(f"{file}: {file.stat().st_size:,} bytes")
-    other = out.with_suffix(".onnx")
-    is_source = source.endswith((".onnx", ".toml")) and Path(source).with_suffix(".onnx").resolve() == other.resolve()
-    if result.graph is None and other.exists() and not is_source:
-        err_console.print(f"note: {other} is not the graph of this controller; --onnx writes the graph")
+    graph = out.with_suffix(".onnx")
+    is_source = source.endswith((".onnx", ".toml")) and Path(source).with_suffix(".onnx").resolve() == graph.resolve()
+    if result.graph is None and graph.exists() and not is_source:
+        err_console.print(f"note: {graph} is not the graph of this controller; --onnx writes the graph")
     car = f", {result.car}" if result.car else ""
     steps = f"{result.sample_steps:,} control steps of a test episode"
     err_console.print(f"{result.driver}{car}, verified on {steps}")
@@ -142,7 +142,7 @@ def certify_command(
     if not is_packaged:
         try:
             add_certificate(file, controller, certificate)
-        except BaseException:  # the page would certify what the controller does not contain
+        except BaseException:  # else the page shows a certificate that the controller does not contain
             remove(target) if previous_page is None else atomic_write(target, previous_page)
             raise
     if json:
@@ -160,13 +160,13 @@ def certify_command(
 
 
 def _read_packaged_for_car(name: str, settings: dict[str, Any]) -> Controller:
-    """Return a packaged controller with the safety filter of its road, for the car of this road, and a sample of it."""
+    """Return a packaged controller with the safety filter and the car of its road, and a sample for this car."""
     controller = read_controller(Path(name))
     recipe = controller.manifest.get("scenario")
     if recipe is None:
         raise invalid_value("file", name, "a controller for one road: it selects its controller by the road")
-    is_usual = has_default_actuator(scenario_from_recipe(recipe))
-    if isinstance(controller.driver, FilteredDriver) and is_usual and not settings:
+    has_default_car = has_default_actuator(scenario_from_recipe(recipe))
+    if isinstance(controller.driver, FilteredDriver) and has_default_car and not settings:
         return controller
     return read_exported_controller(name, settings)
 
@@ -178,11 +178,11 @@ def verify_command(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Check each part of a controller: hashes, signature, driver, and that its forms agree on its sample.
+    """Check each part of a controller: hashes, signature, driver, and agreement of its forms on its sample.
 
     Each line gives the status of a part: checked and how, absent, or stated by the author and not verifiable. The
-    exit code is 2 if a check fails or a folder names Python code that is not trusted, and 3 if a package is missing
-    that a check needs.
+    exit code is 2 if a check fails or a folder names Python code that is not trusted, and 3 if a check needs a package
+    that is not installed.
 
     Examples:
 
@@ -208,7 +208,7 @@ def verify_command(
 def keys_command(
     name: Annotated[Path, Argument(help="Path of the two files to write, without suffix.")], json: JsonOption = False
 ) -> None:
-    """Make a key pair to sign controllers: NAME.key, which you keep secret, and NAME.pub for others.
+    """Make a key pair to sign controllers: NAME.key, which you must keep secret, and NAME.pub for others.
 
     Existing files are not overwritten. The key has no password: only your user can read it, and anyone with a copy
     can sign in your name.
@@ -233,7 +233,7 @@ def sign_command(
     overwrite: Annotated[bool, Option("--replace", help="Replace a signature with another key.")] = False,
     json: JsonOption = False,
 ) -> None:
-    """Sign a controller: others can then verify its maker, and that the file has not been changed.
+    """Sign a controller, so that others can verify its author and that the file has not been changed.
 
     The signature becomes a part of the file, and is checked whenever the file is read. Certify before signing: a
     signed file cannot be certified.

@@ -31,7 +31,7 @@ TORCH_CPU_INDEX = "https://download.pytorch.org/whl/cpu"  # builds without GPU s
 def doctor_command(json: JsonOption = False) -> None:
     """Check SUMO, its version, the display, the cache and one real episode; print a remedy for each failure.
 
-    Exit code 3 if a required part is missing.
+    The exit code is 3 if a required part is missing.
 
     Example:
 
@@ -58,48 +58,49 @@ class HealthCheck:
 
     name: str
     is_ok: bool
-    detail: str  # what was found, such as a version
+    detail: str  # such as the installed version
     remedy: str = ""
-    is_required: bool = True  # for unjam to run at all
+    is_required: bool = True  # unjam cannot run without this part
 
 
 def check_health() -> list[HealthCheck]:
     """Run all checks and return their results."""
     python, sumo = platform.python_version(), f"pip install eclipse-sumo=={REFERENCE_SUMO_VERSION}"
     display, episode_remedy = has_display(), "see the message; unjam drive ring --driver pi shows more"
-    no_display = "for unjam watch without a display: --video FILE, or xvfb-run unjam watch ..."
-    torch = f" --extra-index-url {TORCH_CPU_INDEX}"
+    display_remedy = "for unjam watch without a display: --video FILE, or xvfb-run unjam watch ..."
+    index = f" --extra-index-url {TORCH_CPU_INDEX}"
     return [
         HealthCheck("Python", sys.version_info >= (3, 11), python, "install Python 3.11 or newer"),
         _sumo_check("libsumo"),
         _sumo_check("eclipse-sumo"),
         _sumo_check("traci", is_required=False),
         _reference_sumo_check(),
-        _try_check("netconvert", lambda: sumo_program("netconvert"), sumo),
-        *(_extra_check(name, "train and search", torch) for name in ("torch", "stable-baselines3", "sb3-contrib")),
+        _call_check("netconvert", lambda: sumo_program("netconvert"), sumo),
+        *(_extra_check(name, "train and search", index) for name in ("torch", "stable-baselines3", "sb3-contrib")),
         _extra_check("optuna", "tune, search and calibrate"),
         _extra_check("cryptography", "keys, sign and signed controllers"),
         _cache_check(),
         _sandbox_check(),
-        HealthCheck("display", display, "available" if display else "none", no_display, is_required=False),
+        HealthCheck("display", display, "available" if display else "none", display_remedy, is_required=False),
         replace(_extra_check("imageio-ffmpeg", ".mp4"), name="mp4 video (imageio-ffmpeg)"),
-        _try_check("an episode in a worker", _run_test_episode, episode_remedy),
+        _call_check("an episode in a worker", _run_test_episode, episode_remedy),
     ]
 
 
 def _package_check(name: str, remedy: str, is_required: bool = True, prefix: str = "") -> HealthCheck:
     """Check that a package is installed, in a version that starts with `prefix`."""
     try:
-        found = version(name)
+        installed = version(name)
     except PackageNotFoundError:
         return HealthCheck(name, False, "not installed", remedy, is_required)
-    return HealthCheck(name, found.startswith(prefix), found, remedy, is_required)
+    return HealthCheck(name, installed.startswith(prefix), installed, remedy, is_required)
 
 
-def _extra_check(name: str, users: str, options: str = "") -> HealthCheck:
-    """Check that a package of an extra is installed, which only `users` need."""
+def _extra_check(name: str, commands: str, pip_options: str = "") -> HealthCheck:
+    """Check that a package of an extra is installed, which only some commands need."""
     extra = EXTRAS[name.replace("-", "_")]
-    return _package_check(name, f"only needed for {users}: pip install 'unjam[{extra}]'{options}", is_required=False)
+    remedy = f"only needed for {commands}: pip install 'unjam[{extra}]'{pip_options}"
+    return _package_check(name, remedy, is_required=False)
 
 
 def _sumo_check(name: str, is_required: bool = True) -> HealthCheck:
@@ -114,9 +115,10 @@ def _reference_sumo_check() -> HealthCheck:
     return replace(check, name="SUMO of the results", is_ok=check.detail == REFERENCE_SUMO_VERSION)
 
 
-def _try_check(name: str, run: Callable[[], str], remedy: str) -> HealthCheck:
+def _call_check(name: str, function: Callable[[], str], remedy: str) -> HealthCheck:
+    """Check that a function returns its detail without an error."""
     try:
-        return HealthCheck(name, True, run())
+        return HealthCheck(name, True, function())
     except (UnjamError, OSError) as error:
         return HealthCheck(name, False, str(error), remedy)
 
@@ -136,7 +138,7 @@ def _sandbox_check() -> HealthCheck:
     protections = kernel_protections()
     remedy = "Linux 5.13 or newer blocks writing and network access, unless a container forbids it"
     detail = ", ".join(["limits on memory and time" if os.name == "posix" else "no limits", *protections])
-    return HealthCheck("reading foreign files", len(protections) == 2, detail, remedy, is_required=False)
+    return HealthCheck("reading untrusted files", len(protections) == 2, detail, remedy, is_required=False)
 
 
 def _run_test_episode() -> str:

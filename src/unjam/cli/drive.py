@@ -157,8 +157,8 @@ def watch_command(
         err_console.print("drawing")
         write_video(episode, video, name, pace)
     if json:
-        given = {"scenario": scenario, "backend": backend, "driver": name}
-        print_json({**given, "video": str(video) if video else None, "episode": row})
+        request = {"scenario": scenario, "backend": backend, "driver": name}
+        print_json({**request, "video": str(video) if video else None, "episode": row})
     raise_failure([row])
     if not json and video is not None:
         console.print(f"video: {video}", soft_wrap=True)
@@ -199,7 +199,8 @@ def assess_command(
     ] = "0.05,0.1,0.2",
     episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Maximum number of episodes.")] = 240,
     minutes: Annotated[
-        float | None, Option(help="Maximum time; after the fewest seeds of an answer, none begins that does not fit.")
+        float | None,
+        Option(help="Maximum time: after the minimum number of seeds, no seed begins that would exceed it."),
     ] = None,
     precision: Annotated[
         float, Option(help="Sufficient half-width of the confidence interval of travel time, relative to it.")
@@ -228,7 +229,8 @@ def assess_command(
     from unjam.training.assessment_request import DEFAULT_CONTROLLERS, make_request
 
     drivers, changes = driver or DEFAULT_CONTROLLERS, opt.merge_settings(changes, opt.parse_settings(settings))
-    request = make_request(scenario, _parse_rates(penetration_rates), episodes, precision, minutes, drivers, changes)
+    rates = _parse_penetration_rates(penetration_rates)
+    request = make_request(scenario, rates, episodes, precision, minutes, drivers, changes)
     folder = opt.new_folder(out, f"assess-{Path(scenario).stem}")
     progress = output.ProgressReporter("assessing", "steps")
     resume = output.suggest_resume(folder / REQUEST_FILE, *output.arguments_without("--out"), "--out", folder)
@@ -249,13 +251,13 @@ def assess_command(
     err_console.print(f"report: {assessment.page}", soft_wrap=True)
     if missing := document["missing_budget"]:
         seeds, duration = missing["min_test_seeds"], format_duration(missing["min_seconds"])
-        rest = output.arguments_without("--out", "--driver", "-d", "--episodes", "-n", "--minutes")
+        arguments = output.arguments_without("--out", "--driver", "-d", "--episodes", "-n", "--minutes")
         drivers = [word for name in missing["drivers"] for word in ("-d", name)]
-        command = *rest, *drivers, "--episodes", missing["min_episodes"], "--out", folder
+        command = *arguments, *drivers, "--episodes", missing["min_episodes"], "--out", folder
         output.print_next_command(f"for a verdict ({seeds} test seeds at least, about {duration})", *command)
 
 
-def _parse_rates(text: str) -> list[float]:
+def _parse_penetration_rates(text: str) -> list[float]:
     try:
         return [float(word) for word in text.split(",")]
     except ValueError:

@@ -75,29 +75,29 @@ def with_options(**groups: Callable[..., Any]) -> Callable[[Callable[..., Any]],
 
         options = inspect.signature(command).parameters.items()
         return _with_parameters(
-            wrapper, (option for name, own in options for option in members.get(name, {name: own}).values())
+            wrapper, (option for name, value in options for option in members.get(name, {name: value}).values())
         )
 
     return decorate
 
 
 def with_trust_option(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the option that allows a command to run Python code that a folder of other users names."""
+    """Add the option --trust-code to a command, which allows Python code that a folder names."""
     option = Annotated[bool, Option(TRUST_CODE_OPTION, help="Run Python code that a folder names.")]
-    added = inspect.Parameter("trust_code", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
+    parameter = inspect.Parameter("trust_code", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=option)
 
     @wraps(command)
     def wrapper(*, trust_code: bool, **arguments: Any) -> None:
         with trusting_code() if trust_code else nullcontext():
             command(**arguments)
 
-    return _with_parameters(wrapper, [*inspect.signature(command).parameters.values(), added])
+    return _with_parameters(wrapper, [*inspect.signature(command).parameters.values(), parameter])
 
 
 def _with_parameters(command: Callable[..., None], parameters: Iterable[inspect.Parameter]) -> Callable[..., None]:
     """Set the signature from which typer makes the options of a command."""
-    keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
-    command.__signature__ = inspect.Signature(keywords)  # pyright: ignore[reportFunctionMemberAccess]
+    keyword_parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
+    command.__signature__ = inspect.Signature(keyword_parameters)  # pyright: ignore[reportFunctionMemberAccess]
     return command
 
 
@@ -109,10 +109,10 @@ def network_changes(
     end: Annotated[float | None, Option(help="End time on your own network [s].")] = None,
     humans: HumansOption = None,
 ) -> dict[str, Any]:
-    """Return the scenario settings that the options for user networks set."""
+    """Return the scenario settings from the options for user networks."""
     file = humans if humans is None or humans.startswith(PACKAGED_PREFIX) else str(Path(humans).absolute())
     classes = cav_classes.split(",") if cav_classes else None
-    return _without_none({"cav_classes": classes, "begin": begin, "end": end, "population": file})
+    return _drop_none({"cav_classes": classes, "begin": begin, "end": end, "population": file})
 
 
 @with_options(network=network_changes)
@@ -131,7 +131,7 @@ def scenario_changes(
     platoon: Annotated[str | None, Option(help="Vehicles behind the recorded one: `human*2 cav human*20`.")] = None,
     network: dict[str, Any],
 ) -> dict[str, Any]:
-    """Return the scenario settings that the options of a command set."""
+    """Return the scenario settings from the options of a command."""
     changes = {
         "length": parse_range("length", length),
         "radius": parse_range("radius", radius),
@@ -143,15 +143,15 @@ def scenario_changes(
         "recordings": None if recordings is None else str(Path(recordings).absolute()),
         "platoon": platoon,
     }
-    return _without_none(changes) | network
+    return _drop_none(changes) | network
 
 
-def _without_none(values: dict[str, Any]) -> dict[str, Any]:
+def _drop_none(values: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
 TrainingOptions = tuple[Path | None, str, dict[str, Any]]
-"""arguments of `load_config`: TOML file, name of the preset, and values of other options and of `--set`, by key"""
+"""arguments of `load_config`: TOML file, name of a preset, and values of other options and of `--set` by key"""
 
 
 def training_options(
@@ -173,12 +173,11 @@ def training_options(
 ) -> TrainingOptions:
     """Return the values of the options that configure a training."""
     options = {"scenario": scenario, "steps": steps, "seed": seed, "agent": agent, "expert": expert}
-    options = _without_none({**options, "reward": reward or None})
+    options = _drop_none({**options, "reward": reward or None})
     return config, preset, merge_settings(options, parse_settings(settings))
 
 
-MAX_NUMBER_DIGITS = 10
-"""a length or a radius has fewer digits than this"""
+NUMBER_LENGTH_LIMIT = 10  # characters; a length or a radius has fewer
 
 
 def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
@@ -186,18 +185,18 @@ def parse_range(name: str, text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     parts = text.split("-")
-    if len(parts) > 2 or not all(part.strip().isdecimal() and len(part) < MAX_NUMBER_DIGITS for part in parts):
+    if len(parts) > 2 or not all(part.strip().isdecimal() and len(part) < NUMBER_LENGTH_LIMIT for part in parts):
         raise invalid_value(name, text, "meters, like 230 or 220-270")
     return int(parts[0]), int(parts[-1])
 
 
 def parse_settings(texts: list[str] | None, option: str = "--set") -> dict[str, Any]:
-    """Return the values of texts like `key=value`, by key; errors name the `option`."""
+    """Return the values of texts like `key=value` by key; errors begin with `option`."""
     return parse_assignments(texts or [], option)
 
 
 def new_folder(out: Path | None, name: str) -> Path:
-    """Return the folder for new results: `out`, or the next free one under `runs/`, made for this process alone."""
+    """Return the folder for new results: `out`, or the next free folder under `runs/`, created for this process."""
     if out is not None:
         return out
     stem = Path(name).stem  # a scenario may be a file

@@ -1,4 +1,4 @@
-"""Output of the command line: tables, one JSON document, progress on standard error, and suggested next commands."""
+"""Output of the command line: tables, JSON, progress on standard error, and suggestions of next commands."""
 
 import json
 import shlex
@@ -28,32 +28,32 @@ from unjam.measures.statistics import Estimate, is_expert_unchanged
 from unjam.measures.verdict import short_table_metrics, verdicts
 from unjam.text import format_duration, printable, split_label
 
-PROGRESS_LINE_SECONDS = 5.0  # time between two plain lines of progress without a terminal
-MIN_TIMED_SECONDS = 1.0  # time of a count from which the rest is estimated
-NARROW_COLUMN_WIDTHS = 18, 7  # widths of the columns of metrics and units in a narrow terminal [characters]
-WIDE_OPTIONS_WIDTH = 130  # width from which a cell of the main table of an assessment is one line [characters]
-MAX_HEADING_LENGTH = 45  # length of the name of a driver from which a table shows its beginning only [characters]
+PROGRESS_LINE_SECONDS = 5.0  # between two lines of progress without a terminal
+MIN_TIMED_SECONDS = 1.0  # elapsed time from which the remaining time is estimated
+NARROW_COLUMN_WIDTHS = 18, 7  # columns of metrics and units in a narrow terminal [characters]
+WIDE_OPTIONS_WIDTH = 130  # of a terminal for one line per row in the main table of an assessment [characters]
+MAX_HEADING_LENGTH = 45  # headings shorten longer names of drivers [characters]
 TEXT_COLUMN_WIDTHS = {" ": 22, "\n": 15}
-"""width of headings and verdicts [characters], by what separates a mean from its interval: that of most numbers"""
+"""width of headings and verdicts, as that of most numbers [characters]; by separator of mean and interval"""
 
 
 class TerminalConsole(Console):
-    """A console that shows no control characters of texts from files, whatever prints them."""
+    """A console that replaces control characters in texts from files."""
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Yield the segments of something printed."""
+        """Yield the segments of a renderable without control characters in the text."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(printable(segment.text), segment.style)
 
 
-def _width(stream: TextIO) -> int | None:
-    """Return the width without a terminal, that of COLUMNS or 80 characters; None with one, which can change."""
+def _fixed_width(stream: TextIO) -> int | None:
+    """Return the width for a file or pipe: COLUMNS or 80 characters; None for a terminal, which can be resized."""
     return None if stream.isatty() else get_terminal_size().columns
 
 
-console = TerminalConsole(highlight=False, markup=False, emoji=False, width=_width(sys.stdout))
-err_console = TerminalConsole(stderr=True, highlight=False, markup=False, emoji=False, width=_width(sys.stderr))
-"""progress and messages; standard output is for results"""
+console = TerminalConsole(highlight=False, markup=False, emoji=False, width=_fixed_width(sys.stdout))
+err_console = TerminalConsole(stderr=True, highlight=False, markup=False, emoji=False, width=_fixed_width(sys.stderr))
+"""for progress and messages, because standard output is for results"""
 
 
 def print_json(document: Any) -> None:
@@ -62,13 +62,13 @@ def print_json(document: Any) -> None:
 
 
 def new_table(text_columns: Sequence[str] = (), number_columns: Sequence[str] = ()) -> Table:
-    """Return an empty table: columns of text (units dim), then of numbers; headings in bold.
+    """Return an empty table with columns of text, then columns of numbers.
 
-    Nothing is cut; names in the first column, which a reader copies, are not broken, unless they are of quantities.
+    No text is cut. Names in the first column are not wrapped, so that they can be copied, but names of quantities are.
     """
     table = Table(box=None, pad_edge=False, header_style="bold", show_header=any(text_columns))
-    for number, heading in enumerate(text_columns):
-        is_name, color = number == 0 and "unit" not in text_columns, "dim" if heading == "unit" else None
+    for index, heading in enumerate(text_columns):
+        is_name, color = index == 0 and "unit" not in text_columns, "dim" if heading == "unit" else None
         table.add_column(heading, style=color, overflow="fold", no_wrap=is_name)
     for heading in number_columns:
         table.add_column(heading, justify="right", overflow="fold")
@@ -78,7 +78,7 @@ def new_table(text_columns: Sequence[str] = (), number_columns: Sequence[str] = 
 def print_results(
     rows_by_driver: RowsByDriver, shows_all: bool, baseline: str = "", first_metrics: Sequence[str] = ()
 ) -> None:
-    """Print the verdicts on drivers and the metrics that matter on their road, or all metrics with differences."""
+    """Print verdicts on drivers, and the main metrics of their road or all metrics with differences."""
     for verdict in verdicts(rows_by_driver, baseline):
         for line in verdict.lines:
             print_wrapped(line)
@@ -99,27 +99,27 @@ def print_wrapped(line: str) -> None:
 def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[str] = METRICS) -> None:
     """Print feasibility, metrics with 95 % confidence intervals, and the differences to a baseline if there is one.
 
-    If the terminal is too narrow for all drivers, intervals are below means; if it is still too narrow, there are
-    several tables. Long names of drivers are below them.
+    In a narrow terminal intervals are below means; if this does not suffice, there are several tables. Long names of
+    drivers are listed below the tables.
     """
     headings, rows = metric_table(rows_by_driver, baseline, names)
     long_labels = [label for label in rows_by_driver if len(label) > MAX_HEADING_LENGTH]
     for number, label in enumerate(long_labels, 1):
         headings = [heading.replace(label, f"{label.partition(':')[0]}:… ({number})") for heading in headings]
-    columns = {label: [number] for number, label in enumerate(rows_by_driver)}
-    compared = [label for label in columns if label != baseline]
-    for label, number in zip(compared, range(len(columns), len(headings)), strict=False):
-        columns[label].append(number)  # without a baseline there are no differences
+    columns = {label: [index] for index, label in enumerate(rows_by_driver)}
+    compared_labels = [label for label in columns if label != baseline]
+    for label, index in zip(compared_labels, range(len(columns), len(headings)), strict=False):
+        columns[label].append(index)  # a difference; without a baseline there are none
 
     def build_table(columns: Sequence[int], separator: str) -> Table:
         width = TEXT_COLUMN_WIDTHS[separator]
-        table = new_table(("metric", "unit"), [break_label(headings[number], width) for number in columns])
+        table = new_table(("metric", "unit"), [break_label(headings[index], width) for index in columns])
         for column in table.columns[2:]:
             column.no_wrap = True
         if separator != " ":
             table.columns[0].width, table.columns[1].width = NARROW_COLUMN_WIDTHS
         for row in rows:
-            cells = ((fill(row.cells[number].mean, width), row.cells[number].interval) for number in columns)
+            cells = ((fill(row.cells[index].mean, width), row.cells[index].interval) for index in columns)
             texts = (Text.assemble(mean, separator, (ci, "dim")) if ci else Text(mean) for mean, ci in cells)
             table.add_row(row.label, row.unit, *texts)
         return table
@@ -130,9 +130,9 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
 
     separator = " " if fits(range(len(headings)), " ") else "\n"
     blocks = [list[int]()]
-    for values_of_column in columns.values():
-        block = sorted([*blocks[-1], *values_of_column])
-        blocks[-1:] = [block] if not blocks[-1] or fits(block, separator) else [blocks[-1], values_of_column]
+    for driver_columns in columns.values():
+        block = sorted([*blocks[-1], *driver_columns])
+        blocks[-1:] = [block] if not blocks[-1] or fits(block, separator) else [blocks[-1], driver_columns]
     for block in blocks:
         console.print(build_table(block, separator))
     for number, label in enumerate(long_labels, 1):
@@ -140,37 +140,37 @@ def print_metrics(rows_by_driver: RowsByDriver, baseline: str, names: Iterable[s
 
 
 def break_label(label: str, width: int) -> str:
-    """Return the name of a driver in lines of at most `width` characters, broken after punctuation where possible."""
+    """Break the name of a driver into lines of at most `width` characters, after punctuation if possible."""
     lines = [""]
-    for part in (piece for word in split_label(label) for piece in wrap(word, width, drop_whitespace=False)):
+    for part in (part for word in split_label(label) for part in wrap(word, width, drop_whitespace=False)):
         lines[-1:] = [lines[-1] + part] if len(lines[-1] + part) <= width else [lines[-1], part]
     return "\n".join(filter(None, lines))
 
 
 def print_options(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print the main table of an assessment without its last two columns, which are verdicts."""
-    narrow = console.width < WIDE_OPTIONS_WIDTH
-    split = [text.replace(" − ", "\n− ").replace(" [", "\n[") if narrow else text for text in headings]
-    table = new_table(split[:2], split[2:-2])
-    table.columns[1].max_width, table.columns[1].overflow = NARROW_COLUMN_WIDTHS[0] - 6 if narrow else None, "fold"
+    is_narrow = console.width < WIDE_OPTIONS_WIDTH
+    broken_headings = [text.replace(" − ", "\n− ").replace(" [", "\n[") if is_narrow else text for text in headings]
+    table = new_table(broken_headings[:2], broken_headings[2:-2])
+    table.columns[1].max_width, table.columns[1].overflow = NARROW_COLUMN_WIDTHS[0] - 6 if is_narrow else None, "fold"
     for column in table.columns[2:]:
         column.no_wrap = True
     for row in rows:
-        table.add_row(*(text.replace(" [", "\n[") if narrow else text for text in row[:-2]))
+        table.add_row(*(text.replace(" [", "\n[") if is_narrow else text for text in row[:-2]))
     console.print(table)
 
 
 def print_notes(notes: Sequence[str]) -> None:
-    """Print what a reader of the metrics should know, a line for each note."""
+    """Print notes on the metrics, one line each."""
     for note in notes:
         err_console.print(f"note: {note}", soft_wrap=True)
 
 
 class ProgressReporter:
-    """Progress of a count: a bar on a terminal, plain lines now and then elsewhere."""
+    """Shows the progress of counted work: a bar on a terminal, elsewhere occasional plain lines."""
 
     def __init__(self, label: str, unit: str = "", total: int | None = None) -> None:
-        """Prepare to count steps, named `unit`, of the work that `label` names."""
+        """Prepare to count work named `label` in steps named `unit`."""
         self._label, self._unit = label, f" {unit}" if unit else ""
         self._is_plain = not err_console.is_terminal
         columns = (TextColumn("{task.description}"), BarColumn(16), TaskProgressColumn(), TimeRemainingColumn())
@@ -189,19 +189,19 @@ class ProgressReporter:
             self._bar.stop()
 
     def __call__(self, done: int, total: int) -> None:
-        """Show that `done` of `total` are done."""
+        """Show that `done` of `total` steps are done."""
         self._bar.update(self._task, completed=done, total=total)
         now = time.monotonic()
         self._start_time = self._start_time or now
         if self._is_plain and now - self._last_line > PROGRESS_LINE_SECONDS:
             self._last_line = now
-            elapsed, left = now - self._start_time, ""
+            elapsed, remaining = now - self._start_time, ""
             if 0 < done < total and elapsed >= MIN_TIMED_SECONDS:
-                left = f", {format_duration(elapsed * (total - done) / done)} left"
-            err_console.print(f"{self._label}: {done:,} of {total:,}{self._unit}{left}")
+                remaining = f", {format_duration(elapsed * (total - done) / done)} left"
+            err_console.print(f"{self._label}: {done:,} of {total:,}{self._unit}{remaining}")
 
     def begin(self, label: str, total: int) -> None:
-        """Begin to count the steps of another work from zero, with a line that says so."""
+        """Begin to count the steps of other work, named `label`, from zero."""
         self._label, self._total, self._done = label, total, {}
         self._start_time, self._last_line = None, time.monotonic()
         self._bar.reset(self._task, description=label, total=total)
@@ -209,13 +209,13 @@ class ProgressReporter:
             err_console.print(label)
 
     def update(self, episode: Any, steps: int) -> None:
-        """Show the progress of parallel episodes: one has made so many steps, of the `total` of all."""
+        """Show the progress of parallel episodes, of which one has made `steps` steps."""
         self._done[episode] = steps
         self(sum(self._done.values()), self._total)
 
 
 def print_next_command(reason: str, *arguments: object) -> None:
-    """Suggest a command line, without line breaks so that it can be copied."""
+    """Suggest a command line without line breaks, so that it can be copied."""
     err_console.print(f"{reason}: {shlex.join(['unjam', *map(str, arguments)])}", soft_wrap=True)
 
 
@@ -228,7 +228,7 @@ def suggest_after_drive(
     is_drawable: bool = True,
     controller: str = DEFAULT_DRIVER,
 ) -> None:
-    """Suggest the next command on the same road: compare with others, train on an expert, or watch if possible."""
+    """Suggest the next command on the same road: compare drivers, train on an expert, or watch a controller."""
     controllers = [driver for driver in drivers if driver != "human"]
     if "human" not in drivers:
         print_next_command("compare with human drivers", *arguments_without("--out"), "-d", "human")
@@ -238,7 +238,7 @@ def suggest_after_drive(
         command = "train", scenario, "--expert", controllers[-1], "--preset", "demo"
         options = setting_options(changes, "scenario_options.", reward, backend)
         print_next_command("train on an expert", *command, *options)
-    elif is_drawable and not controllers[-1].partition(":")[0].endswith(".zip"):  # in this process only
+    elif is_drawable and not controllers[-1].partition(":")[0].endswith(".zip"):  # cannot run in a worker
         command = "watch", scenario, "-d", controllers[-1], "--video", f"{Path(scenario).stem}.gif"
         print_next_command(f"watch {controllers[-1]}", *command, *setting_options(changes, backend=backend))
 
@@ -246,9 +246,9 @@ def suggest_after_drive(
 def setting_options(
     changes: Mapping[str, Any], prefix: str = "", reward: str = "", backend: str = "sumo"
 ) -> Iterator[str]:
-    """Yield the command-line options that set these values, each key with a prefix, the reward, and the backend.
+    """Yield command-line options that set these values, each key with `prefix`, the reward, and the backend.
 
-    With a prefix the command has a configuration, of which the backend is a setting.
+    A command with a prefix has a configuration, in which the backend is a setting.
     """
     if reward:
         yield from ("--reward", reward)
@@ -259,34 +259,34 @@ def setting_options(
 
 
 def setting_text(value: Any) -> str:
-    """Return a value as `--set` reads it: a text as it is, others as TOML."""
+    """Return a value as `--set` reads it: a text unchanged, other values as TOML."""
     return value if isinstance(value, str) else _toml_text(value)
 
 
 def _toml_text(value: Any) -> str:
     if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{key} = {_toml_text(each)}' for key, each in value.items())}}}"
+        return f"{{{', '.join(f'{key} = {_toml_text(entry)}' for key, entry in value.items())}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_toml_text, value))}]"
     return json.dumps(value)
 
 
 def arguments_without(*options: str) -> list[str]:
-    """Return the arguments of the running command without options that have a value."""
-    rest, words = list[str](), iter(sys.argv[1:])
+    """Return the arguments of the running command without these options, which have values."""
+    arguments, words = list[str](), iter(sys.argv[1:])
     for word in words:
         if word in options:
             next(words, "")
         elif not any(word.startswith(f"{option}=" if option.startswith("--") else option) for option in options):
-            rest.append(word)
-    return rest
+            arguments.append(word)
+    return arguments
 
 
 def suggest_after_training(folder: Path, gain: "Estimate | None", steps: int, run: Path, is_finished: bool) -> None:
-    """Suggest to export the controller if its gain is positive or unknown, else to continue an unfinished training.
+    """Suggest to export the controller if its gain is positive or unknown, or else to continue an unfinished training.
 
-    `folder` is that of a road, and `run` that of the training; with one road they are the same. `gain` is None
-    with a single test seed.
+    `folder` has the results of one road, and `run` the training; for a training on one road both are the same. `gain`
+    is None for a single test seed.
     """
     if gain is None or gain.low > 0:
         print_next_command("export it", "export", folder, "--out", f"{folder.name}.unjam")
@@ -299,7 +299,7 @@ def suggest_after_training(folder: Path, gain: "Estimate | None", steps: int, ru
 
 @contextmanager
 def suggest_resume(file: Path, *command: object) -> Iterator[None]:
-    """Print the command that resumes some work if the body raises an error, and the file that it needs is there."""
+    """Print the command that resumes the work if the block raises an error, and `file`, which it needs, exists."""
     try:
         yield
     except BaseException as error:

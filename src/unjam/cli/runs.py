@@ -1,4 +1,4 @@
-"""Results of training runs: `unjam evaluate`, `model`, `report`, and `unjam runs` to list, compare and remove runs."""
+"""Results of training runs: `unjam evaluate`, `model`, `report`, and `unjam runs`, which lists and removes runs."""
 
 import sys
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ def evaluate_command(
     humans: opt.HumansOption = None,
     out: Annotated[
         Path | None,
-        Option(help="Folder for the results.", show_default="the run's own; of a part, a new one under runs/"),
+        Option(help="Folder for the results.", show_default="the run; for a partial evaluation, a new one under runs/"),
     ] = None,
     workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
     show_all: opt.AllMetricsOption = False,
@@ -54,9 +54,9 @@ def evaluate_command(
 ) -> None:
     """Compare a trained controller with every expert and the human baseline on fixed test seeds.
 
-    The evaluation and the report of the run are replaced, unless --out names another folder. Only a complete
-    evaluation replaces them: one with selected drivers (-d), other human drivers (--humans) or fewer episodes than
-    in the configuration of the run has a folder of its own.
+    A complete evaluation replaces the evaluation and the report of the run, unless --out names another folder. A
+    partial evaluation, with selected drivers (-d), other human drivers (--humans) or fewer episodes than in the
+    configuration of the run, is written into a new folder.
 
     Examples:
 
@@ -95,7 +95,7 @@ def evaluate_command(
     if json:
         gain, means = gain_over_expert(config, evaluation.rows), evaluation.means()
         facts = {"run": str(run), "folder": str(target), "scenario": config.scenario, "gain": gain and asdict(gain)}
-        drivers = [{"driver": one, "episodes": rows, "mean": means[one]} for one, rows in evaluation.rows.items()]
+        drivers = [{"driver": name, "episodes": rows, "mean": means[name]} for name, rows in evaluation.rows.items()]
         print_json({**facts, "drivers": drivers, "notes": results.metadata["notes"]})
         return
     output.print_wrapped(main_finding(results))
@@ -109,8 +109,8 @@ def model_command(
 ) -> None:
     """Show the errors of a run's learned model relative to the environment.
 
-    The errors are root mean squares on episodes that were not used for training. They are listed together with
-    the errors of the base model alone and the size of the predicted changes. For a model of whole roads, the
+    The errors are root mean squares on episodes that were not used for training, next to the errors of the base
+    model alone and the size of the predicted changes. For a model of whole roads, the
     command compares the waves in model rollouts with those in a recorded episode. The report of the run, which
     contains the figures, is written again.
 
@@ -226,9 +226,9 @@ def list_runs_command(
     table = output.new_table(("run", "scenario", "preset", "state"), ("steps", "difference to expert"))
     for run in runs:
         steps = f"{run.steps:,}" if run.state == "finished" else f"{run.steps:,} of {run.config.steps:,}"
-        for number, (road, config) in enumerate(run.config.task_configs().items()):
-            cells = ("", "", "") if number else (run.config.preset or "–", run.state, steps)
-            name = f"  {road}" if number else run.name
+        for index, (road, config) in enumerate(run.config.task_configs().items()):
+            cells = ("", "", "") if index else (run.config.preset or "–", run.state, steps)
+            name = f"  {road}" if index else run.name
             reward = f", reward {config.reward}" if config.reward else ""
             table.add_row(name, f"{Path(config.scenario).name}{reward}", *cells, _gain_text(run.gains[road]))
     console.print(table)
@@ -278,7 +278,7 @@ def progress_command(
     folder: RunsFolderOption = DEFAULT_RUNS_FOLDER,
     json: opt.JsonOption = False,
 ) -> None:
-    """Print the progress of a run as CSV, a row per iteration; names of nested values contain dots.
+    """Print the progress of a run as CSV with a row per iteration; names of nested values contain dots.
 
     Example:
 
@@ -322,13 +322,14 @@ def remove_command(
         size = sum(path.stat().st_size for path in run.folder.rglob("*") if path.is_file()) / 1e6
         question = f"Remove {run.folder} ({run.state}, {run.steps:,} steps, {size:.0f} MB)?"
         if yes or typer.confirm(printable(question)):
-            others = [str(path.relative_to(run.folder)) for path in remove_run(run.folder)]
-            kept = f", except files that unjam did not write: {shorten_list(others)}" if others else ""
-            err_console.print(f"removed {run.folder}{kept}", soft_wrap=True)
+            remaining = [str(path.relative_to(run.folder)) for path in remove_run(run.folder)]
+            note = f", except files that unjam did not write: {shorten_list(remaining)}" if remaining else ""
+            err_console.print(f"removed {run.folder}{note}", soft_wrap=True)
     if json:
         print_json({"removed": [str(run.folder) for run in runs]})
 
 
 def _find_runs(names: Sequence[str], folder: Path) -> list[Any]:
+    """Return the runs with these names, each once."""
     runs = (read_run(find_run(name, folder), name) for name in names)
     return list({run.folder.resolve(): run for run in runs}.values())

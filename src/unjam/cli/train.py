@@ -1,4 +1,4 @@
-"""`unjam train` runs one training, and `unjam search` many of them to find better settings."""
+"""`unjam train` runs one training, and `unjam search` runs many trainings to find better settings."""
 
 import time
 from contextlib import nullcontext
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from unjam.training.train import TrainResult
 
 PROGRESS_LINES, MAX_SILENCE = 20, 600.0
-"""without a terminal: number of plain lines of progress, after equally many steps, and longest time between two [s]"""
+"""without a terminal: number of lines of progress at regular steps, and maximum time between two lines [s]"""
 STEP_OVERRUN_RATIO = 1.1
-"""ratio of planned to requested steps above which a note is printed, as only whole iterations are trained"""
+"""ratio of planned to requested steps above which a note is printed; all iterations are complete"""
 EVALUATION_LABEL = "evaluating on test seeds"
 
 
@@ -73,13 +73,13 @@ def train_command(
         config = load_config(config_file, preset, changes)
         folder = opt.new_folder(out, config.scenario)
     check_config(config)
-    # These import torch, which takes seconds: errors in the arguments are reported before.
+    # These import torch, which takes seconds; errors in the arguments are reported earlier.
     from unjam.reports.summary import main_finding
     from unjam.training.tensorboard import tensorboard_writer
     from unjam.training.train import train
 
     if resume is None:
-        with removing_if_empty(folder):  # a folder that is not empty is refused before the plan is printed
+        with removing_if_empty(folder):  # refuses a folder with files before the plan is printed
             make_new_folder(folder, f", or --resume {folder}")
         if (steps := planned_steps(config)) > STEP_OVERRUN_RATIO * config.steps:
             err_console.print(f"note: iterations are complete: {steps:,} steps will be trained, not {config.steps:,}")
@@ -114,7 +114,7 @@ def train_command(
 
 
 def _result_facts(road: "TrainResult", run: "TrainResult") -> dict[str, Any]:
-    """Return the result of a run on one road for JSON; for a run on a single road, both arguments are the same."""
+    """Return the results of a run on one road for JSON; for a run on a single road both arguments are the same."""
     return {
         **{"folder": str(road.folder), "controller": str(road.controller), "report": str(run.report)},
         "gain": asdict(road.gain) if road.gain else None,
@@ -124,18 +124,18 @@ def _result_facts(road: "TrainResult", run: "TrainResult") -> dict[str, Any]:
 
 
 class _TrainingProgress(output.ProgressReporter):
-    """Progress of training: a bar with the latest returns on a terminal, plain lines elsewhere."""
+    """Shows the progress of a training: a bar with the latest returns on a terminal, elsewhere plain lines."""
 
     def __init__(self, config: "RunConfig", folder: Path) -> None:
         self._config, self._folder, self._steps = config, folder, planned_steps(config)
         super().__init__(f"training into {folder}", "steps", self._steps)
         self._validation_text, self._worst_road = "-", ""
-        self._start = self._last_line = time.monotonic()
-        self._first_row: tuple[int, float] | None = None
-        self._next_steps = 0.0
+        self._init_time = self._last_line = time.monotonic()
+        self._first_report: tuple[int, float] | None = None  # steps and time
+        self._next_line_steps = 0.0
 
     def show_iteration(self, row: dict[str, Any]) -> None:
-        """Show the progress row of an iteration."""
+        """Show the progress after an iteration, from its row of metrics."""
         if row["return_validation"] is not None:
             self._validation_text = f"{row['return_validation']:.0f} at {row['environment_steps']:,}"
             self._worst_road = _worst_road_text(row.get("tasks", {}))
@@ -144,25 +144,25 @@ class _TrainingProgress(output.ProgressReporter):
         steps, total = row["environment_steps"], self._steps
         self._bar.update(self._task, completed=steps, description=text)
         now = time.monotonic()
-        left = self._time_left_text(row["iteration"], steps, now)
-        if self._is_plain and (steps >= min(self._next_steps, total) or now - self._last_line > MAX_SILENCE):
-            part = total / PROGRESS_LINES
-            self._next_steps, self._last_line = part * (1 + steps // part), now
-            line = f"iteration {row['iteration']}: {steps:,} of {total:,} steps, {text}{left}"
+        remaining = self._remaining_time_text(row["iteration"], steps, now)
+        if self._is_plain and (steps >= min(self._next_line_steps, total) or now - self._last_line > MAX_SILENCE):
+            interval = total / PROGRESS_LINES
+            self._next_line_steps, self._last_line = interval * (1 + steps // interval), now
+            line = f"iteration {row['iteration']}: {steps:,} of {total:,} steps, {text}{remaining}"
             err_console.print(line, soft_wrap=True)
 
-    def _time_left_text(self, iteration: int, steps: int, now: float) -> str:
-        """Return the time that the rest of the training will take; empty at the end, and if nothing is known yet."""
+    def _remaining_time_text(self, iteration: int, steps: int, now: float) -> str:
+        """Return the expected remaining time of the training; empty at the end and while it is unknown."""
         total = self._steps
-        if self._first_row is None:
-            self._first_row = (0, self._start) if iteration == 1 else (steps, now)  # else it was resumed
-        first_steps, start = self._first_row
+        if self._first_report is None:
+            self._first_report = (0, self._init_time) if iteration == 1 else (steps, now)  # a resumed training
+        first_steps, first_time = self._first_report
         if not first_steps < steps < total:
             return ""
-        return f", {format_duration((total - steps) * (now - start) / (steps - first_steps))} left"
+        return f", {format_duration((total - steps) * (now - first_time) / (steps - first_steps))} left"
 
     def show_evaluation(self, episode: tuple[str, int], steps: int) -> None:
-        """Show the progress of the evaluation after the training."""
+        """Show the progress of an episode in the evaluation after the training."""
         if not self._done:
             roads = self._config.task_configs().items()
             self._total = sum(evaluation_steps(road, self._folder / name) for name, road in roads)
@@ -174,7 +174,7 @@ class _TrainingProgress(output.ProgressReporter):
 
 
 def _plan_text(config: "RunConfig") -> str:
-    """Return what a training will do."""
+    """Return a line on the plan of a training: learner, expert, roads and steps."""
     tasks = config.task_configs().values()
     roads = f"{len(tasks)} roads" if len(tasks) > 1 else Path(config.scenario).name
     policy = f"{config.agent} without an expert" if config.expert == "none" else f"{config.agent} on {config.expert}"
@@ -185,7 +185,7 @@ def _plan_text(config: "RunConfig") -> str:
 
 
 def _worst_road_text(roads: dict[str, dict[str, Any]]) -> str:
-    """Return the road with the smallest difference between validation and expert; empty for a single road."""
+    """Return a text on the road with the smallest difference of validation to expert; empty for a single road."""
     if not roads:
         return ""
     differences = {road: row["return_validation"] - row["return_expert"] for road, row in roads.items()}
@@ -230,20 +230,20 @@ def search_command(
         err_console.print(f"searching {', '.join(space)} in {plan}", soft_wrap=True)
     resume = output.suggest_resume(folder / REQUEST_FILE, *output.arguments_without("--out"), "--out", folder)
     with lock_new_folder(folder, resumable_file=REQUEST_FILE), resume:
-        found = search(base, space, trials, folder, workers, executor, on_message)
+        results = search(base, space, trials, folder, workers, executor, on_message)
     best = folder / BEST_CONFIG_FILE
     if json:
         rows = [
-            {"trial": each.number, "gain": each.gain, "last_gain": each.last_gain, "values": each.values}
-            for each in found
+            {"trial": trial.number, "gain": trial.gain, "last_gain": trial.last_gain, "values": trial.values}
+            for trial in results
         ]
         print_json({"folder": str(folder), "best": str(best), "trials": rows})
         return
-    for trial in found[:5]:
+    for trial in results[:5]:
         console.print(describe_trial(trial))
-    untrained = sum(trial.gain is not None and trial.gain <= 0 for trial in found)
-    console.print(f"{untrained} of {format_count(len(found), 'training')} kept the untrained network")
-    if any(trial.gain is not None and trial.gain > 0 for trial in found):
+    untrained = sum(trial.gain is not None and trial.gain <= 0 for trial in results)
+    console.print(f"{untrained} of {format_count(len(results), 'training')} kept the untrained network")
+    if any(trial.gain is not None and trial.gain > 0 for trial in results):
         output.print_next_command("train with the best", "train", "--config", best)
     else:
         err_console.print("no gain is shown with any of these settings: vary others, or train longer (--steps)")

@@ -13,7 +13,7 @@ from unjam.drivers.local_state import LocalState
 from unjam.errors import InputError
 from unjam.files import UNREADABLE_ERRORS, parse_json
 from unjam.parameters import build_dataclass, flatten_keys
-from unjam.text import one_line
+from unjam.text import to_one_line
 from unjam.worlds.record import Episode
 
 IRRELEVANT_PARAMETERS = {
@@ -99,7 +99,7 @@ def _is_within(training_value: Any, value: Any) -> bool:
 
 def _value_text(value: Any) -> str:
     """Return a value from an untrusted file on one line; a range as `low-high`."""
-    return one_line("-".join(map(str, dict.fromkeys(value))) if isinstance(value, list | tuple) else value)
+    return to_one_line("-".join(map(str, dict.fromkeys(value))) if isinstance(value, list | tuple) else value)
 
 
 def outside_domain_share(controller: Controller, states: LocalState) -> float:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from unjam.drivers.command import answer_as_array
+from unjam.drivers.command import to_answer_array
 from unjam.drivers.driver import Driver, Memory, check_memory
 from unjam.drivers.local_state import COMMON_FIELDS, FIELD_SIZES, SECTIONS_AHEAD, LocalState, state_of_ones
 from unjam.drivers.user_driver import DriverLike, as_driver
@@ -85,7 +85,7 @@ def _call_act(driver: Driver, state: LocalState, memory: Memory, step: int) -> t
 
 def check_acceleration(acceleration: Any, rows: int, context: str) -> np.ndarray:
     """Return the answer of a driver as an array; raise `InputError` unless it is finite and has `rows` rows."""
-    array = answer_as_array(acceleration, rows, f"driver: {context}")
+    array = to_answer_array(acceleration, rows, f"driver: {context}")
     if not np.isfinite(array).all():
         raise InputError(f"driver: {context}: acceleration is {array[~np.isfinite(array)][0]}; allowed: finite")
     return array

@@ -8,7 +8,7 @@ import numpy as np
 
 from unjam.errors import InputError
 from unjam.physics.arrays import Array, Floats, clip, namespace
-from unjam.text import one_line
+from unjam.text import to_one_line
 
 
 class Command(NamedTuple):
@@ -42,16 +42,17 @@ def _as_doubles(answer: Any) -> Floats:
     return array.astype(np.float64, copy=False)
 
 
-def as_numbers(answer: Any, label: str, allowed: str = "", to_array: Callable[[Any], Array] = _as_doubles) -> Floats:
+def as_numbers(
+    answer: Any, label: str, allowed: str = "real numbers", to_array: Callable[[Any], Array] = _as_doubles
+) -> Floats:
     """Return the answer of a user's code as an array, made by `to_array`; raise `InputError` unless it is numbers."""
     try:
         return to_array(answer)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # the last for tensors with a gradient
-        reason = f"{label} is not numbers: {one_line(repr(answer), 60)}"
-        raise InputError(f"{reason}; allowed: {allowed}" if allowed else reason) from None
+        raise InputError(f"{label} is not numbers: {to_one_line(repr(answer), 60)}; allowed: {allowed}") from None
 
 
-def answer_as_array(
+def to_answer_array(
     answer: Any, rows: int, context: str, quantity: str = "acceleration", row_name: str = "CAV"
 ) -> Floats:
     """Return the answer of a driver or a reward as an array; raise `InputError` unless its shape is (rows,)."""
@@ -66,7 +67,8 @@ def batch_commanded_accelerations(command: Command | None, limits: Limits, rows:
     """Return the commands within the limits, shape (rows,) [m/s2]; `InputError` unless they are finite, one a row."""
     values: Any = () if command is None else command.acceleration
     if np.shape(values) != (rows,) or not bool(namespace(values).isfinite(values).all()):
-        raise InputError(f"driver: step {step}: not {rows} accelerations that are finite")
+        allowed = f"{rows} finite numbers, one for each CAV"
+        raise InputError(f"driver: step {step}: acceleration is not allowed; allowed: {allowed}")
     return limits.clip(values)
 
 
@@ -81,7 +83,7 @@ def commanded_accelerations(command: Command | None, limits: Limits, names: Sequ
     if is_float and isfinite(found):  # the fast path, in every step of a simulator
         return [limits.clip(found)]
     context = f"driver: step {step}"
-    values = answer_as_array([found] if is_float else found, rows, context)
+    values = to_answer_array([found] if is_float else found, rows, context)
     if not all(map(isfinite, values.tolist())):  # faster than NumPy for few vehicles
         _raise_not_finite(values, names, f"{context}: acceleration", "finite")
     return limits.clip(values).tolist()
@@ -95,7 +97,7 @@ def commanded_time_gaps(command: Command | None, min_time_gap: float, names: Seq
     if command is None or command.time_gap is None:
         return [min_time_gap] * len(names)
     context = f"driver: step {step}"
-    time_gaps = np.fmax(answer_as_array(command.time_gap, len(names), context, "time gap"), min_time_gap)  # drops NaN
+    time_gaps = np.fmax(to_answer_array(command.time_gap, len(names), context, "time gap"), min_time_gap)  # drops NaN
     if not np.isfinite(time_gaps).all():
         _raise_not_finite(time_gaps, names, f"{context}: time gap", "finite, or NaN")
     return time_gaps.tolist()

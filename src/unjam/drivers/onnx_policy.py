@@ -11,7 +11,7 @@ from unjam.drivers.check import PROBE_ROWS, check_row_independence
 from unjam.drivers.driver import Driver, Memory
 from unjam.drivers.observation import PolicyInput, observation_size
 from unjam.drivers.policy import PolicyDescription, PolicyDriver, PolicyMemory
-from unjam.errors import InputError, invalid_value, naming, unknown_name
+from unjam.errors import InputError, invalid_value, prefix_errors, unknown_name
 from unjam.onnx_models import check_model, open_session, parse_model, remove_texts, run_session, time_limit
 
 OPSETS, IR_VERSIONS = range(9, 26), range(4, 14)  # allowed versions of the operators and of the format
@@ -79,7 +79,7 @@ class OnnxDriver(PolicyDriver):
     graph: NDArray[np.uint8] = field(kw_only=True, repr=False)  # bytes of the graph
 
     def __post_init__(self) -> None:
-        with naming(f"driver {self.label}: "):
+        with prefix_errors(f"driver {self.label}: "):
             super().__post_init__()
             if self.graph.dtype != np.uint8 or self.graph.ndim != 1:
                 raise InputError("graph: it is not bytes")

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from unjam.drivers.command import answer_as_array
+from unjam.drivers.command import to_answer_array
 from unjam.drivers.driver import Driver, Memory, check_memory, label_with_parameters
 from unjam.drivers.local_state import LocalState
 from unjam.drivers.requirements import Requirements, RoadInterface
@@ -226,14 +226,14 @@ class UserDriver(Driver):
         answer = self._call_method("act", state, memory)
         if not (isinstance(answer, tuple) and len(answer) == 2):
             raise InputError(f"{label}: act() returns {answer!r:.60}; allowed: (accelerations, memory)")
-        numbers, new_memory = answer_as_array(answer[0], rows, label), check_memory(answer[1], rows, f"{label}: act()")
+        numbers, new_memory = to_answer_array(answer[0], rows, label), check_memory(answer[1], rows, f"{label}: act()")
         is_single = getattr(answer[0], "dtype", None) == np.float32  # stays so: rows may differ by its rounding
         return numbers.astype(np.float32) if is_single else numbers, new_memory
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return the time gaps of the user's driver, if it has `time_gaps`."""
         answer, rows = self._call_method("time_gaps", state, memory) if np.size(state.speed) else None, len(state.speed)
-        return None if answer is None else answer_as_array(answer, rows, self.describe(), "time gap")
+        return None if answer is None else to_answer_array(answer, rows, self.describe(), "time gap")
 
     def memory_features(self, memory: Memory) -> Array | None:
         """Return the memory features of the user's driver, if it has `memory_features`."""

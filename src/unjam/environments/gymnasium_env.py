@@ -32,7 +32,7 @@ from unjam.scenarios.file_watch import watch_files
 from unjam.scenarios.road import OrderedRoad, RecordedRoad
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import warn_of_reserved_seed
-from unjam.text import one_line
+from unjam.text import to_one_line
 from unjam.worlds.backend import Backend, BackendLike, WorldOptions, check_support, open_backend, open_world
 from unjam.worlds.drive import DriveLoop
 from unjam.worlds.episode import check_can_drive, check_policy_inputs
@@ -80,7 +80,7 @@ def as_action(action: Any, name: str) -> float:
     allowed, is_ready = "one finite number", type(action) is np.ndarray and action.dtype.kind == "f"
     values = action if is_ready else as_numbers(action, f"step: {name}", allowed)
     if values.size != 1 or not isfinite(number := values.item()):
-        raise InputError(f"step: {name}: {one_line(repr(action), 60)} is not allowed; allowed: {allowed}")
+        raise InputError(f"step: {name}: {to_one_line(repr(action), 60)} is not allowed; allowed: {allowed}")
     return number
 
 

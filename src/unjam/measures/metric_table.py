@@ -122,6 +122,6 @@ def estimate_cell(estimate: Estimate, digits: int, expected_count: int | None = 
     return TableCell(f"{estimate.mean:{format_spec}}", interval)
 
 
-def with_no_break_spaces(text: str) -> str:
+def use_no_break_spaces(text: str) -> str:
     """Return the text with no-break spaces, so that it stays on one line."""
     return text.replace(" ", "\N{NO-BREAK SPACE}")

@@ -16,7 +16,7 @@ from PIL import Image
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate
 from unjam.reports.results import PlotEpisode, kept_row, seconds_by_part
-from unjam.text import one_line, printable
+from unjam.text import printable, to_one_line
 
 SPEED_COLORMAP = "viridis"  # slow is dark, fast is bright: readable with color blindness and in print
 TEXT_COLOR, MUTED_COLOR, GRID_COLOR = "#1f2933", "#697586", "#e4e7eb"
@@ -52,7 +52,7 @@ PLOT_STYLE: dict[Any, Any] = {
 
 def short_label(label: str) -> str:
     """Return a driver's label on one line, cut to the width of a title: tuned drivers have many parameters."""
-    return one_line(label, MAX_LABEL_LENGTH)
+    return to_one_line(label, MAX_LABEL_LENGTH)
 
 
 class NotebookFigure(Figure):

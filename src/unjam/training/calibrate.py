@@ -282,7 +282,8 @@ def calibrate(
                 raise
             except EpisodeError as error:
                 if factors == original:
-                    raise UnjamError(f"{corridor.files.path.name}: as it is: {error}") from None
+                    reason = f"the original network cannot be simulated: {error}"
+                    raise UnjamError(f"{corridor.files.path.name}: {reason}") from None
                 log.add(first, text, (None, str(error)))
         return CalibrationTrial(factors, *log.verdicts[first, text])
 

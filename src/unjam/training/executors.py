@@ -22,7 +22,7 @@ from unjam.child_processes import (
     child_environment,
     child_import_path,
     isolated_start,
-    outside_working_folder,
+    leave_working_folder,
     python_command,
 )
 from unjam.errors import UnjamError, as_unjam_error, error_from_name, import_optional
@@ -30,7 +30,7 @@ from unjam.files import APPEND_FLAGS, atomic_write, make_folder, open_in_place
 from unjam.folders import PROTECTED_FOLDERS_VARIABLE
 from unjam.parameters import build_dataclass
 from unjam.processes import bind_to_parent
-from unjam.trust import TRUST_CODE_OPTION, expecting_code, is_all_code_trusted
+from unjam.trust import TRUST_CODE_OPTION, forget_expected_code, is_all_code_trusted
 from unjam.worlds.messages import open_answer_pipe, read_message, start_child, write_message
 
 if TYPE_CHECKING:  # the command line imports this module and must start quickly
@@ -160,7 +160,7 @@ def _open_ray(workers: int) -> Iterator[Callable[[CommandLine], int]]:
     """Yield a function that runs a command line on the existing Ray cluster, or else on a new one of this machine."""
     ray, folder = import_optional("ray"), os.getcwd()
     # Ray's processes import modules from the folder in which it was started.
-    with _convert_ray_errors(), isolated_start(child_import_path()), outside_working_folder():
+    with _convert_ray_errors(), isolated_start(child_import_path()), leave_working_folder():
         try:
             ray.init(address="auto", log_to_driver=False)
         except ConnectionError:
@@ -192,7 +192,7 @@ def _run_on_node(command: CommandLine, folder: str, protected_folders: str) -> i
     return LocalExecutor(folder if os.path.isdir(folder) else None).run(command)
 
 
-@expecting_code()
+@forget_expected_code()
 def train_in_subprocess(
     config: "RunConfig",
     folder: Path,

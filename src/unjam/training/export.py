@@ -45,7 +45,7 @@ from unjam.training.run_folder import (
     controller_origin,
     read_config,
 )
-from unjam.trust import check_trusted, expecting_code
+from unjam.trust import check_trusted, forget_expected_code
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class ExportResult:
     """actuator that the safety filter expects; empty without a filter"""
 
 
-@expecting_code()
+@forget_expected_code()
 def export_controller(
     source: str | Path,
     out: str | Path,

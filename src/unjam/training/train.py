@@ -38,7 +38,7 @@ from unjam.reports.html import write_report_page
 from unjam.reports.results import CONTROLLER_FILE, read_progress
 from unjam.scenarios.file_watch import watch_files
 from unjam.seeds import VALIDATION_SEED
-from unjam.text import one_line
+from unjam.text import to_one_line
 from unjam.training import run_folder
 from unjam.training.config import CONFIG_FILE, RunConfig, to_toml
 from unjam.training.evaluate import DriverAndEpisode, EvaluationProgress, RowsByDriver, evaluate_run, gain_over_expert
@@ -50,7 +50,7 @@ from unjam.training.random_state import exclusive_random_state
 from unjam.training.string_limit import find_operating_points
 from unjam.training.task_sampling import TaskSampler, make_episodes, warm_up_iterations
 from unjam.tree import unpack
-from unjam.trust import expecting_code
+from unjam.trust import forget_expected_code
 from unjam.worlds.batch.run import run_batched_if_supported
 from unjam.worlds.worker_pool import WorkerPool
 
@@ -162,7 +162,7 @@ def train_in_process(
         run_folder.read_config(folder)
     else:
         run_folder.make_new_folder(folder, f", or --resume {folder}")
-    with run_folder.removing_if_empty(folder), expecting_code(), lock_folder(folder):
+    with run_folder.removing_if_empty(folder), forget_expected_code(), lock_folder(folder):
         (run_folder.resume_run_folder if resume else run_folder.create_run_folder)(folder, config)
         refusals = nullcontext() if resume else run_folder.empty_if_refused(folder)
         with refusals, ExitStack() as locks, WorkerPool(config.workers) as workers:
@@ -214,7 +214,7 @@ class Trainer:
             try:
                 self._restore(*checkpoint)
             except UNREADABLE_ERRORS as error:
-                reason = f"is none of this run: {type(error).__name__}: {one_line(error)}"
+                reason = f"is none of this run: {type(error).__name__}: {to_one_line(error)}"
                 raise InputError(f"checkpoint: that of {str(folder)!r} {reason}; allowed: remove it") from None
             run_folder.append_lineage(folder, self.collector.iteration)
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from unjam.drivers.check import PROBE_ROWS, check_row_independence
-from unjam.drivers.command import answer_as_array
+from unjam.drivers.command import to_answer_array
 from unjam.drivers.user_driver import FileReference, UserFunction, is_file_reference, object_label
 from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.parameters import split_parameters
@@ -333,7 +333,7 @@ def validate_reward_terms(
         raise InputError(f"{label}: it has no terms; allowed: at least one")
     for name, answer in answers.items():
         row = "control step" if row_name == "step" else row_name
-        values = answer_as_array(answer, len(outcome.speeds), label, f"term {name!r}", row)
+        values = to_answer_array(answer, len(outcome.speeds), label, f"term {name!r}", row)
         is_allowed = abs(values) <= MAX_REWARD_TERM
         if not is_allowed.all():
             row, allowed = int(np.argmin(is_allowed)), f"finite, at most {MAX_REWARD_TERM:g}"
