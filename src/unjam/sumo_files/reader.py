@@ -198,9 +198,7 @@ class XmlReader:
             harmless = {name: value for name, value in harmless.items() if name not in self._changed_attributes}
         self._write_start(tag, harmless)
         if tag in EXTERNAL_ELEMENTS and attributes.get("file"):
-            self._renamed_tags = dict.fromkeys(
-                EXTERNAL_ELEMENTS, "content"
-            )  # SUMO would crash on an element within itself
+            self._renamed_tags = dict.fromkeys(EXTERNAL_ELEMENTS, "content")  # SUMO crashes on an element within itself
             self._include(attributes["file"])
             self._renamed_tags = {}
             self._write_end(tag)

@@ -175,7 +175,7 @@ def run_netconvert(files: dict[tuple[str, str], str], options: list[str], folder
     inputs = [f"{option}={folder / name}" for option, name in files]
     fixed_options = [f"--output-file={network}", "--offset.disable-normalization=true", "--precision=6"]
     command = [sumo_program("netconvert"), *inputs, *fixed_options, *options]
-    # At a limit of file sizes, netconvert gets a signal, which Python ignores; it would write an incomplete file.
+    # netconvert ignores the signal of a file size limit, as Python does, and writes an incomplete file.
     result = subprocess.run(command, capture_output=True, text=True, check=False, restore_signals=False)
     if result.returncode == 0 and network.exists():
         if network.read_bytes().rstrip().endswith(b"</net>"):
