@@ -30,7 +30,7 @@ LOCK_FILE = ".lock"  # the file that locks a folder for its writer
 HEARTBEAT_INTERVAL, MAX_MISSED_HEARTBEATS = 10.0, 6  # of the owner of a folder [s], and how many may be missing
 PRIVATE_FOLDER_PREFIX, PRIVATE_LOCK_FILE = "unjam-", ".temporary"
 """beginning of the names of private temporary folders, and the file that locks such a folder for its process"""
-PR_SET_PDEATHSIG = 1  # Linux's option of prctl
+PR_SET_PDEATHSIG = 1  # option of prctl on Linux
 MAX_CHILD_MEMORY, MAX_CHILD_TIME = 8 * 2**30, 600  # for reading an untrusted file [bytes, s]
 _is_command_line = False
 

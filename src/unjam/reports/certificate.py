@@ -1,4 +1,4 @@
-"""The page of a certificate: proven properties of a controller, tested worst cases, and its operating domain."""
+"""Page of a certificate: proven properties, tested worst cases and operating domain of a controller."""
 
 from pathlib import Path
 from typing import Any

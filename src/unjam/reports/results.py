@@ -73,7 +73,7 @@ class PlotEpisode(Episode):
 
 
 def to_plot_episode(driver: str, episode: Episode) -> PlotEpisode:
-    """Return the data of an episode for figures; its `control_step` is the time between two snapshots."""
+    """Return the data of an episode for figures; the new `control_step` is the time between two snapshots."""
     values = {name: getattr(episode, name) for name in (*EPISODE_ENTRIES, *PLOT_ARRAYS)}
     values |= {name: values[name][:: episode.snapshot_stride] for name in FULL_RATE_ARRAYS}
     if episode.has_recorded_leader:  # the plane moves with the recorded vehicle, which is at its origin
@@ -203,7 +203,7 @@ def read_rows(folder: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def read_progress(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of a run's progress without damaged rows, such as one that a crash truncated."""
+    """Return the rows of progress of a run without damaged rows, such as a row that a crash truncated."""
 
     def is_progress(row: dict[str, Any]) -> bool:
         counts = row.get("iteration"), row.get("environment_steps", 0)

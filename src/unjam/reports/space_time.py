@@ -187,9 +187,9 @@ def speed_field(
         if loop_length:  # repeat the vehicles before and after the loop
             position = np.concatenate([position - loop_length, position, position + loop_length])
             speed = np.tile(speed, 3)
-        behind = (np.searchsorted(position, grid) - 1).clip(min=0)
-        ahead = (behind + 1).clip(max=len(position) - 1)
-        nearest = np.where(np.abs(grid - position[behind]) < np.abs(grid - position[ahead]), behind, ahead)
+        rear = (np.searchsorted(position, grid) - 1).clip(min=0)
+        front = (rear + 1).clip(max=len(position) - 1)
+        nearest = np.where(np.abs(grid - position[rear]) < np.abs(grid - position[front]), rear, front)
         is_near = np.abs(grid - position[nearest]) <= FILL_DISTANCE + FILL_SECONDS * speed[nearest]
         if is_platoon:
             is_near = (grid >= position[0]) & (grid <= position[-1])
