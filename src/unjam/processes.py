@@ -306,10 +306,7 @@ def is_locked(folder: Path) -> bool:
 
 
 def _open_locked(path: Path, target: str = "", is_shared: bool = False, needs_lock: bool = False) -> int | None:
-    """Open and lock a file, and return its descriptor; None if the platform has no locks.
-
-    On a file system without locks the file is not locked; with `needs_lock` None is returned.
-    """
+    """Open and lock a file; return None if the system, or with `needs_lock` its file system, has no locks."""
     try:
         import fcntl
     except ImportError:

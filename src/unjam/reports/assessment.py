@@ -43,10 +43,7 @@ MISSING = Estimate(nan, nan, nan, 0)
 
 
 def count_answered_seeds(folder: Path, rates: Sequence[float], drivers: dict[str, Any]) -> int:
-    """Return the number of test seeds of an assessment in a folder; 0 unless it has these rates and drivers.
-
-    `drivers` are recipes by name.
-    """
+    """Return the number of test seeds of the assessment in a folder; 0 if rates or drivers (recipes by name) differ."""
     with suppress(InputError, *INVALID_DATA_ERRORS):
         document = parse_json((folder / ASSESSMENT_FILE).read_bytes())
         if (document["penetration_rates"], document["drivers"]) == ([*rates], json.loads(to_json(drivers))):
@@ -172,27 +169,20 @@ def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
     baseline = assessment["baseline"]
     verdicts = [option.get("verdict", "–") for option in options]
     relative_times = [f"{100 * effect['travel_time'].mean / effect['baseline_travel_time']:+.1f}" for effect in effects]
-    acc_differences = [
-        format_difference(option["difference_to_acc"], 1) if "difference_to_acc" in option else "–"
-        for option in options
-    ]
+    acc_differences = [format_difference(option.get("difference_to_acc", MISSING), 1) for option in options]
     contacts = [f"{effect['collisions']:+.0f}" for effect in effects]
-    time_row, *metric_rows = (
-        (
-            *heading,
-            estimate_cell(baseline[metric], digits).mean,
-            [format_difference(effect[field], digits) for effect in effects],
-        )
-        for field, metric, *heading, digits in EFFECT_METRICS
-    )
+    metric_rows = []
+    for field, metric, *heading, digits in EFFECT_METRICS:
+        human = estimate_cell(baseline[metric], digits).mean
+        metric_rows.append((*heading, human, [format_difference(effect[field], digits) for effect in effects]))
     baseline_contacts = f"{baseline['collisions'].mean * baseline['collisions'].count:.0f}"
     rows = (
         ("verdict", "", "", verdicts),
         ("feasibility", "", "", [feasibility_text(effect) for effect in effects]),
-        time_row,
+        metric_rows[0],
         ("travel time, relative to the human baseline", "%", "", relative_times),
         ("travel time, compared with ACC vehicles", "s", "", acc_differences),
-        *metric_rows,
+        *metric_rows[1:],
         ("vehicles in collisions, all episodes", "", baseline_contacts, contacts),
         ("test seeds", "", str(assessment["seeds"]["test"]), [str(effect["travel_time"].count) for effect in effects]),
     )

@@ -143,10 +143,7 @@ def _branch_row(episodes: Sequence[PlotEpisode], branch: str, is_main: bool) -> 
 
 
 def _append_recorded(episode: PlotEpisode, values: np.ndarray, quantity: int) -> np.ndarray:
-    """Return values of all vehicles, shape (T + 1, N), with the recorded vehicle as the last column.
-
-    `quantity` is 0 for positions and 1 for speeds.
-    """
+    """Append the recorded vehicle to values of all vehicles, shape (T + 1, N); `quantity`: 0 positions, 1 speeds."""
     if not episode.has_recorded_leader:
         return values
     return np.column_stack([values, episode.replayed_motion[..., quantity]])
@@ -216,10 +213,7 @@ def has_lane_maps(episodes: Sequence[PlotEpisode]) -> bool:
 
 
 def space_time_figure(episodes: Sequence[PlotEpisode], selection: Sequence[PlotEpisode] = ()) -> Figure:
-    """Draw positions and speeds over time: a map for each lane, or without lanes a line for each vehicle.
-
-    `selection` is as in `episode_grid`.
-    """
+    """Draw speeds over time and position: a map per lane, or a line per vehicle; `selection` as in `episode_grid`."""
     return (lane_map_figure if has_lane_maps(episodes) else trajectory_figure)(episodes, selection)
 
 

@@ -57,9 +57,8 @@
   }
 
   // Returns the value between two entries, those of a vehicle in two frames.
-  const interpolate = (values, before, after, fraction) => {
-    return Number.isNaN(values[after]) ? values[before] : values[before] + fraction * (values[after] - values[before]);
-  };
+  const interpolate = (values, before, after, fraction) =>
+    Number.isNaN(values[after]) ? values[before] : values[before] + fraction * (values[after] - values[before]);
   // Returns the center and direction of a vehicle between two entries.
   function pose(road, before, after, fraction) {
     if (road.positions) {
