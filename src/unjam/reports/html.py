@@ -161,8 +161,8 @@ def _report_figures(
 def _test_returns(sources: Sources, columns: Sequence[ReportColumn]) -> tuple[dict[str, Estimate], str]:
     """Return the returns on test seeds by driver, and an empty text.
 
-    For a single training, return differences to its expert, and the label of the expert. Human drivers are left out:
-    their returns are often so small that the other differences would not be visible.
+    For a single training, the returns are differences to its expert, and the text is the label of the expert. Human
+    drivers are left out, because other differences would often not be visible next to their small returns.
     """
     rows = {column.name: column.rows for column in columns}
     expert = sources[0][1].metadata.get("expert", "")
