@@ -49,10 +49,7 @@ EXTRAS = {
 
 
 def missing_package_error(error: ImportError, name: str | None = None) -> MissingPartError:
-    """Return the error for a package of an extra or a shared library that cannot be imported; else raise `error`.
-
-    `name` is that of the package; None: the name in `error`.
-    """
+    """Return the error for a missing package (`name`, or that in `error`) or shared library; else raise `error`."""
     package = (name or error.name or "").partition(".")[0]
     reason = f"cannot be imported ({' '.join(str(error).split())})"
     if package not in EXTRAS:

@@ -94,10 +94,7 @@ def _open_by_name(path: Path, name: Path | str, parent: int | None) -> Iterator[
 
 @contextmanager
 def open_folder(path: Path, create: bool = False) -> Iterator[Folder]:
-    """Open a folder; raise `InputError` for a link or `..` in its path inside a protected folder.
-
-    `create` makes missing folders inside a protected folder.
-    """
+    """Open a folder, or `create` a protected one; raise `InputError` for links or `..` inside a protected folder."""
     path = path.absolute()
     root = protected_root(path)
     with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""Check the values of unjam's frozen dataclasses: types, ranges, unknown names."""
+"""Check types, ranges and names of values for the frozen dataclasses of unjam."""
 
 import operator
 import os

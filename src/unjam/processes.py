@@ -30,7 +30,7 @@ LOCK_FILE = ".lock"  # the file that locks a folder for its writer
 HEARTBEAT_INTERVAL, MAX_MISSED_HEARTBEATS = 10.0, 6  # of the owner of a folder [s], and how many may be missing
 PRIVATE_FOLDER_PREFIX, PRIVATE_LOCK_FILE = "unjam-", ".temporary"
 """beginning of the names of private temporary folders, and the file that locks such a folder for its process"""
-PR_SET_PDEATHSIG = 1  # Linux's option of prctl
+PR_SET_PDEATHSIG = 1  # option of prctl on Linux
 MAX_CHILD_MEMORY, MAX_CHILD_TIME = 8 * 2**30, 600  # for reading an untrusted file [bytes, s]
 _is_command_line = False
 
@@ -306,10 +306,7 @@ def is_locked(folder: Path) -> bool:
 
 
 def _open_locked(path: Path, target: str = "", is_shared: bool = False, needs_lock: bool = False) -> int | None:
-    """Open and lock a file, and return its descriptor; None if the platform has no locks.
-
-    On a file system without locks the file is not locked; with `needs_lock` None is returned.
-    """
+    """Open and lock a file; return None if the system, or with `needs_lock` its file system, has no locks."""
     try:
         import fcntl
     except ImportError:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 FamilyPart = Literal["training", "combination", "axis"]
-FAMILY_PREFIX = "family/"  # beginning of the names of the family's roads as scenarios
+FAMILY_PREFIX = "family/"  # beginning of the scenario names of these roads
 
 SHORT_WARM_UP, LONG_WARM_UP = (750, 6000)  # human-only simulation steps: a wave begins, or is fully developed
 AGGRESSIVE_IDM = {"time_headway": 0.9, "max_acceleration": 1.3, "comfortable_deceleration": 2.0}

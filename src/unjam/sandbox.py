@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446  # Landlock's system calls, the same on all processors
+CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446  # system calls of Landlock on all processors
 WRITE_FILE, TRUNCATE = 1 << 1, 1 << 14
 REMOVE_AND_CREATE = 0b1_1111_1111 << 4  # folders, files, devices, sockets, pipes and links
 REFER = 1 << 13  # moving to another folder

@@ -173,7 +173,7 @@ def test_page_lists_assumptions_and_works_offline(page: str) -> None:
     for text in (
         "as the vehicle types of its files say",
         "time_gap 1.1",
-        "12 tuning seeds, 20 test seeds; 120 episodes (with those of the pictures) of at most 400 or 30 minutes",
+        "12 tuning seeds, 20 test seeds; 120 episodes (including those of the pictures) of at most 400 or 30 minutes",
         "±2 % of that of the human baseline",
         "time gap of 1 s",
     ):
@@ -187,8 +187,8 @@ def test_page_explains_why_nothing_is_recommended(tmp_path: Path) -> None:
     page = render_assessment(assessment_folder(tmp_path, [HARMS]))
     assert '<p class="badge not-recommended">not recommended</p>' in page
     assert "ACC alone has no panel" in page
-    assert "10 % CAVs: no controller is recommended; each was rejected" in page
-    assert "The fastest, acc: slower than the human baseline." in page
+    assert "10 % CAVs: no controller is recommended, because all were rejected" in page
+    assert "Reason for the fastest, acc: slower than the human baseline." in page
 
 
 def test_page_without_an_evaluated_controller_has_acc_vehicles(tmp_path: Path) -> None:

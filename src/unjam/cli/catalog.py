@@ -1,4 +1,4 @@
-"""Lists of what the package contains: `unjam scenarios` and `unjam drivers`."""
+"""Lists of the scenarios and drivers in the package: `unjam scenarios` and `unjam drivers`."""
 
 import ast
 import inspect

@@ -199,8 +199,7 @@ def assess_command(
     ] = "0.05,0.1,0.2",
     episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Maximum number of episodes.")] = 240,
     minutes: Annotated[
-        float | None,
-        Option(help="Maximum time: after the minimum number of seeds, no seed begins that would exceed it."),
+        float | None, Option(help="Maximum time; only the minimum number of seeds for a verdict may exceed it.")
     ] = None,
     precision: Annotated[
         float, Option(help="Sufficient half-width of the confidence interval of travel time, relative to it.")

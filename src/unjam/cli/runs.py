@@ -107,12 +107,11 @@ def evaluate_command(
 def model_command(
     run: Annotated[Path, Argument(help="Folder of a training run with a learned model.")], json: opt.JsonOption = False
 ) -> None:
-    """Show the errors of a run's learned model relative to the environment.
+    """Show the errors of the learned model of a run relative to the environment.
 
     The errors are root mean squares on episodes that were not used for training, next to the errors of the base
-    model alone and the size of the predicted changes. For a model of whole roads, the
-    command compares the waves in model rollouts with those in a recorded episode. The report of the run, which
-    contains the figures, is written again.
+    model alone and the size of the predicted changes. For a model of whole roads, the command compares the waves in
+    model rollouts with those in a recorded episode. It also writes the report of the run, with figures, again.
 
     Examples:
 

@@ -155,7 +155,7 @@ class _TrainingProgress(output.ProgressReporter):
         """Return the expected remaining time of the training; empty at the end and while it is unknown."""
         total = self._steps
         if self._first_report is None:
-            self._first_report = (0, self._init_time) if iteration == 1 else (steps, now)  # a resumed training
+            self._first_report = (0, self._init_time) if iteration == 1 else (steps, now)  # else resumed
         first_steps, first_time = self._first_report
         if not first_steps < steps < total:
             return ""

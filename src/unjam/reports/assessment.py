@@ -1,4 +1,4 @@
-"""The page of an assessment: effects of ACC vehicles and controllers on a road, and the recommendation."""
+"""Page of an assessment: effects of ACC vehicles and controllers on a road, and the recommendation."""
 
 import json
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ EFFECT_METRICS = (
     ("flow", "outflow_veh_per_h", "flow", "veh/h", 0),
     ("fuel", "fuel_ml_per_km", "fuel by emission model", "ml/km", 1),
     ("hard_braking", "human_braking_beyond_4_5", "human drivers' braking beyond 4.5 m/s²", "per million", 0),
-)  # field of an effect, its metric, and label, unit and digits in tables
+)  # field of an effect, its metric, and its label, unit and number of decimals in tables
 HUMAN_BASELINE_LABEL, ACC_LABEL = "human baseline", "ACC alone"
 OPTION_HEADINGS = (
     *("CAVs", "driver", "travel time − human [s]", "travel time − ACC [s]"),
@@ -43,30 +43,24 @@ MISSING = Estimate(nan, nan, nan, 0)
 
 
 def count_assessed_seeds(folder: Path, rates: Sequence[float], drivers: dict[str, Any]) -> int:
-    """Return the number of test seeds of the assessment in a folder; 0 if it has other rates, drivers or no document.
-
-    `drivers` has their recipes by name.
-    """
+    """Return the number of test seeds of the assessment in a folder; 0 if rates or drivers (recipes by name) differ."""
     with suppress(InputError, *INVALID_DATA_ERRORS):
-        earlier = parse_json((folder / ASSESSMENT_FILE).read_bytes())
-        if (earlier["penetration_rates"], earlier["drivers"]) == ([*rates], json.loads(to_json(drivers))):
-            return int(earlier["seeds"]["test"])
+        document = parse_json((folder / ASSESSMENT_FILE).read_bytes())
+        if (document["penetration_rates"], document["drivers"]) == ([*rates], json.loads(to_json(drivers))):
+            return int(document["seeds"]["test"])
     return 0
 
 
 def archive_assessment(folder: Path, rates: Sequence[float], drivers: dict[str, Any], seeds: int) -> Path | None:
-    """Rename page and document of an assessment with other rates, drivers or more test seeds, and return a new path.
-
-    Return None if the next assessment may replace them.
-    """
+    """Rename the files of an assessment with other rates or drivers, or with more test seeds; return a new path."""
     if not (folder / ASSESSMENT_FILE).is_file() or 0 < count_assessed_seeds(folder, rates, drivers) <= seeds:
         return None
     with open_folder(folder) as opened:
-        stems = (f"{Path(ASSESSMENT_FILE).stem}-{number}" for number in count(1))
-        stem = next(name for name in stems if not opened.mode(f"{name}.json") and not opened.mode(f"{name}.html"))
-        # The document is renamed last: the next call recognizes an assessment by it.
+        stems = (f"{Path(ASSESSMENT_FILE).stem}-{index}" for index in count(1))
+        new_stem = next(stem for stem in stems if not opened.mode(f"{stem}.json") and not opened.mode(f"{stem}.html"))
+        # The document is renamed last: while it exists, the next call finds the assessment.
         renamed = {
-            name: f"{stem}{Path(name).suffix}" for name in filter(opened.mode, (ASSESSMENT_PAGE, ASSESSMENT_FILE))
+            name: f"{new_stem}{Path(name).suffix}" for name in filter(opened.mode, (ASSESSMENT_PAGE, ASSESSMENT_FILE))
         }
         for name, new_name in renamed.items():
             opened.rename(name, new_name)
@@ -74,7 +68,7 @@ def archive_assessment(folder: Path, rates: Sequence[float], drivers: dict[str, 
 
 
 def write_assessment(folder: Path, target: Path) -> Path:
-    """Write the page of a folder of `unjam assess`; return its path.
+    """Write the page for a folder of `unjam assess`; return its path.
 
     Raise `InputError` if the folder contains no assessment, `DiskError` if the page cannot be written.
     """
@@ -84,17 +78,18 @@ def write_assessment(folder: Path, target: Path) -> Path:
 
 
 def render_assessment(folder: Path) -> str:
-    """Return the page as text."""
+    """Return the page of an assessment as text."""
     path = folder / ASSESSMENT_FILE
     if not path.is_file():
         raise InputError(f"report: {str(folder)!r} has no {ASSESSMENT_FILE}")
     assessment, results = parse_assessment(json.loads(path.read_text())), read_results(folder)
-    names = {"human": HUMAN_BASELINE_LABEL}
+    labels = {"human": HUMAN_BASELINE_LABEL}
     panels = [
-        replace(episode, driver=names.get(episode.driver, episode.driver)) for episode in results.plot_episodes.values()
+        replace(episode, driver=labels.get(episode.driver, episode.driver))
+        for episode in results.plot_episodes.values()
     ]
-    plotted = ((label, results.rows.get(label)) for label in results.plot_episodes)  # of the first episode of each
-    times = {label: f"{rows[0][TIME_METRIC]:.1f} s" if rows else "not measured" for label, rows in plotted}
+    first_rows = [rows[0] if (rows := results.rows.get(driver)) else None for driver in results.plot_episodes]
+    times = [f"{row[TIME_METRIC]:.1f} s" if row else "not measured" for row in first_rows]
     return render_template(
         "assessment.html",
         assessment=assessment,
@@ -103,10 +98,10 @@ def render_assessment(folder: Path) -> str:
         option_rows=option_rows(assessment),
         columns=[HUMAN_BASELINE_LABEL, *map(_option_label, _evaluated_options(assessment))],
         result_rows=_result_rows(assessment),
-        candidate_rows=[_tuning_row(candidate) for candidate in assessment["candidates"]],
+        candidate_rows=[_candidate_row(candidate) for candidate in assessment["candidates"]],
         effect_figure=figures.data_uri(effect_figure(assessment)),
         space_time=figures.data_uri(space_time.space_time_figure(panels)) if panels else "",
-        panels=[f"{names.get(label, label)}, {time}" for label, time in times.items()],
+        panels=[f"{panel.driver}, {time}" for panel, time in zip(panels, times, strict=True)],
         has_lane_maps=space_time.has_lane_maps(panels),
         percent=format_percent,
         breakable=lambda label: Markup("<wbr>").join(split_label(label)),  # names of drivers may be long
@@ -121,10 +116,10 @@ def _option_label(option: dict[str, Any]) -> str:
 
 
 def _rates_without_controller(assessment: dict[str, Any]) -> list[tuple[float, dict[str, Any]]]:
-    """Return the penetration rates without an evaluated controller, with the fastest candidate of each."""
+    """Return each penetration rate without an evaluated controller, with its fastest candidate."""
     evaluated = [result["penetration_rate"] for result in assessment["controller_results"]]
     return [
-        (rate, min(candidates, key=lambda each: each["effect"]["travel_time"].mean))
+        (rate, min(candidates, key=lambda candidate: candidate["effect"]["travel_time"].mean))
         for rate in assessment["penetration_rates"]
         if rate not in evaluated
         and (
@@ -134,11 +129,11 @@ def _rates_without_controller(assessment: dict[str, Any]) -> list[tuple[float, d
 
 
 def parse_assessment(document: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of `assessment.json` with its estimates as `Estimate`, and NaN in place of null."""
+    """Return the content of `assessment.json` with estimates as `Estimate`, and NaN instead of null."""
 
     def parse(value: Any, key: str = "effect") -> Any:
         if key == "effect":
-            return {name: parse(each, name) for name, each in value.items()}
+            return {name: parse(entry, name) for name, entry in value.items()}
         return Estimate(**replace_null(value)) if isinstance(value, dict) else nan if value is None else value
 
     groups = {key: [*map(parse, document[key])] for key in ("controller_results", "acc_results", "candidates")}
@@ -148,62 +143,60 @@ def parse_assessment(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def option_rows(assessment: dict[str, Any]) -> list[list[str]]:
-    """Return the cells of the main table, as in `OPTION_HEADINGS`: the human baseline, then a row for each option."""
+    """Return the cells of the main table below `OPTION_HEADINGS`: the human baseline, then a row for each option."""
     time, flow = (assessment["baseline"][metric].mean for metric in (TIME_METRIC, FLOW_METRIC))
     rows = [["none", HUMAN_BASELINE_LABEL, f"{time:.1f} s", "–", f"{flow:,.0f} veh/h", "–", "–", "–"]]
     for option in _evaluated_options(assessment):
-        effect, to_acc = option["effect"], [option.get(name, MISSING) for name in ACC_DIFFERENCES]
-        times = [format_difference(change, 1) for change in (effect["travel_time"], to_acc[0])]
-        flows = [format_difference(change) for change in (effect["flow"], to_acc[1])]
+        effect, acc_differences = option["effect"], [option.get(name, MISSING) for name in ACC_DIFFERENCES]
+        times = [format_difference(change, 1) for change in (effect["travel_time"], acc_differences[0])]
+        flows = [format_difference(change) for change in (effect["flow"], acc_differences[1])]
         verdicts = feasibility_text(effect), option.get("verdict", "–")
         rows.append([format_percent(option["penetration_rate"]), option["driver"], *times, *flows, *verdicts])
     return rows
 
 
 def feasibility_text(effect: dict[str, Any]) -> str:
-    """Return whether the CAVs are feasible, and whether human drivers brake hard more often; a dash if unknown."""
+    """Return a text on the feasibility of the CAVs, and on more frequent hard braking by human drivers."""
     if effect["feasibility"] == FEASIBLE and effect["hard_braking"].mean > 0:
         return f"{FEASIBLE}, but human drivers brake hard more often in the mean"
     return effect["feasibility"] or "–"
 
 
 def _result_rows(assessment: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the rows of the results on test seeds: the human baseline in absolute numbers, then differences to it."""
+    """Return the rows of the table of results on test seeds: the human baseline, then differences to it."""
     options = _evaluated_options(assessment)
     effects = [option["effect"] for option in options]
     baseline = assessment["baseline"]
     verdicts = [option.get("verdict", "–") for option in options]
-    relative = [f"{100 * effect['travel_time'].mean / effect['baseline_travel_time']:+.1f}" for effect in effects]
-    acc = [
-        format_difference(option["difference_to_acc"], 1) if "difference_to_acc" in option else "–"
-        for option in options
-    ]
+    relative_times = [f"{100 * effect['travel_time'].mean / effect['baseline_travel_time']:+.1f}" for effect in effects]
+    acc_differences = [format_difference(option.get("difference_to_acc", MISSING), 1) for option in options]
     contacts = [f"{effect['collisions']:+.0f}" for effect in effects]
-    time, *others = (
-        (*heading, estimate_cell(baseline[metric], digits).mean, [format_difference(e[field], digits) for e in effects])
-        for field, metric, *heading, digits in EFFECT_METRICS
-    )
+    metric_rows = []
+    for field, metric, *heading, digits in EFFECT_METRICS:
+        human = estimate_cell(baseline[metric], digits).mean
+        metric_rows.append((*heading, human, [format_difference(effect[field], digits) for effect in effects]))
     baseline_contacts = f"{baseline['collisions'].mean * baseline['collisions'].count:.0f}"
     rows = (
         ("verdict", "", "", verdicts),
         ("feasibility", "", "", [feasibility_text(effect) for effect in effects]),
-        time,
-        ("travel time, relative to the human baseline", "%", "", relative),
-        ("travel time, compared with ACC vehicles", "s", "", acc),
-        *others,
+        metric_rows[0],
+        ("travel time, relative to the human baseline", "%", "", relative_times),
+        ("travel time, compared with ACC vehicles", "s", "", acc_differences),
+        *metric_rows[1:],
         ("vehicles in collisions, all episodes", "", baseline_contacts, contacts),
         ("test seeds", "", str(assessment["seeds"]["test"]), [str(effect["travel_time"].count) for effect in effects]),
     )
-    return [{"label": label, "unit": unit, "cells": [first, *cells]} for label, unit, first, cells in rows]
+    return [{"label": label, "unit": unit, "cells": [human, *cells]} for label, unit, human, cells in rows]
 
 
 def _evaluated_options(assessment: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the results of ACC vehicles and controllers on test seeds, ordered by penetration rate."""
     options = [*assessment["acc_results"], *assessment["controller_results"]]
-    return sorted(options, key=lambda each: each["penetration_rate"])
+    return sorted(options, key=lambda option: option["penetration_rate"])
 
 
-def _tuning_row(option: dict[str, Any]) -> dict[str, Any]:
+def _candidate_row(option: dict[str, Any]) -> dict[str, Any]:
+    """Return the row of a candidate in the table of results on tuning seeds."""
     effect = option["effect"]
     cells = [format_difference(effect[name], digits) for name, digits in (("travel_time", 1), ("flow", 0), ("fuel", 1))]
     cells += [f"{effect['collisions']:.0f}", str(effect["travel_time"].count)]
@@ -215,7 +208,7 @@ def _tuning_row(option: dict[str, Any]) -> dict[str, Any]:
 def effect_figure(assessment: dict[str, Any]) -> Figure:
     """Draw the effect of each driver at each penetration rate, in percent of the human baseline.
 
-    Tuning seeds are pale, test seeds opaque; lines are confidence intervals.
+    Marks of tuning seeds are pale, those of test seeds opaque; lines are confidence intervals.
     """
     drivers = list(dict.fromkeys([*(result["driver"] for result in assessment["acc_results"]), *assessment["drivers"]]))
     rates = assessment["penetration_rates"]
@@ -227,17 +220,17 @@ def effect_figure(assessment: dict[str, Any]) -> Figure:
         groups = (("candidates", 0.35, 4, 0.0), ("acc_results", 1.0, 6, 0.06), ("controller_results", 1.0, 6, 0.06))
         for group, alpha, size, shift in groups:
             for option in assessment[group]:
-                number, effect = drivers.index(option["driver"]), option["effect"]
-                x = rates.index(option["penetration_rate"]) + 0.7 * ((number + 0.5) / len(drivers) - 0.5) + shift
-                scale = 100.0 / effect[baseline] if effect[baseline] else nan  # no vehicle left in so short a time
-                style = {"color": figures.LINE_COLORS[(number + 1) % len(figures.LINE_COLORS)], "alpha": alpha}
+                index, effect = drivers.index(option["driver"]), option["effect"]
+                x = rates.index(option["penetration_rate"]) + 0.7 * ((index + 0.5) / len(drivers) - 0.5) + shift
+                scale = 100.0 / effect[baseline] if effect[baseline] else nan  # no vehicle arrived in a short episode
+                style = {"color": figures.LINE_COLORS[(index + 1) % len(figures.LINE_COLORS)], "alpha": alpha}
                 axes.plot([x] * 2, [scale * effect[field].low, scale * effect[field].high], lw=1.6, **style)
                 axes.plot(x, scale * effect[field].mean, "o", ms=size, **style)
         axes.set_ylabel(f"{label} compared with human baseline [%]")
         axes.set_xticks(range(len(rates)), [format_percent(rate) for rate in rates])
         axes.set(xlim=(-0.5, len(rates) - 0.5), xlabel="penetration rate")
         axes.grid(False, axis="x")
-    for number, name in enumerate(drivers):
-        panels[0].plot([], [], "o-", color=figures.LINE_COLORS[(number + 1) % len(figures.LINE_COLORS)], label=name)
+    for index, name in enumerate(drivers):
+        panels[0].plot([], [], "o-", color=figures.LINE_COLORS[(index + 1) % len(figures.LINE_COLORS)], label=name)
     figure.legend(loc="outside upper left", ncols=4)
     return figure

@@ -1,4 +1,4 @@
-"""The page of a certificate: proven properties of a controller, tested worst cases, and its operating domain."""
+"""Page of a certificate: proven properties, tested worst cases and operating domain of a controller."""
 
 from pathlib import Path
 from typing import Any
@@ -14,38 +14,39 @@ from unjam.reports.html import render_template
 
 DOMAIN_QUANTITIES = (("own speed", "speed", "m/s"), ("leader speed", "leader_speed", "m/s"), ("gap", "leader_gap", "m"))
 
-MAX_PAGE_HEAD = 2_000  # of a page, with its generator and title [bytes]
+MAX_PAGE_HEAD = 2_000  # beginning of a page, which contains its generator and title [bytes]
 
 
 def write_certificate_page(
     name: str, driver: FilteredDriver, certificate: dict[str, Any], verdict: str, target: Path
 ) -> None:
-    """Write the page of a controller, with the verdict on its string stability first."""
-    worst, strings, comfort = (certificate[key] for key in ("worst_cases", "string_stability", "comfort"))
+    """Write the certificate page of a controller; it begins with the verdict on string stability."""
+    worst_cases, string_stability = certificate["worst_cases"], certificate["string_stability"]
+    comfort = f"{certificate['comfort']['rms_acceleration']:.2f} m/s²"
     cards = [
-        ("Min gap", f"{worst['min_gap']:.2f} m", "in all tests"),
-        ("Min time gap", f"{worst['min_time_gap']:.2f} s", "while the leader brakes hard"),
-        ("Max braking", f"{worst['max_braking']:.1f} m/s²", "in all tests"),
-        ("Ride comfort", f"{comfort['rms_acceleration']:.2f} m/s²", "r.m.s.; below 0.315 is comfortable"),
+        ("Min gap", f"{worst_cases['min_gap']:.2f} m", "in all tests"),
+        ("Min time gap", f"{worst_cases['min_time_gap']:.2f} s", "while the leader brakes hard"),
+        ("Max braking", f"{worst_cases['max_braking']:.1f} m/s²", "in all tests"),
+        ("Ride comfort", comfort, "r.m.s.; below 0.315 is comfortable"),
     ]
     text = render_template(
         "certificate.html",
         name=name,
         driver=driver,
-        worst_cases=worst,
+        worst_cases=worst_cases,
         cards=cards,
         verdict=verdict,
         notes=_certificate_notes(certificate),
-        string_stability=[(string, _max_gain(string)) for string in strings],
-        attack_figure=data_uri(_attack_figure(worst["attack"])),
-        string_figure=data_uri(_string_figure(strings)),
+        string_stability=[(point, _max_gain(point)) for point in string_stability],
+        attack_figure=data_uri(_attack_figure(worst_cases["attack"])),
+        string_figure=data_uri(_string_figure(string_stability)),
         domain=[(label, certificate["domain"][key], unit) for label, key, unit in DOMAIN_QUANTITIES],
     )
     atomic_write(target, text)
 
 
 def is_certificate_page(path: Path) -> bool:
-    """Return whether a file is a page of `write_certificate_page`."""
+    """Return whether a file is a page that `write_certificate_page` wrote."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -53,9 +54,9 @@ def is_certificate_page(path: Path) -> bool:
     return b'content="unjam ' in head and b"<title>Certificate: " in head
 
 
-def _max_gain(result: dict[str, Any]) -> float:
-    """Return the largest gain at a speed, of frequencies at which the vehicle follows; NaN if there are none."""
-    return float(np.fmax.reduce(np.array(result["gains"], np.float64)))
+def _max_gain(point: dict[str, Any]) -> float:
+    """Return the largest gain at a speed, over frequencies at which the vehicle follows; NaN if there are none."""
+    return float(np.fmax.reduce(np.array(point["gains"], np.float64)))
 
 
 def _certificate_notes(certificate: dict[str, Any]) -> list[str]:
@@ -88,13 +89,13 @@ def _attack_figure(accelerations: list[float]) -> Figure:
 def _string_figure(string_stability: list[dict[str, Any]]) -> Figure:
     figure = new_figure(2.8)
     panels = figure.subplots(1, max(1, len(string_stability)), sharey=True, squeeze=False)[0]
-    for axes, each in zip(panels, string_stability, strict=False):
+    for axes, point in zip(panels, string_stability, strict=False):
         axes.axhline(1.0, color=MUTED_COLOR, lw=0.8)
-        gains = np.array(each["gains"], np.float64)  # with NaN for null
-        axes.semilogx(each["frequencies"], gains, color=CAV_PLOT_COLOR, label="controller")
+        gains = np.array(point["gains"], np.float64)  # null becomes NaN
+        axes.semilogx(point["frequencies"], gains, color=CAV_PLOT_COLOR, label="controller")
         human = {"color": LINE_COLORS[2], "ls": "--", "label": "human driver (IDM)"}
-        axes.semilogx(each["frequencies"], each["human_gains"], **human)
-        axes.set(xlabel="frequency [Hz]", title=f"{each['speed']:g} m/s")
+        axes.semilogx(point["frequencies"], point["human_gains"], **human)
+        axes.set(xlabel="frequency [Hz]", title=f"{point['speed']:g} m/s")
     panels[0].set_ylabel("gain")
     panels[0].legend()
     return figure

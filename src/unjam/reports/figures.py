@@ -15,24 +15,24 @@ from PIL import Image
 
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import Estimate
-from unjam.reports.results import PlotEpisode, kept_row, seconds_by_part
+from unjam.reports.results import PlotEpisode, seconds_by_part, selected_row
 from unjam.text import printable, to_one_line
 
-SPEED_COLORMAP = "viridis"  # slow is dark, fast is bright: readable with color blindness and in print
+SPEED_COLORMAP = "viridis"  # dark is slow, bright is fast: readable with color blindness and in print
 TEXT_COLOR, MUTED_COLOR, GRID_COLOR = "#1f2933", "#697586", "#e4e7eb"
 CAV_PLOT_COLOR = "#d7263d"
 LINE_COLORS = ["#7b8794", "#e07a1f", "#2b6cb0", "#2f855a", "#b83280", "#805ad5", "#1a202c", "#00a3c4"]
 """colors of drivers, in the order of the legend"""
-FIGURE_WIDTH = 10.5  # width of a figure of the page [inch]; it is legible from 760 pixels on, the smallest width there
+FIGURE_WIDTH = 10.5  # of a figure on the page, where it is at least 760 pixels wide and still legible [inch]
 MAX_LABEL_LENGTH = 34  # maximum length of the label of a driver in a figure [characters]
-DPI = 130  # pixels per inch of rasterized parts
-MAX_PLOT_TIMES = 600  # maximum number of times of an episode that a figure shows
+DPI = 130  # of rasterized parts [pixels per inch]
+MAX_PLOT_TIMES = 600  # maximum number of snapshots of an episode in a figure
 
 PLOT_STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
     "text.parse_math": False,  # names of drivers may have dollar signs
-    "text.usetex": False,  # in a program, a matplotlibrc could enable LaTeX, which runs code
+    "text.usetex": False,  # in other programs a matplotlibrc could enable LaTeX, which runs code
     "axes.edgecolor": MUTED_COLOR,
     "axes.labelcolor": TEXT_COLOR,
     "axes.titlecolor": TEXT_COLOR,
@@ -51,19 +51,19 @@ PLOT_STYLE: dict[Any, Any] = {
 
 
 def short_label(label: str) -> str:
-    """Return a driver's label on one line, cut to the width of a title: tuned drivers have many parameters."""
+    """Cut the label of a driver, which can have many parameters, to the width of a title."""
     return to_one_line(label, MAX_LABEL_LENGTH)
 
 
 class NotebookFigure(Figure):
-    """A figure that notebooks display, also if `matplotlib.pyplot` is not imported."""
+    """A figure that notebooks display even if `matplotlib.pyplot` is not imported."""
 
     def _repr_png_(self) -> bytes:
         return png_bytes(self)
 
 
 def new_figure(height: float, width: float = FIGURE_WIDTH) -> Figure:
-    """Return an empty figure [inch], by default as wide as the page."""
+    """Return an empty figure; height and width in inches, by default as wide as the page."""
     return NotebookFigure(figsize=(width, height), layout="constrained", dpi=DPI)
 
 
@@ -80,7 +80,7 @@ def svg_bytes(figure: Figure) -> bytes:
     return re.sub(
         rb'(?<=data:image/png;base64,)[^"]+',
         lambda match: base64.b64encode(_reduce_colors(base64.b64decode(match[0]))),
-        printable(content.getvalue().decode()).encode(),  # labels are in its comments, too
+        printable(content.getvalue().decode()).encode(),  # comments in it contain labels
     )
 
 
@@ -92,9 +92,9 @@ def png_bytes(figure: Figure) -> bytes:
 
 
 def _reduce_colors(png: bytes) -> bytes:
-    """Return a picture on white in 256 colors: a sixth of the size.
+    """Return a picture on white in 256 colors, a sixth of the size.
 
-    Maximum coverage keeps rare colors: those of CAVs and of the highest speeds.
+    Quantization by maximum coverage keeps rare colors: those of CAVs and of the highest speeds.
     """
     image, content = Image.open(io.BytesIO(png)).convert("RGBA"), io.BytesIO()
     background = Image.new("RGBA", image.size, "white")
@@ -105,10 +105,10 @@ def _reduce_colors(png: bytes) -> bytes:
 
 @rc_context(PLOT_STYLE)
 def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
-    """Draw quantities over time, a line per driver.
+    """Draw quantities over time, with a line for each driver.
 
-    On closed and recorded roads: the CAV's speed and gap, or without CAVs the mean speed, and the std of speed across
-    all vehicles; on other open roads: the mean speed, the std, and the insertion backlog if there is any.
+    On closed and recorded roads: speed and gap of the CAV, or without CAVs the mean speed, and the standard deviation
+    of speed across all vehicles. On other open roads: mean speed, standard deviation, and any insertion backlog.
     """
     has_same_vehicles = all(episode.has_same_vehicles for episode in episodes)
     has_cav_panels = has_same_vehicles and any(episode.controlled_columns for episode in episodes)
@@ -134,7 +134,7 @@ def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
 
 
 def _time_series(episode: PlotEpisode, has_cav_panels: bool, has_no_backlog: bool) -> dict[str, np.ndarray]:
-    """Return the quantities of `time_series_figure` by label; each of shape (T + 1,)."""
+    """Return the quantities of `time_series_figure` by label, each of shape (T + 1,)."""
     speeds = np.where(np.isnan(episode.speeds).all(axis=1, keepdims=True), 0.0, episode.speeds)
     waves = {"speed std across\nvehicles [m/s]": np.nanstd(speeds, axis=1)}
     if has_cav_panels:
@@ -147,20 +147,20 @@ def _time_series(episode: PlotEpisode, has_cav_panels: bool, has_no_backlog: boo
 
 @rc_context(PLOT_STYLE)
 def last_vehicle_figure(episodes: Sequence[PlotEpisode]) -> Figure:
-    """Draw the speed of the recorded vehicle over time, and that of the last vehicle with each driver."""
+    """Draw the speeds of the recorded vehicle, and of the last vehicle with each driver, over time."""
     figure = new_figure(3.2)
-    axes, recorded = figure.subplots(), dict[bytes, PlotEpisode]()
+    axes, recordings = figure.subplots(), dict[bytes, PlotEpisode]()
     for episode, color in zip(episodes, LINE_COLORS, strict=False):
         if episode.has_recorded_leader:
-            recorded.setdefault(episode.replayed_motion.tobytes(), episode)
+            recordings.setdefault(episode.replayed_motion.tobytes(), episode)
             stride = max(1, len(episode.times) // MAX_PLOT_TIMES)
             ratios = (METRICS[name].function(episode) for name in ("amplification", "amplification_medium"))
             total, medium = ("–" if np.isnan(ratio) else f"{ratio:.2f}" for ratio in ratios)
             label = f"{short_label(episode.driver)}: amplification {total}, of waves of 20 to 60 s {medium}"
             axes.plot(episode.times[::stride], episode.speeds[::stride, 0], color=color, lw=1.4, label=label)
-    for number, episode in enumerate(recorded.values()):
-        line = {"color": TEXT_COLOR, "lw": 1.0, "ls": (0, (3, 1.5)), "label": "" if number else "recorded vehicle"}
-        axes.plot(episode.times, episode.replayed_motion[:, 0, 1], **line, zorder=1.5)
+    for index, episode in enumerate(recordings.values()):
+        style = {"color": TEXT_COLOR, "lw": 1.0, "ls": (0, (3, 1.5)), "label": "" if index else "recorded vehicle"}
+        axes.plot(episode.times, episode.replayed_motion[:, 0, 1], **style, zorder=1.5)
     axes.set(xlabel="time [s]", ylabel="speed [m/s]")
     axes.margins(x=0)
     figure.legend(loc="outside upper left", ncols=2)
@@ -174,42 +174,42 @@ def learning_curve_figure(
     test_returns: dict[str, Estimate],
     expert: str = "",
 ) -> Figure:
-    """Draw returns on validation seeds against environment steps; below, those on test seeds after the trainings.
+    """Draw returns on validation seeds over environment steps, and below returns on test seeds after the trainings.
 
-    Above are each run by its label, with a ring around the network that was kept, and as horizontal lines the experts
-    by theirs; below is a mean with its CI for each driver, of the differences to an `expert` if there is one. Returns
-    on different seeds are not comparable.
+    `runs` has rows of progress by label; a ring marks the selected network. Horizontal lines are the returns of
+    `experts` by label. `test_returns` has estimates by driver; with an `expert` they are differences to it. Returns on
+    different seeds are not comparable.
     """
     figure = new_figure(3.8 + (0.6 + 0.22 * len(test_returns) if test_returns else 0.0))
     heights = [3.4, 0.4 + 0.22 * len(test_returns)] if test_returns else [1.0]
-    axes, *others = figure.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
+    axes, *test_panels = figure.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
     for (label, rows), color in zip(runs.items(), cycle(LINE_COLORS[2:]), strict=False):
         steps = np.array([row["environment_steps"] for row in rows]) / 1000
         prefix = f"{label}: " if len(runs) > 1 else ""
-        training, label = [row["return_mean"] for row in rows], f"{prefix}training seeds, with exploration"
-        axes.plot(steps, training, color=color, lw=1, alpha=0.45, label=label)
+        returns, label = [row["return_mean"] for row in rows], f"{prefix}training seeds, with exploration"
+        axes.plot(steps, returns, color=color, lw=1, alpha=0.45, label=label)
         validations = [(0.0, rows[0]["return_expert"])]  # the untrained policy equals its expert
         validations += [(step, row["return_validation"]) for step, row in zip(steps, rows, strict=True)]
         points = np.array([point for point in validations if point[1] is not None], float).reshape(-1, 2)
         label = f"{prefix}validation seeds, deterministic"
         axes.plot(*points.T, color=color, lw=1.8, marker="o", ms=3.5, label=label)
-        if (kept := kept_row(rows)) and len(runs) == 1:
-            place = kept["environment_steps"] / 1000, kept["return_validation"]
-            axes.scatter(*place, 110, "none", edgecolors=color, label="network that is kept")
+        if (row := selected_row(rows)) and len(runs) == 1:
+            point = row["environment_steps"] / 1000, row["return_validation"]
+            axes.scatter(*point, 110, "none", edgecolors=color, label="network that is kept")
     for (label, value), style in zip(experts.items(), cycle(("--", ":", "-.", (0, (1, 3))))):
         axes.axhline(value, color=TEXT_COLOR, lw=1.1, ls=style, label=f"{label}, validation seeds")
     axes.set(xlabel="environment steps [thousands]", ylabel="return of an episode")
     axes.margins(x=0.01, y=0.06)
-    for below in others:
-        for number, found in enumerate(test_returns.values()):
-            ends = np.nan_to_num([[found.mean - found.low], [found.high - found.mean]])
-            below.errorbar([found.mean], [number], xerr=ends, fmt="o", ms=4, color=TEXT_COLOR, capsize=3)
-        below.set_yticks(range(len(test_returns)), list(map(short_label, test_returns)))
+    for panel in test_panels:
+        for index, estimate in enumerate(test_returns.values()):
+            errors = np.nan_to_num([[estimate.mean - estimate.low], [estimate.high - estimate.mean]])
+            panel.errorbar([estimate.mean], [index], xerr=errors, fmt="o", ms=4, color=TEXT_COLOR, capsize=3)
+        panel.set_yticks(range(len(test_returns)), list(map(short_label, test_returns)))
         if expert:
-            below.axvline(0.0, color=TEXT_COLOR, lw=0.9)
+            panel.axvline(0.0, color=TEXT_COLOR, lw=0.9)
         quantity = f"return minus that of {expert}" if expert else "return"
-        below.set(xlabel=f"{quantity} on test seeds, after training: mean and 95 % CI")
-        below.set(ylim=(len(test_returns) - 0.5, -0.5))
+        panel.set(xlabel=f"{quantity} on test seeds, after training: mean and 95 % CI")
+        panel.set(ylim=(len(test_returns) - 0.5, -0.5))
     figure.legend(loc="outside upper left", ncols=3)
     return figure
 
@@ -227,7 +227,7 @@ def training_time_figure(progress: Sequence[dict[str, Any]]) -> Figure:
 
 @rc_context(PLOT_STYLE)
 def stacked_bars(bars: dict[str, dict[str, float]], label: str, height: float) -> Figure:
-    """Draw a bar per name with its parts end to end; equal parts have equal colors in all bars."""
+    """Draw a bar for each name with its parts end to end; a part has the same color in all bars."""
     figure = new_figure(height)
     axes, left = figure.subplots(), np.zeros(len(bars))
     parts = dict.fromkeys(part for bar in bars.values() for part in bar)
@@ -241,5 +241,5 @@ def stacked_bars(bars: dict[str, dict[str, float]], label: str, height: float) -
 
 
 def color_table() -> list[str]:
-    """Return the colors of speed as hex codes, slowest first, for drawings without matplotlib."""
+    """Return the colors of speeds as hexadecimal codes, slowest first, for drawings without matplotlib."""
     return [to_hex(color) for color in colormaps[SPEED_COLORMAP](np.linspace(0, 1, 32))]

@@ -1,4 +1,4 @@
-"""The report: one self-contained HTML page that works offline."""
+"""The report: one HTML page that works offline."""
 
 import base64
 import json
@@ -29,13 +29,13 @@ from unjam.scenarios.scenario import VEHICLE_LENGTH
 from unjam.text import printable
 from unjam.worlds.record import assign_columns
 
-MAX_PANELS = 6
-Sources = Sequence[tuple[str, Results]]  # folders of results, with their names
-MAX_REPLAY_FRAMES = 600  # maximum number of frames of a replay, which interpolates between them
-MAX_REPLAY_VALUES = 600_000  # vehicles times frames of all drivers of a replay: about three megabytes
-MAX_MERGE_DISTANCE = 50.0  # a merge is drawn at the vehicle that was nearest to it, if that was no farther away [m]
+MAX_PANELS = 6  # maximum number of drivers in space-time diagrams and the replay
+Sources = Sequence[tuple[str, Results]]  # names and results of folders
+MAX_REPLAY_FRAMES = 600  # of a replay, which interpolates between frames
+MAX_REPLAY_VALUES = 600_000  # vehicles times frames of all drivers of a replay; about three megabytes
+MAX_MERGE_DISTANCE = 50.0  # between a merge and the vehicle at which it is drawn [m]
 REPLAY_NAN = 65535  # code of NaN in the arrays of a replay
-WORST_SHARE = 0.9  # share of the largest variance of speeds at which a replay opens
+WAVE_VARIANCE_RATIO = 0.9  # a replay starts when the variance of speeds reaches this ratio of its maximum
 REPLAY_STEP = 0.5  # time between two frames of the replay [s]
 
 
@@ -55,7 +55,7 @@ def write_report_page(folders: Sequence[Path], target: Path) -> Path:
 
 
 def _damaged_folder(results: Sequence[Results]) -> Path:
-    """Return the first folder that cannot be rendered on its own."""
+    """Return the first folder for which a report cannot be rendered."""
     for result in results:
         try:
             render_report([result])
@@ -67,7 +67,7 @@ def _damaged_folder(results: Sequence[Results]) -> Path:
 def render_template(template: str, **values: Any) -> str:
     """Return a page of the folder `page/` as `printable` text, with common style and script; values are escaped.
 
-    Values in figures, JSON and addresses are encoded, and must be printable before.
+    Texts in figures, JSON and addresses are encoded there and must already be printable.
     """
     options: dict[str, Any] = {"undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=PackageLoader("unjam.reports", "page"), autoescape=True, **options)
@@ -80,22 +80,22 @@ def _page_file(name: str) -> Markup:
 
 
 def render_report(results: Sequence[Results]) -> str:
-    """Return the page as text."""
+    """Return the report page as text."""
     columns = summary.report_columns(results)
     panels = [replace(column.episode, driver=column.name) for column in columns if column.episode is not None]
     panels = panels[:MAX_PANELS]
-    drawn = [panel for panel in panels if panel.has_poses]
+    replay_panels = [panel for panel in panels if panel.has_poses]
     single = results[0] if len(results) == 1 else None
     sources = list(zip(summary.folder_names(results), results, strict=True))
     counts = [len(column.rows) for column in columns]
     rows, baseline = {column.name: column.rows for column in columns}, summary.common_baseline(results)
-    first = "" if baseline else summary.first_alternative(results)
+    first_alternative = "" if baseline else summary.first_alternative(results)
     is_alternative = {
-        column.name: column.name.endswith(f": {HUMAN_LABEL}") and column.name != first for column in columns
+        column.name: column.name.endswith(f": {HUMAN_LABEL}") and column.name != first_alternative for column in columns
     }
-    if first in rows:  # drivers of CAVs are compared with human drivers of their own folder
+    if first_alternative in rows:  # drivers of CAVs are compared with human drivers of their own folder
         columns = [
-            summary.compare_alternative(column, rows[first]) if is_alternative[column.name] else column
+            summary.compare_alternative(column, rows[first_alternative]) if is_alternative[column.name] else column
             for column in columns
         ]
     headings, table = metric_table(rows, baseline)
@@ -106,7 +106,7 @@ def render_report(results: Sequence[Results]) -> str:
         single=single is not None,
         verdicts=[column.verdict for column in columns if column.verdict is not None],
         baseline_name=summary.name_baselines(results),
-        first_alternative=first if first in rows else "",
+        first_alternative=first_alternative if first_alternative in rows else "",
         findings=[(name, finding) for name, result in sources if (finding := summary.main_finding(result))],
         warning=summary.mismatch_warning(results),
         command_differences=[] if single else summary.command_differences(results),
@@ -116,7 +116,7 @@ def render_report(results: Sequence[Results]) -> str:
         panels=panels,
         space_time=[figures.data_uri(space_time.space_time_figure(panels, [panel])) for panel in panels],
         has_cavs=any(panel.controlled_columns for panel in panels),
-        drawn=drawn,
+        replay_panels=replay_panels,
         road_values=list(dict.fromkeys(roads)),
         has_lane_maps=space_time.has_lane_maps(panels),
         baseline_differences=summary.baseline_differences(columns),
@@ -130,48 +130,50 @@ def render_report(results: Sequence[Results]) -> str:
         table=table,
         sources=[(name, result, original_command(result)) for name, result in sources],
         script=_page_file("replay.js"),
-        undrawn=[panel.driver for panel in panels if not panel.has_poses],
-        replay_data=Markup(json.dumps(replay_data(drawn)).replace("<", "\\u003c")),
+        drivers_without_replay=[panel.driver for panel in panels if not panel.has_poses],
+        replay_data=Markup(json.dumps(replay_data(replay_panels)).replace("<", "\\u003c")),
     )
 
 
 def _report_figures(
     sources: Sources, columns: Sequence[ReportColumn], panels: Sequence[PlotEpisode]
 ) -> dict[str, Figure]:
-    found: dict[str, Figure] = {}
+    """Return the figures of the report for which there are data, by the name in the page."""
+    report_figures: dict[str, Figure] = {}
     if panels:
-        found["time_series"] = figures.time_series_figure(panels)
+        report_figures["time_series"] = figures.time_series_figure(panels)
     if any(panel.has_recorded_leader for panel in panels):
-        found["last_vehicle"] = figures.last_vehicle_figure(panels)
+        report_figures["last_vehicle"] = figures.last_vehicle_figure(panels)
     if runs := {name: result.progress for name, result in sources if result.progress}:
-        test_returns, expert = _test_returns(sources, columns)
-        found["learning_curve"] = figures.learning_curve_figure(runs, _expert_returns(sources), test_returns, expert)
+        curves = runs, _expert_returns(sources), *_test_returns(sources, columns)
+        report_figures["learning_curve"] = figures.learning_curve_figure(*curves)
     if len(sources) == 1 and sources[0][1].progress:
         progress, model = sources[0][1].progress, sources[0][1].model
-        found["training_time"] = figures.training_time_figure(progress)
+        report_figures["training_time"] = figures.training_time_figure(progress)
         if model is not None and "waves" in model:
-            found["model_waves"] = wave_figure(model)
+            report_figures["model_waves"] = wave_figure(model)
         elif model is not None:
-            found |= {"model_examples": example_figure(model), "model_errors": error_figure(model)}
-            found["model_rollouts"] = rollout_figure(progress, model)
-    return found
+            report_figures |= {"model_examples": example_figure(model), "model_errors": error_figure(model)}
+            report_figures["model_rollouts"] = rollout_figure(progress, model)
+    return report_figures
 
 
 def _test_returns(sources: Sources, columns: Sequence[ReportColumn]) -> tuple[dict[str, Estimate], str]:
-    """Return the returns on test seeds by driver, and the expert of a single training, of which they are differences.
+    """Return the returns on test seeds by driver, and an empty text.
 
-    Human drivers are left out then: their returns are often so small that the other differences would not be visible.
+    For a single training, the returns are differences to its expert, and the text is the label of the expert. Human
+    drivers are left out, because other differences would often not be visible next to their small returns.
     """
     rows = {column.name: column.rows for column in columns}
     expert = sources[0][1].metadata.get("expert", "")
     if len(sources) > 1 or expert not in rows:
-        return {name: metric_estimate(own, "return") for name, own in rows.items()}, ""
-    others = rows.keys() - {expert, HUMAN_LABEL}
-    return {name: paired_difference(rows[name], rows[expert], "return") for name in rows if name in others}, expert
+        return {name: metric_estimate(driver_rows, "return") for name, driver_rows in rows.items()}, ""
+    compared = [name for name in rows if name not in (expert, HUMAN_LABEL)]
+    return {name: paired_difference(rows[name], rows[expert], "return") for name in compared}, expert
 
 
 def _expert_returns(sources: Sources) -> dict[str, float]:
-    """Return the return of the expert of each run on the validation seeds, with which its curve starts."""
+    """Return the return of each expert on validation seeds, with which the curve of its run starts."""
     returns: dict[str, float] = {}
     has_several_roads = len({result.metadata.get("scenario") for _, result in sources}) > 1
     for _, result in sources:
@@ -182,7 +184,7 @@ def _expert_returns(sources: Sources) -> dict[str, float]:
 
 
 def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
-    """Return the data of the page's replay: positions and speeds at a few frames per second.
+    """Return the data for the replay on the page: positions and speeds at a few frames per second.
 
     With many vehicles there are fewer frames, to limit the size of the page.
     """
@@ -199,7 +201,7 @@ def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
     return {
         "step": step,
         "frames": frames,
-        "start": round(_worst_time(panels[0]), 1),
+        "start": round(_wave_time(panels[0]), 1),
         "min_speed": scale.vmin,
         "max_speed": scale.vmax,
         "colors": figures.color_table(),
@@ -209,31 +211,31 @@ def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
     }
 
 
-def _worst_time(episode: PlotEpisode) -> float:
-    """Return the first time at which speeds differ nearly as much as ever: a wave is on the road [s]."""
+def _wave_time(episode: PlotEpisode) -> float:
+    """Return the first time with a large wave [s]: the variance of speeds is near its maximum."""
     count = np.sum(~np.isnan(episode.speeds), axis=1)
     mean = np.nansum(episode.speeds, axis=1) / count.clip(1)
     variance = np.nansum((episode.speeds - mean[:, None]) ** 2, axis=1) / count.clip(1)
-    return float(episode.times[(variance >= WORST_SHARE * variance.max()).argmax()])
+    return float(episode.times[(variance >= WAVE_VARIANCE_RATIO * variance.max()).argmax()])
 
 
 def _replay_track(episode: PlotEpisode, step: float, frames: int, longest_platoon: float) -> dict[str, Any]:
     """Return the positions and speeds of the vehicles, and the lines of the road.
 
-    On a closed road positions are along the loop, otherwise on the plane. A line has rows (coordinate along the road,
-    x, y) [m]. After an early end the vehicles stand still. Behind a recorded vehicle the line has the same length for
-    all drivers [m].
+    Positions are along the loop on a closed road, and in the plane on other roads. A line has rows (coordinate along
+    the road, x, y) [m]. After an early end the vehicles stand still. Behind a recorded vehicle the line is as long as
+    the longest platoon of all drivers [m].
     """
-    indices = np.round(np.arange(frames) * step / episode.control_step).astype(int)
-    indices = indices.clip(max=len(episode.speeds) - 1)
-    speeds = episode.speeds[indices]
+    snapshots = np.round(np.arange(frames) * step / episode.control_step).astype(int)
+    snapshots = snapshots.clip(max=len(episode.speeds) - 1)
+    speeds = episode.speeds[snapshots]
     if episode.is_closed:
         return {
             "vehicles": speeds.shape[1],
             "cavs": episode.controlled_columns,
             "loop_length": episode.loop_length,
             "speeds": [_encode_array(speeds)],
-            "positions": [_encode_array(episode.positions[indices])],
+            "positions": [_encode_array(episode.positions[snapshots])],
             "lines": [np.round(episode.outline, 2).tolist()],
             "merges": [],
         }
@@ -241,7 +243,7 @@ def _replay_track(episode: PlotEpisode, step: float, frames: int, longest_platoo
     is_present, is_cav = ~np.isnan(speeds[:, vehicles]), np.isin(vehicles, episode.controlled_columns)
     first, last = is_present.argmax(axis=0), frames - 1 - is_present[::-1].argmax(axis=0)
     columns = assign_columns(first, last, is_cav.tolist())
-    values = np.concatenate([episode.poses[indices], speeds[..., None]], axis=-1)
+    values = np.concatenate([episode.poses[snapshots], speeds[..., None]], axis=-1)
     packed = np.full((frames, int(columns.max(initial=-1)) + 1, 4), np.nan, np.float32)
     for vehicle, column, present in zip(vehicles, columns, is_present.T, strict=True):
         packed[present, column] = values[present, vehicle]
@@ -255,27 +257,27 @@ def _replay_track(episode: PlotEpisode, step: float, frames: int, longest_platoo
         "speeds": [_encode_array(packed[..., 3])],
         "poses": [_encode_array(packed[..., axis]) for axis in range(3)],
         "lines": [np.column_stack([np.zeros(len(line)), line]).round(1).tolist() for line in lines],
-        "merges": _merge_places(episode),
+        "merges": _merge_points(episode),
     }
 
 
-def _merge_places(episode: PlotEpisode) -> list[list[float]]:
-    """Return the places (x, y) where ramps join [m]: those of the vehicles that were nearest to each."""
-    places = []
+def _merge_points(episode: PlotEpisode) -> list[list[float]]:
+    """Return the points (x, y) where ramps join [m], from the vehicle that was nearest to each merge."""
+    points = []
     for position in episode.merge_positions:
         distance = np.abs(episode.positions - position)
         if np.isfinite(distance).any() and np.nanmin(distance) <= MAX_MERGE_DISTANCE:
             nearest = np.unravel_index(np.nanargmin(distance), distance.shape)
-            places.append(episode.poses[nearest][:2].round(1).tolist())
-    return places
+            points.append(episode.poses[nearest][:2].round(1).tolist())
+    return points
 
 
 def _encode_array(array: np.ndarray) -> dict[str, Any]:
     """Return values of shape (frames, columns) in the compressed format of the page.
 
-    Values are quantized to 65,534 steps between the smallest and the largest, with `REPLAY_NAN` for NaN; on three
-    kilometers a step is 5 cm. Each frame is stored as the difference to the previous one, modulo 65,536, compressed
-    with zlib, as base64.
+    Values are quantized to 65,534 steps between the smallest and the largest value (5 cm on three kilometers), and NaN
+    becomes `REPLAY_NAN`. The differences of each frame to the previous frame, modulo 65,536, are compressed with zlib
+    and encoded as base64.
     """
     low, high = (float(end(array, initial=0.0)) for end in (np.nanmin, np.nanmax))
     scale = (high - low) / (REPLAY_NAN - 1) or 1.0

@@ -1,4 +1,4 @@
-"""Texts, tables and figures about the learned model of a run."""
+"""Texts, tables and figures on the learned model of a run."""
 
 from collections.abc import Sequence
 from math import nan
@@ -23,7 +23,7 @@ PREDICTED_QUANTITIES = {
     "reward": ("reward", ""),
 }  # label and unit of each predicted quantity
 ERROR_KINDS = ("change", "base", "model")
-"""quantities with a root mean square: the predicted changes, the errors of the base model and of the learned model"""
+"""quantities with a root mean square: predicted changes, errors of the base model, errors of the learned model"""
 BASE_LABELS = {
     "idm": ("IDM alone", "physics with an IDM follower"),
     "population": (
@@ -35,21 +35,21 @@ BASE_LABELS = {
     "none": ("no change", "the assumption that nothing changes"),
 }  # label and description of each base model
 WAVE_HEADINGS = ("mean speed [m/s]", "std across vehicles [m/s]", "slowest vehicle [m/s]")
-ERROR_PRECISION = 1e-5  # errors below this are rounding errors of single precision [m/s, m, reward]
+ERROR_PRECISION = 1e-5  # smaller errors are rounding errors of single precision [m/s, m, reward]
 
 MODEL_COLOR, BASE_COLOR, CHANGE_COLOR, RECORDED_COLOR = LINE_COLORS[2], LINE_COLORS[1], LINE_COLORS[0], TEXT_COLOR
 ESTIMATORS = ("unexplained_variance", "transitions", "total_variation", "training_loss")
-REPLAYED_QUANTITIES = ("leader_speed", "leader_gap", "follower_gap")  # quantities with errors drawn over the time ahead
+REPLAYED_QUANTITIES = ("leader_speed", "leader_gap", "follower_gap")  # errors are drawn over the time ahead
 ERROR_BINS = (("leader_speed", "leader_gap"), ("leader_speed", "speed"), ("reward", "leader_gap"))
-"""pairs of a quantity and of the state over which its errors are drawn"""
+"""pairs of a quantity and the state over which its errors are drawn"""
 STEPS_LABEL = "environment steps [thousands]"
 
 
 def error_rows(facts: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the errors by quantity, one control step ahead and, with `final_`, at the end of the replay.
+    """Return a row for each quantity: errors one control step ahead and, with `final_`, at the end of the replay.
 
-    Each row has a label, a unit, the values of the `ERROR_KINDS`, and the same values as text in `cells`. The reward is
-    not replayed: its final errors are None.
+    A row has a label, a unit, the errors of each of the `ERROR_KINDS`, and the errors as texts in `cells`. Final errors
+    of the reward are None, because it is not replayed.
     """
     rows = []
     for name, (label, unit) in PREDICTED_QUANTITIES.items():
@@ -64,19 +64,21 @@ def error_rows(facts: dict[str, Any]) -> list[dict[str, Any]]:
 def error_headings(facts: dict[str, Any]) -> list[str]:
     """Return the headings of the cells of `error_rows`."""
     names = ("change", _base_label(facts), "model")
-    return [f"{name}, {after:g} s" for after in (facts["control_step"], facts["replay"]["times"][-1]) for name in names]
+    times = facts["control_step"], facts["replay"]["times"][-1]
+    return [f"{name}, {time:g} s" for time in times for name in names]
 
 
 def wave_rows(facts: dict[str, Any]) -> list[tuple[str, list[str]]]:
-    """Return label and cells of a recorded episode and of the rollouts from its start.
+    """Return the labels and cells of a recorded episode and of rollouts from its start.
 
-    The cells are those of `WAVE_HEADINGS`: means over the second half, where errors have had time to grow.
+    The cells below `WAVE_HEADINGS` are means over the second half, after errors have grown.
     """
     rows: list[tuple[str, list[str]]] = []
     for label, road in facts["waves"].items():
         speeds = np.array(road["speeds"], np.float64)
-        later = speeds[len(speeds) // 2 :]
-        values = (np.nanmean(later), np.nanstd(later, 1).mean(), np.nanmin(later, 1).mean())
+        second_half = speeds[len(speeds) // 2 :]
+        minima = np.nanmin(second_half, 1)
+        values = (np.nanmean(second_half), np.nanstd(second_half, 1).mean(), minima.mean())
         rows.append((_base_label(facts) if label == "base" else label, [f"{value:.2f}" for value in values]))
     return rows
 
@@ -91,7 +93,7 @@ def error_text(value: float | None) -> str:
 
 
 def error_verdict(facts: dict[str, Any]) -> str:
-    """Return which errors of the model are smaller and larger than its base's, one step ahead and at the end."""
+    """Return sentences on errors of the model that are smaller or larger than those of its base."""
     sentences = []
     for prefix, time in (("", "One step"), ("final_", f"{facts['replay']['times'][-1]:g} s")):
         smaller, larger = [], []
@@ -99,21 +101,21 @@ def error_verdict(facts: dict[str, Any]) -> str:
             base, model = row[f"{prefix}base"], row[f"{prefix}model"]
             if base is None or max(base, model) < ERROR_PRECISION:
                 continue
-            change = row["label"]
+            text = row["label"]
             if base >= ERROR_PRECISION:  # relative to an exact base there is no percentage
-                change += f" (by {100 * abs(1.0 - model / base):.0f}\u00a0%)"
+                text += f" (by {100 * abs(1.0 - model / base):.0f}\u00a0%)"
             if model < 0.98 * base:
-                smaller.append(change)
+                smaller.append(text)
             elif model > 1.02 * base:
-                larger.append(change)
-        parts = (("smaller for ", smaller), ("larger for ", larger))
-        text = ", and ".join(start + ", ".join(changes) for start, changes in parts if changes)
-        sentences.append(f"{time} ahead, the model's errors relative to its base are {text or 'equal'}.")
+                larger.append(text)
+        groups = (("smaller for ", smaller), ("larger for ", larger))
+        comparison = ", and ".join(prefix + ", ".join(texts) for prefix, texts in groups if texts)
+        sentences.append(f"{time} ahead, the model's errors relative to its base are {comparison or 'equal'}.")
     return " ".join(sentences)
 
 
 def rollout_summary(progress: Sequence[dict[str, Any]]) -> str:
-    """Return length and returns of the model rollouts in the last iteration."""
+    """Return sentences on the length and the returns of model rollouts in the last iteration."""
     last = progress[-1]["model"]
     text = (
         f"In the last iteration rollouts are k* = {last['k_star']} control steps long: the model error "
@@ -129,7 +131,7 @@ def rollout_summary(progress: Sequence[dict[str, Any]]) -> str:
 
 
 def bound_summary(facts: dict[str, Any]) -> str:
-    """Return the values of the bound C for different rollout lengths, relative to the largest possible return."""
+    """Return sentences on the bound C for different rollout lengths, relative to the largest possible return."""
     if (bound := facts["bound"]) is None:
         return ""
     k, values, max_return = bound["k"], bound["bound"], bound["largest_return"]
@@ -148,7 +150,7 @@ def bound_summary(facts: dict[str, Any]) -> str:
 
 
 def model_section(result: Results) -> dict[str, Any] | None:
-    """Return the page's content about the learned model; None without one."""
+    """Return the content of the page on the learned model; None if there is no such model."""
     facts = result.model
     if facts is None or not result.progress:
         return None
@@ -177,15 +179,15 @@ def _base_label(facts: dict[str, Any]) -> str:
 
 
 def _wave_caption(facts: dict[str, Any]) -> str:
-    left, start = "an episode in the environment that no network was trained on", "from its start"
+    episode, start = "an episode in the environment that no network was trained on", "from its start"
     cavs = "CAVs repeat their recorded accelerations, but noise"
     if facts.get("lane_names"):
-        left += ", with its traffic demand"
+        episode += ", with its traffic demand"
         start = "with the same demand"
         cavs = "Only the expert drives the CAVs, and the perception error of human drivers"
     return (
-        f"Left: {left}; then rollouts {start}, with the learned model and with the base model alone. {cavs} is drawn "
-        "again: waves are as frequent and as fast, but occur at other times."
+        f"Left: {episode}; then rollouts {start}, with the learned model and with the base model alone. {cavs} is "
+        "drawn again: waves are as frequent and as fast, but occur at other times."
     )
 
 
@@ -199,15 +201,16 @@ def wave_figure(facts: dict[str, Any]) -> Figure:
         arrays = (road.get(name, np.zeros((0, 0))) for name in ("speeds", "positions", "lanes"))
         speeds, positions, lanes = (np.array(array, np.float64) for array in arrays)
         columns = tuple(str(column) for column in range(speeds.shape[1]))
-        own = {"driver": _base_label(facts) if label == "base" else label, "vehicle_ids": columns, "speeds": speeds}
-        own |= {"cav_ids": tuple(columns[cav] for cav in road["cav_columns"])}
-        episodes.append(PlotEpisode(**common, **own, positions=positions, lane_indices=lanes))
+        driver = _base_label(facts) if label == "base" else label
+        ids: dict[str, Any] = {"vehicle_ids": columns, "cav_ids": tuple(columns[cav] for cav in road["cav_columns"])}
+        values: dict[str, Any] = {"speeds": speeds, "positions": positions, "lane_indices": lanes}
+        episodes.append(PlotEpisode(**common, **ids, **values, driver=driver))
     return space_time_figure(episodes)
 
 
 @rc_context(PLOT_STYLE)
 def rollout_figure(progress: Sequence[dict[str, Any]], facts: dict[str, Any]) -> Figure:
-    """Draw over training rollout length, model error and returns; and the bound over the rollout length."""
+    """Draw rollout length, model error and returns over environment steps, and the bound over the rollout length."""
     figure, (lengths, estimates, returns, bounds) = _panels(2, 2, 2.3)
     steps = np.array([row["environment_steps"] for row in progress]) / 1000
     rows = [row["model"] for row in progress]
@@ -242,7 +245,7 @@ def rollout_figure(progress: Sequence[dict[str, Any]], facts: dict[str, Any]) ->
 
 @rc_context(PLOT_STYLE)
 def error_figure(facts: dict[str, Any]) -> Figure:
-    """Draw the errors of model and base: over the time ahead; and one step ahead over gap and speed."""
+    """Draw the errors of the model and its base over the time ahead, and one step ahead over gap and speed."""
     figure, panels = _panels(2, 3, 2.4)
     base = {"color": BASE_COLOR, "lw": 1.4, "ls": "--"}
     model = {"color": MODEL_COLOR, "lw": 1.6}
@@ -269,15 +272,15 @@ def error_figure(facts: dict[str, Any]) -> Figure:
 
 @rc_context(PLOT_STYLE)
 def example_figure(facts: dict[str, Any]) -> Figure:
-    """Draw model and recording with the same accelerations from the same start; each member is a thin line."""
+    """Draw recordings, and the model with the same accelerations and starts; each member is a thin line."""
     examples, times = facts["replay"]["examples"], facts["replay"]["times"]
     quantities = list(examples[0]["quantities"])
     figure, panels = _panels(len(quantities), len(examples), 2.1)
     pairs = [(name, example) for name in quantities for example in examples]
     for axes, (name, example) in zip(panels, pairs, strict=True):
         values = example["quantities"][name]
-        for number, member in enumerate(values["members"]):
-            label = "model, each member" if number == 0 else None
+        for index, member in enumerate(values["members"]):
+            label = "model, each member" if index == 0 else None
             axes.plot(times, member, color=MODEL_COLOR, lw=0.9, alpha=0.8, label=label)
         axes.plot(times, values["base"], color=BASE_COLOR, lw=1.1, ls="--", label=_base_label(facts))
         axes.plot(times, values["recorded"], color=RECORDED_COLOR, lw=1.6, label="recorded")
@@ -288,7 +291,7 @@ def example_figure(facts: dict[str, Any]) -> Figure:
 
 
 def _panels(rows: int, columns: int, height: float) -> tuple[Figure, np.ndarray]:
-    """Return a figure and its panels, row by row, each `height` inches high."""
+    """Return a figure and its panels, row by row; each is `height` inches high."""
     figure = new_figure(height * rows + 0.4)
     return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 

@@ -1,4 +1,4 @@
-"""Texts, key figures and tables of the report, from the results of one or several folders."""
+"""Texts, key figures and tables of a report on one or several folders of results."""
 
 import shlex
 from collections.abc import Sequence
@@ -24,14 +24,14 @@ from unjam.measures.statistics import (
     paired_difference,
 )
 from unjam.measures.verdict import Verdict, is_better, road_metrics, verdicts
-from unjam.reports.results import PlotEpisode, Results, is_outdated, kept_row, original_command
+from unjam.reports.results import PlotEpisode, Results, is_outdated, original_command, selected_row
 from unjam.text import format_count, printable
 
-CLOSE_TIME_GAP = 1.0  # time gap below which the report has a note [s]; the paper's h_max
+CLOSE_TIME_GAP = 1.0  # the report has a note on smaller time gaps [s]; h_max of the paper
 IRRELEVANT_OPTIONS, IRRELEVANT_FLAGS = ("--out", "--workers"), ("--json", "--all")
-"""options of a command on which its results do not depend, with a value and without"""
-FORMULA_STARTS = {*"=+-@\t\r\n"}  # first letters of a cell that a spreadsheet takes for a formula
-MAX_LIMIT_RATIO = 1.01  # ratio of mean speed to the limit above which the report has a note
+"""options of a command with and without a value that have no effect on its results"""
+FORMULA_STARTS = {*"=+-@\t\r\n"}  # first characters of cells that a spreadsheet reads as formulas
+MAX_LIMIT_RATIO = 1.01  # the report has a note on larger ratios of mean speed to the limit
 COMPARED_METRICS = (
     *("mean_speed", "mean_speed_steady", "outflow_veh_per_h", "travel_time", "delay", "insertion_backlog_veh"),
     *(POWER_FUEL_METRIC, "share_standing", "speed_std_fleet", "speed_std_fleet_steady"),
@@ -43,74 +43,75 @@ COMPARED_METRICS = (
 
 @dataclass(frozen=True)
 class ReportColumn:
-    """One driver of one folder, as named in tables and figures."""
+    """One driver of one folder, with its name in tables and figures."""
 
     name: str
     rows: list[dict[str, Any]]
     episode: PlotEpisode | None
-    baseline_rows: list[dict[str, Any]] | None = None  # rows of its folder's baseline; None for the baseline itself
-    verdict: Verdict | None = None  # the verdict compared with the baseline
+    baseline_rows: list[dict[str, Any]] | None = None  # of the baseline in the folder; None for the baseline itself
+    verdict: Verdict | None = None  # compared with the baseline
 
 
 def report_columns(results: Sequence[Results]) -> list[ReportColumn]:
-    """Return all drivers in the order of `driver_rank`; those that several folders share, only once."""
+    """Return all drivers in the order of `driver_rank`; a driver with equal episodes in several folders only once."""
     columns: dict[str, ReportColumn] = {}
     for result, folder in zip(results, folder_names(results), strict=True):
         baseline = result.baseline or HUMAN_LABEL
-        found = {verdict.driver: verdict for verdict in verdicts(result.rows, baseline)}
+        verdict_by_driver = {verdict.driver: verdict for verdict in verdicts(result.rows, baseline)}
         for label, rows in result.rows.items():
-            is_own = len(results) > 1 and result.trained_label in (None, label)
-            is_other = label in columns and _episode_keys(columns[label].rows) != _episode_keys(rows)
-            name = f"{folder}: {label}" if is_own or is_other else label
-            others = None if label == baseline else result.rows.get(baseline)
-            verdict = replace(found[label], driver=name) if label in found else None
-            columns.setdefault(name, ReportColumn(name, rows, result.plot_episodes.get(label), others, verdict))
+            is_of_folder = len(results) > 1 and result.trained_label in (None, label)
+            has_homonym = label in columns and _episode_keys(columns[label].rows) != _episode_keys(rows)
+            name = f"{folder}: {label}" if is_of_folder or has_homonym else label
+            baseline_rows = None if label == baseline else result.rows.get(baseline)
+            verdict = replace(verdict_by_driver[label], driver=name) if label in verdict_by_driver else None
+            episode = result.plot_episodes.get(label)
+            columns.setdefault(name, ReportColumn(name, rows, episode, baseline_rows, verdict))
     return sorted(columns.values(), key=lambda column: driver_rank(column.name))
 
 
 def common_baseline(results: Sequence[Results]) -> str:
     """Return the baseline of the table of `report_columns`; empty if the folders do not share one."""
-    first, *others = (choose_baseline(result.rows, result.baseline) for result in results)
-    is_same = len({tuple(_episode_keys(result.rows.get(first, []))) for result in results}) == 1
-    is_own = len(results) > 1 and any(result.trained_label in (None, first) for result in results)
-    return first if all(other == first for other in others) and is_same and not is_own else ""
+    baselines = [choose_baseline(result.rows, result.baseline) for result in results]
+    baseline = baselines[0]
+    has_same_episodes = len({tuple(_episode_keys(result.rows.get(baseline, []))) for result in results}) == 1
+    is_of_folder = len(results) > 1 and any(result.trained_label in (None, baseline) for result in results)
+    return baseline if len(set(baselines)) == 1 and has_same_episodes and not is_of_folder else ""
 
 
 def first_alternative(results: Sequence[Results]) -> str:
-    """Return the column of human drivers in the first of several folders of users' networks; empty without it.
+    """Return the name of the column of human drivers on the first of several user networks; else an empty text.
 
-    Those of the others, on the seeds that both have, are compared with it: a network with a speed limit with one
-    without, say.
+    Human drivers on the other networks, for example with a speed limit, are compared with it on common seeds.
     """
     has_humans = all(HUMAN_LABEL in result.rows and result.trained_label is None for result in results)
     are_networks = all(result.metadata["scenario"].endswith(".sumocfg") for result in results)
-    common = common_seeds(results)
+    seeds = common_seeds(results)
     keys = [_episode_keys(result.rows[HUMAN_LABEL]) for result in results] if has_humans else []
-    episodes = {str([key for key in driver_keys if key[0] in common]) for driver_keys in keys}
-    is_comparison = len(results) > 1 and are_networks and bool(common) and len(episodes) > 1
+    episodes = {str([key for key in network_keys if key[0] in seeds]) for network_keys in keys}
+    is_comparison = len(results) > 1 and are_networks and bool(seeds) and len(episodes) > 1
     return f"{folder_names(results)[0]}: {HUMAN_LABEL}" if is_comparison else ""
 
 
 def common_seeds(results: Sequence[Results]) -> set[str]:
-    """Return the seeds that human drivers of all folders have."""
+    """Return the seeds on which all folders have human drivers."""
     return set.intersection(*({str(row["seed"]) for row in result.rows.get(HUMAN_LABEL, [])} for result in results))
 
 
 def compare_alternative(column: ReportColumn, first_rows: Sequence[dict[str, Any]]) -> ReportColumn:
-    """Return the column of human drivers on another network, compared with those on the first one on common seeds."""
+    """Return the column of human drivers on another network, compared with the first network on common seeds."""
     label = "human drivers of the first network"
-    own, first = (list(rows) for rows in zip(*pair_rows(column.rows, first_rows), strict=True))
-    (verdict,) = verdicts({label: first, column.name: own}, label)
-    return replace(column, rows=own, baseline_rows=first, verdict=verdict)
+    rows, baseline_rows = (list(paired) for paired in zip(*pair_rows(column.rows, first_rows), strict=True))
+    (verdict,) = verdicts({label: baseline_rows, column.name: rows}, label)
+    return replace(column, rows=rows, baseline_rows=baseline_rows, verdict=verdict)
 
 
 def _episode_keys(rows: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Return a key for each episode of a driver; the keys differ between different roads."""
+    """Return a key for each episode of a driver; keys of different roads are different."""
     return [(str(row["seed"]), str(row["return"])) for row in rows]
 
 
 def folder_names(results: Sequence[Results]) -> list[str]:
-    """Return a name for each folder: the shortest end of its path that is unique."""
+    """Return a name for each folder: the shortest unique end of its path."""
     paths = [result.folder.resolve().parts for result in results]
     for length in range(1, max(map(len, paths)) + 1):
         names = ["/".join(parts[-length:]) for parts in paths]
@@ -133,22 +134,21 @@ def report_title(results: Sequence[Results]) -> str:
 def mismatch_warning(results: Sequence[Results]) -> str:
     """Return a warning if several folders have different roads, seeds or durations; else an empty text.
 
-    Networks that are compared as alternatives have an explanation instead.
-
-    The roads of one training are different by intention.
+    Networks that are compared as alternatives have an explanation instead. The roads of one training are different on
+    purpose and have no warning.
     """
     parents = {result.folder.resolve().parent for result in results}
     if len(parents) == 1 and (parents.pop() / "config.toml").is_file():
         return ""
     episodes = [next(iter(result.plot_episodes.values()), None) for result in results]
-    known = [episode for episode in episodes if episode is not None and not episode.has_recorded_leader]
-    kinds = {
+    comparable = [episode for episode in episodes if episode is not None and not episode.has_recorded_leader]
+    properties = {
         "roads": [result.metadata["scenario"] for result in results],
-        "geometries": [episode.outline.round().tobytes() + episode.lane_lines.round().tobytes() for episode in known],
+        "geometries": [road.outline.round().tobytes() + road.lane_lines.round().tobytes() for road in comparable],
         "seeds": [str([row["seed"] for row in next(iter(result.rows.values()), [])]) for result in results],
-        "durations": [str(episode.times[-1]) for episode in known if episode.status == "completed"],
+        "durations": [str(episode.times[-1]) for episode in comparable if episode.status == "completed"],
     }
-    different = [kind for kind, values in kinds.items() if len(set(values)) > 1]
+    different = [name for name, values in properties.items() if len(set(values)) > 1]
     if (first := first_alternative(results)) and "durations" not in different:
         return (
             f"Human drivers of these networks are compared with {first}, on the seeds that both have. Delay is the "
@@ -162,9 +162,9 @@ def mismatch_warning(results: Sequence[Results]) -> str:
 
 
 def command_differences(results: Sequence[Results]) -> list[tuple[str, str]]:
-    """Return for each of several folders the options of the command that wrote it which not all of them have.
+    """Return the name of each folder with the options of its command that other folders do not have.
 
-    Empty where no command is known to differ, apart from the folder for its results and the number of workers.
+    Empty if a command is unknown, or if commands differ only in the folder of results and the number of workers.
     """
     commands = [_command_options(result) for result in results]
     if not all(commands):
@@ -184,18 +184,18 @@ def _command_options(result: Results) -> list[str]:
 
 
 def name_baselines(results: Sequence[Results]) -> str:
-    """Return what the drivers of these results are compared with, in words."""
+    """Return the names of the baselines of these results, joined by `or`."""
     names = dict.fromkeys(result.baseline or "the human baseline" for result in results)
     return " or ".join("the human baseline" if name == HUMAN_LABEL else name for name in names)
 
 
 def main_finding(result: Results) -> str:
-    """Return what a folder shows besides the verdicts on its drivers, in a few sentences; it may be empty."""
+    """Return sentences on the results of a folder in addition to the verdicts on its drivers; may be empty."""
     if (trained := result.trained_label) is None:
         return "" if HUMAN_LABEL in result.rows and len(result.rows) > 1 else _drive_finding(result)
     rows = result.rows[trained]
-    experts = {label: other for label, other in result.rows.items() if label not in (trained, HUMAN_LABEL)}
-    returns = {label: metric_estimate(other, "return").mean for label, other in experts.items()}
+    experts = {label: result.rows[label] for label in result.rows if label not in (trained, HUMAN_LABEL)}
+    returns = {label: metric_estimate(experts[label], "return").mean for label in experts}
     expert, sentences = result.metadata["expert"], list[str]()
     best = max(returns, key=lambda label: np.nan_to_num(returns[label], nan=-np.inf), default=expert)
     if expert in experts:
@@ -203,7 +203,7 @@ def main_finding(result: Results) -> str:
         seeds = format_units(rows, gain.count, "test seed")
         finding = f"Return difference to its expert, {expert} (return {returns[expert]:,.0f}), on {seeds}"
         sentences.append(f"{finding}: {format_difference(gain)}. {gain_verdict(gain)}")
-        if row := kept_row(result.progress):
+        if row := selected_row(result.progress):
             steps = f"{row['environment_steps']:,} environment steps"
             sentences.append(f"The network is that after {steps}, the best in validation.")
         if not is_expert_unchanged(gain):
@@ -217,7 +217,7 @@ def main_finding(result: Results) -> str:
 
 
 def _traffic_finding(rows: EpisodeRows, expert_rows: EpisodeRows, expert: str, name: str) -> str:
-    """Return whether the metric that decides on this road is better than that of the expert, as a sentence."""
+    """Return a sentence on the difference to the expert in the main metric of the road."""
     metric, change = METRICS[name], paired_difference(rows, expert_rows, name)
     finding = {None: "no difference is shown", True: "better", False: "worse"}[is_better(name, change)]
     number = f"{format_difference(change, metric.digits)} {metric.unit}".strip()
@@ -235,18 +235,18 @@ def _drive_finding(result: Results) -> str:
 
 
 def _mean_text(rows: Sequence[dict[str, Any]], name: str) -> str:
-    """Return a mean with its label; what follows a comma in the name of the metric is after it, in parentheses."""
+    """Return a mean with the label of the metric; text after a comma in the label follows in parentheses."""
     label, _, detail = METRICS[name].label.partition(", ")
     return f"{label} {_mean_with_unit(rows, name)}{detail and f' ({detail})'}"
 
 
 def _mean_with_unit(rows: EpisodeRows, name: str) -> str:
-    metric, found = METRICS[name], metric_estimate(rows, name)
-    return f"{found.mean:.{metric.digits}f} {metric.unit}".strip() if found.count else "–"
+    metric, estimate = METRICS[name], metric_estimate(rows, name)
+    return f"{estimate.mean:.{metric.digits}f} {metric.unit}".strip() if estimate.count else "–"
 
 
 def report_notes(result: Results) -> list[str]:
-    """Return caveats of the main finding."""
+    """Return caveats on the results of a folder."""
     labels = [result.trained_label] if result.trained_label else list(filter(driver_rank, result.rows))
     notes = dict.fromkeys([*result.metadata.get("notes", []), *early_end_notes(result.rows)])
     if is_outdated(result.folder, result.metadata):
@@ -278,7 +278,7 @@ def _driver_notes(result: Results, label: str) -> list[str]:
 
 
 def key_figures(result: Results) -> list[dict[str, str]]:
-    """Return the key figures of the only driver of a folder; none for several drivers, which have verdicts."""
+    """Return the key figures of the only driver in a folder; none for several drivers, which have verdicts."""
     if len(result.rows) > 1:
         return []
     [(label, rows)] = result.rows.items()
@@ -289,8 +289,8 @@ def key_figures(result: Results) -> list[dict[str, str]]:
 def baseline_differences(columns: Sequence[ReportColumn]) -> dict[str, Any]:
     """Return the table of paired differences to the baseline of the same folder; empty without baselines.
 
-    A cell is marked as better or worse if its confidence interval excludes zero and all pairs count. There is no
-    correction for multiple comparisons: of twenty cells, one is marked by chance.
+    A cell is marked as better or worse if its confidence interval excludes zero and the metric is defined for all
+    pairs. Without correction for multiple comparisons, about one of twenty cells is marked by chance.
     """
     compared = [(column, column.baseline_rows) for column in columns if column.baseline_rows is not None]
     if not compared:
@@ -298,12 +298,13 @@ def baseline_differences(columns: Sequence[ReportColumn]) -> dict[str, Any]:
     rows = []
     for name in COMPARED_METRICS:
         metric, cells = METRICS[name], []
-        for column, others in compared:
-            gain, units = paired_difference(column.rows, others, name), count_units(column.rows, others)
-            verdict = is_better(name, gain) if gain.count == units else None
+        for column, baseline_rows in compared:
+            difference = paired_difference(column.rows, baseline_rows, name)
+            units = count_units(column.rows, baseline_rows)
+            verdict = is_better(name, difference) if difference.count == units else None
             mark = {True: "better", False: "worse", None: ""}[verdict]
-            text = str(estimate_cell(gain, metric.digits, units, "+"))
-            cells.append({"text": text, "mark": mark, "count": gain.count})
+            text = str(estimate_cell(difference, metric.digits, units, "+"))
+            cells.append({"text": text, "mark": mark, "count": difference.count})
         if any(cell["count"] for cell in cells):
             rows.append({"label": metric.label, "unit": metric.unit, "cells": cells})
     return {"names": [column.name for column, _ in compared], "rows": rows}
@@ -317,7 +318,7 @@ def episodes_as_csv(columns: Sequence[ReportColumn]) -> str:
 
 
 def csv_text(table: pd.DataFrame) -> str:
-    """Return a table as `printable` CSV; texts that a spreadsheet would calculate begin with an apostrophe."""
+    """Return a table as `printable` CSV, with an apostrophe before texts that a spreadsheet reads as formulas."""
 
     def protect(value: Any) -> Any:
         return f"'{value}" if isinstance(value, str) and value[:1] in FORMULA_STARTS else value

@@ -1,4 +1,4 @@
-"""Pictures and videos of a road, drawn without a display; environments render with them too."""
+"""Pictures and videos of a road, also for rendering of environments; they require no display."""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -22,18 +22,18 @@ from unjam.worlds.road_world import RoadScene
 
 FRAME_SIZE = 640  # width and height of a frame [pixels]
 ROAD_MARGIN = 8.0  # margin around the road [m]
-OVERSAMPLING = 2  # factor by which pictures are drawn larger and then reduced, for smooth edges
-MIN_VEHICLE_PIXELS = 7.0  # length of a vehicle on a large road, where the true length would be invisible
+OVERSAMPLING = 2  # pictures are drawn larger by this factor and then reduced, for smooth edges
+MIN_VEHICLE_PIXELS = 7.0  # minimum length of a vehicle, which would be invisible on a large road
 ROAD_COLOR = "#dfe3e8"
-MAX_TITLE_WIDTH = 36  # maximum length of a line of the title, which must fit into a ring [characters]
-MIN_EMPTY_CENTER = 0.15  # empty radius around the center that a caption there needs, relative to the size of the road
+MAX_TITLE_WIDTH = 36  # of a line of the title, which must fit into a ring [characters]
+MIN_EMPTY_CENTER = 0.15  # minimum radius for a caption in the center, relative to the size of the road
 LEGEND_WIDTH, LEGEND_HEIGHT = 110, 10  # size of the scale of speeds [pixels]
 FRAMES_PER_SECOND = 20
 VIDEO_FORMATS = (".gif", ".webp", ".mp4")
 
 
 def draw_road(scene: RoadScene, max_speed: float, caption: str) -> Image.Image:
-    """Return the picture of a road: vehicles colored by speed, and a caption of a few lines.
+    """Return the picture of a road with vehicles colored by speed, and a caption of a few lines.
 
     `max_speed` is the speed of the brightest color [m/s]; vehicles with speed NaN are not on the road.
     """
@@ -60,21 +60,21 @@ def draw_road(scene: RoadScene, max_speed: float, caption: str) -> Image.Image:
         pen.polygon(corners, fill=color, outline=outline, width=width)
     distances = np.linalg.norm(np.concatenate([_densify_line(line, size / 100) for line in lines]) - center, axis=1)
     is_centered = distances.min() > MIN_EMPTY_CENTER * size
-    place, anchor, align = (0.5, "mm", "center") if is_centered else (0.03, "la", "left")
+    position, anchor, align = (0.5, "mm", "center") if is_centered else (0.03, "la", "left")
     style: dict[str, Any] = {"fill": TEXT_COLOR, "font": ImageFont.load_default(22 * OVERSAMPLING), "spacing": 12}
-    pen.multiline_text((place * pixels, place * pixels), caption, anchor=anchor, align=align, **style)
+    pen.multiline_text((position * pixels, position * pixels), caption, anchor=anchor, align=align, **style)
     _draw_legend(pen, max_speed, pixels)
     return image.reduce(OVERSAMPLING)
 
 
 def _draw_legend(pen: ImageDraw.ImageDraw, max_speed: float, pixels: int) -> None:
-    """Draw the scale of speeds into the bottom right corner, which the roads of the package leave empty."""
+    """Draw the scale of speeds into the bottom right corner, where roads of the package are not."""
     colors, font = color_table(), ImageFont.load_default(14 * OVERSAMPLING)
     width, bottom = LEGEND_WIDTH * OVERSAMPLING, 0.97 * pixels
     left = bottom - width
     top = bottom - LEGEND_HEIGHT * OVERSAMPLING
-    for number, color in enumerate(colors):
-        start, end = (left + width * position / len(colors) for position in (number, number + 1))
+    for index, color in enumerate(colors):
+        start, end = (left + width * position / len(colors) for position in (index, index + 1))
         pen.rectangle((start, top, end, bottom), fill=color)
     for x, anchor, text in ((left, "ld", "0"), (left + width, "rd", f"{max_speed:.0f} m/s")):
         pen.text((x, top - 4 * OVERSAMPLING), text, fill=TEXT_COLOR, font=font, anchor=anchor)
@@ -82,10 +82,10 @@ def _draw_legend(pen: ImageDraw.ImageDraw, max_speed: float, pixels: int) -> Non
 
 
 def split_lines(lines: np.ndarray) -> list[np.ndarray]:
-    """Return lines that rows of NaN separate, without single points."""
+    """Split an array of points into lines at rows of NaN, without single points."""
     parts = np.split(lines, np.flatnonzero(np.isnan(lines[:, 0])))
-    finite = [part[~np.isnan(part[:, 0])] for part in parts]
-    return [part for part in finite if len(part) > 1]
+    finite_parts = [part[~np.isnan(part[:, 0])] for part in parts]
+    return [part for part in finite_parts if len(part) > 1]
 
 
 def _vehicle_corners(pose: np.ndarray, scale: float) -> np.ndarray:
@@ -97,7 +97,7 @@ def _vehicle_corners(pose: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _densify_line(line: np.ndarray, spacing: float) -> np.ndarray:
-    """Return a line with more points, at most about `spacing` meters apart."""
+    """Return a line with more points, with distances of at most about `spacing` [m]."""
     lengths = np.linalg.norm(np.diff(line, axis=0), axis=1)
     along = np.append(0.0, lengths.cumsum())
     grid = np.linspace(0.0, along[-1], 2 + int(along[-1] / spacing))
@@ -132,7 +132,7 @@ def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) ->
     if path.suffix.lower() == ".mp4":
         _write_mp4(frames, path, 1 / seconds)
         return
-    # A .gif counts in hundredths of a second: durations that are rounded separately would not add up.
+    # A .gif has durations in hundredths of a second; rounding each separately would change their sum.
     ends = np.round(100 * seconds * np.arange(1, 2 + (len(episode.speeds) - 1) // stride))
     durations = (10 * np.diff(ends, prepend=0)).astype(int).tolist()
     content, kind = io.BytesIO(), path.suffix.lower().removeprefix(".")
@@ -141,7 +141,7 @@ def write_video(episode: Episode, path: Path, title: str, pace: float = 10.0) ->
 
 
 def check_video_format(path: Path) -> None:
-    """Raise `InputError` unless `write_video` supports the format of such a file, `MissingPartError` without ffmpeg."""
+    """Raise `InputError` unless `write_video` supports the format of `path`, `MissingPartError` without ffmpeg."""
     if path.suffix.lower() not in VIDEO_FORMATS:
         raise invalid_value("video", path.name, f"a name that ends in {', '.join(VIDEO_FORMATS)}")
     if path.suffix.lower() == ".mp4":
@@ -150,7 +150,7 @@ def check_video_format(path: Path) -> None:
 
 def _write_mp4(frames: Iterator[Image.Image], path: Path, rate: float) -> None:
     imageio_ffmpeg = import_optional("imageio_ffmpeg")
-    with PrivateFolder() as private:  # ffmpeg itself writes the file: it follows links and hides errors
+    with PrivateFolder() as private:  # ffmpeg writes the file itself, follows links and hides errors
         video = Path(private, path.name)
         writer = imageio_ffmpeg.write_frames(str(video), (FRAME_SIZE, FRAME_SIZE), fps=rate, ffmpeg_log_level="error")
         writer.send(None)

@@ -1,4 +1,4 @@
-// Adds a download of each figure as SVG and of each table as CSV, and marks tables that are wider than the screen.
+// Adds links to download figures as SVG and tables as CSV, and marks tables that are wider than the screen.
 (() => {
   const addLink = (element, text, name, address) => {
     const link = document.createElement("a");
