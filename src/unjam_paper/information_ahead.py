@@ -72,7 +72,7 @@ class InformedACC(SmoothACC):
         return {**super().initial_memory(n), "mean_received_speed": np.full(n, np.nan), "step": np.zeros(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the accelerations and the new memory; rows are all roads of the first candidate, of the next, and so on."""
+        """Return the accelerations and the new memory; rows are the roads of each candidate in turn."""
         step = min(int(memory["step"][0]), len(self.received_speeds) - 1)
         received = np.tile(self.received_speeds[step], len(state.speed) // self.received_speeds.shape[1])
         ahead = update_mean(memory["mean_received_speed"], received, self.ahead_averaging_time, self.time_step)
