@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from people import figure_6
+from people import figure_6_rows
 from tables import metric_mean, results_part
 
 from unjam.measures.statistics import estimate
@@ -151,7 +151,7 @@ def data_effect() -> str:
     """Return the errors of the networks of Figure 6 with few data of another driver and of the IDM in the model."""
     texts = []
     for driver, what in (("other", "with another driver"), ("same", "with the same IDM")):
-        rows = figure_6(driver=driver, split="trajectories", is_long=False, size=0.01)
+        rows = figure_6_rows(driver=driver, split="trajectories", is_long=False, size=0.01)
         errors = {network: found["driver_error"].mean() for network, found in rows.groupby("network")}
         texts.append(f"{errors['knowledge']:.3f} with IDM and {errors['vanilla']:.3f} without {what}")
     return f"error with 1 % of the data [m/s²]: {'; '.join(texts)} (`results/figure-6.json`)"

@@ -51,16 +51,16 @@ def test_a_claim_is_judged_by_intervals_of_paired_differences(
     claims: Any, others: dict[str, list[float]], verdict: str, decisive: str
 ) -> None:
     values = {name: np.array(found) for name, found in {"own": [4.0, 5.0, 6.2], **others}.items()}
-    found, numbers = claims.compare(values, "own")
+    found, numbers = claims.compare_values(values, "own")
     assert found == f"{verdict} (3 trainings)"
     assert f"difference{f' to {decisive}' if decisive else ''} " in numbers
-    opposite, _ = claims.compare({name: -each for name, each in values.items()}, "own", larger=False)
+    opposite, _ = claims.compare_values({name: -each for name, each in values.items()}, "own", larger=False)
     assert opposite == found
 
 
 def test_trainings_in_two_groups_are_undecided(claims: Any) -> None:
     values = {"own": np.array([9.0, 9.1, 5.0, 5.1]), "other": np.zeros(4)}
-    assert claims.compare(values, "own")[0] == "undecided (4 trainings)"
+    assert claims.compare_values(values, "own")[0] == "undecided (4 trainings)"
 
 
 def test_two_groups_of_compared_values_leave_a_verdict_open_only_if_the_differences_have_both_signs(
@@ -68,8 +68,8 @@ def test_two_groups_of_compared_values_leave_a_verdict_open_only_if_the_differen
 ) -> None:
     groups = np.array([-41.6, -32.1, -35.6, 11.7, 11.9, 8.4, 10.7, -1.6, -2.1, 1.6])
     own = np.array([8.7, 8.4, 10.4, 10.7, 7.6, 8.0, 7.9, 11.3, 7.4, 9.0])
-    assert claims.compare({"own": own, "other": groups}, "own")[0] == "undecided (10 trainings)"
-    assert claims.compare({"own": groups + own, "other": groups}, "own")[0] == "held (10 trainings)"
+    assert claims.compare_values({"own": own, "other": groups}, "own")[0] == "undecided (10 trainings)"
+    assert claims.compare_values({"own": groups + own, "other": groups}, "own")[0] == "held (10 trainings)"
 
 
 def test_a_method_that_is_hardly_better_than_its_expert_holds_by_the_expert(claims: Any) -> None:
