@@ -1,8 +1,8 @@
-"""Claims of the paper, compared with the results of the studies: the tables of CLAIMS.md, which this file writes.
+"""Write CLAIMS.md: tables of the claims of the paper, compared with the results of the studies.
 
     python docs/claims.py
 
-Verdicts are about the studies without the safety filter, which the paper does not have, once these are measured.
+Verdicts are about studies without the safety filter, as in the paper, where these have results.
 """
 
 from collections import Counter
@@ -18,7 +18,18 @@ from differences import differences_table
 from people import people_claims
 from studies import difference_to_expert, study_rows
 from tables import markdown_table, results_part
-from verdicts import HELD, INCONSISTENT, NOT_HELD, UNDECIDED, Finding, Values, compare, judge, list_values, worst
+from verdicts import (
+    HELD,
+    INCONSISTENT,
+    NOT_HELD,
+    UNDECIDED,
+    Finding,
+    Values,
+    combine_findings,
+    compare_values,
+    judge_differences,
+    list_values,
+)
 
 from unjam.files import atomic_write
 from unjam.measures.feasibility import FEASIBLE
@@ -97,7 +108,7 @@ END = """<!-- end -->
 `python docs/claims.py` writes this page from the settings of the package and the files in `results/`;
 [the documentation](docs/results.md) has the tables and figures."""
 EXPERT, SMOOTH_EXPERT, SMOOTH_LABEL = "PI (paper)", "PI", "PI with a time constant of 3 s"
-"""the expert of the paper without a residual, and the same with the time constant that is unjam's default"""
+"""labels of the expert of the paper, and of the same expert with the default time constant of unjam"""
 NOT_MEASURED = "not yet measured"
 BY_EXPERT, BY_CONSTRUCTION, SAYS_NOTHING = ", by the expert", ", by construction", ", but says nothing"
 BY_EXPLORATION = ", in training alone"
@@ -109,11 +120,11 @@ A1_EXPERT = "expert alone"
 ERROR_ESTIMATORS = "unexplained_variance", "transitions"
 """estimators of the model error; the second one is the paper's quantity"""
 SLOWER_STEP = 0.5
-"""time by which a slower simulator takes longer for 1,000 steps [s]"""
+"""additional time that a slower simulator would need for 1,000 steps [s]"""
 LARGE_BOUND = 100.0
-"""multiple of what it bounds from which on a bound says nothing"""
+"""ratio of a bound to the bounded quantity from which on the bound says nothing"""
 RARE = 0.05
-"""vehicles that collide in an episode, below which collisions are rare"""
+"""mean number of vehicles that collide in an episode below which collisions are rare"""
 PAPER_ROADS = ("ring", "figure-eight", "merge")
 LEARNERS = ("trpo", "ppo", "sac")
 """variants of the learners in Table 1 besides the paper's method"""
@@ -121,11 +132,11 @@ TABLE_1, TABLE_2 = ("proposed", *LEARNERS), ("proposed", "trpo", "mb-trpo", "no-
 VOLUMES = {"5": "ring-5", "11": "ring-11", "22": "ring"}
 """roads of Figure 10 by the number of vehicles"""
 PAPER_QUANTITIES = {"cav_mean_speed": "speed", "speed_std_cav": "std"}
-"""quantities of learning curves that drivers without learning have, too, in the convention of the paper"""
+"""quantities of learning curves that other drivers also have, with their names in the convention of the paper"""
 SIMILAR_SHARE = 0.1
-"""share of a return within which another one is similar"""
+"""largest difference between similar returns, as a share of a return"""
 EXPERT_SHARE = 0.9
-"""share of a difference from which on it counts as that of the expert"""
+"""share of a difference from which on the difference is due to the expert"""
 TRAINED, VALIDATED = "return_mean", "return_validation"
 RETURNS = {TRAINED: "in training", VALIDATED: "in validation"}
 """returns of learning curves: with exploration, and of the deterministic controller"""
@@ -134,7 +145,7 @@ FIRST, LAST, THIRD_QUARTER, LAST_QUARTER = slice(0, 10), slice(90, 100), slice(5
 VALIDATION_STEPS = 30_000
 """environment steps between two validations: five iterations of 6,000"""
 BLOCK = 5
-"""points of a learning curve that are averaged before it counts as having reached a return"""
+"""points of a learning curve that are averaged before they are compared with a return"""
 
 
 class MissingResultsError(Exception):
@@ -143,7 +154,7 @@ class MissingResultsError(Exception):
 
 @dataclass(frozen=True)
 class Version:
-    """Results of the paper's studies with the safety filter or without it."""
+    """Results of the studies of the paper with the safety filter, or without it."""
 
     has_filter: bool
 
@@ -175,16 +186,16 @@ class Version:
         """Return the return of each training on test seeds."""
         rows = self.rows(name, road)
         best = rows[rows[variants[0]]["gain_reference"]["expert"]]["return"]["mean"]
-        return {label_of(each): best + np.array(rows[each]["gains"]) for each in variants}
+        return {variant_label(name): best + np.array(rows[name]["gains"]) for name in variants}
 
     def curves(self, name: str, road: str, variants: Sequence[str], quantity: str = "return_mean") -> Values:
         """Return learning curves, shape (trainings, 100)."""
         curves = self.part(name, road, "curves")[self.study(name, road)[1]]
-        return {label_of(each): np.array(curves[each][quantity]) for each in variants}
+        return {variant_label(name): np.array(curves[name][quantity]) for name in variants}
 
     def curve_means(self, name: str, road: str, variants: Sequence[str], quantity: str, part: slice) -> Values:
         """Return means over a part of the learning curves."""
-        return {label: each[:, part].mean(1) for label, each in self.curves(name, road, variants, quantity).items()}
+        return {label: curve[:, part].mean(1) for label, curve in self.curves(name, road, variants, quantity).items()}
 
     def validation_cause(self, verdict: str, name: str, road: str, variant: str, quantity: str) -> str:
         """Return `BY_EXPERT` for a claim that holds in validation if the method is not shown to learn anything there.
@@ -199,16 +210,16 @@ class Version:
             return BY_EXPERT
         (curve,) = self.curves(name, road, (variant,), quantity).values()
         gain = estimate_over_trainings((curve[:, LAST].mean(1) - curve[:, 0]).tolist())
-        return "" if judge([gain]) == HELD else BY_EXPERT
+        return "" if judge_differences([gain]) == HELD else BY_EXPERT
 
 
 Assessment = Callable[[Version], Finding]
-"""what the results of a version say of a claim"""
+"""function that returns the finding on a claim from the results of a version"""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper, and how results of a version assess it."""
+    """A claim of the paper, and the function that assesses it."""
 
     text: str
     study: str
@@ -217,12 +228,12 @@ class Claim:
     depends_on_filter: bool = True
 
     def row(self) -> dict[str, str]:
-        """Return the row of the table."""
+        """Return the row of the claim in the table."""
         with_filter, without = (self._finding(Version(has_filter)) for has_filter in (True, False))
-        is_one = self.road not in UNFILTERED_ROADS or not self.depends_on_filter
-        verdict, numbers = with_filter if is_one else without
-        version = Version(is_one)
-        has_two = not is_one and with_filter[0] != NOT_MEASURED
+        has_one_version = self.road not in UNFILTERED_ROADS or not self.depends_on_filter
+        verdict, numbers = with_filter if has_one_version else without
+        version = Version(has_one_version)
+        has_two = not has_one_version and with_filter[0] != NOT_MEASURED
         return {
             "the paper says": self.text,
             "we get, without the filter": numbers,
@@ -238,25 +249,22 @@ class Claim:
             return NOT_MEASURED, NO_VALUE_TEXT
 
 
-def label_of(variant: str) -> str:
+def variant_label(variant: str) -> str:
     """Return the label of a variant."""
     return VARIANTS[variant].label
 
 
 def paper_values(road: str, column: int, digits: int, variants: Sequence[str] = TABLE_1) -> str:
     """Return the values of the paper's table by variant."""
-    return list_values({label_of(each): PAPER_RESULTS[road, each][column] for each in variants}, digits)
+    return list_values({variant_label(name): PAPER_RESULTS[road, name][column] for name in variants}, digits)
 
 
 def larger_return(study: str, road: str, variant: str, *others: str) -> Assessment:
-    """Return how to judge that a variant has a larger return on test seeds than others, and whether its expert has it.
-
-    The expert counts for variants that add a residual to it.
-    """
+    """Return the assessment of a larger return of a variant on test seeds; for residuals, it considers the expert."""
 
     def judge_returns(version: Version) -> Finding:
         rows, returns = version.rows(study, road), version.returns(study, road, (variant, *others))
-        verdict, numbers = compare(returns, label_of(variant))
+        verdict, numbers = compare_values(returns, variant_label(variant))
         if not variant.startswith("proposed"):
             return verdict, f"return on test seeds: {numbers}"
         gain = difference_to_expert(rows, variant, EXPERT)
@@ -270,11 +278,11 @@ def larger_return(study: str, road: str, variant: str, *others: str) -> Assessme
         if best := best_feasible(rows):
             numbers += f"; best feasible driver of the table without learning: {list_values(best)}"
         if verdict.startswith(HELD):
-            means = {label: float(each.mean()) for label, each in returns.items()}
-            own, best = means.pop(label_of(variant)), max(means.values())
+            means = {label: float(values.mean()) for label, values in returns.items()}
+            own, best = means.pop(variant_label(variant)), max(means.values())
             share = (rows[EXPERT]["return"]["mean"] - best) / (own - best)
             numbers += f"; PI has {100 * share:.0f} % of the difference to the others" if share > 0 else ""
-            verdict += expert_cause(own, best, expert_returns(rows), [Estimate(**each) for each in gains])
+            verdict += expert_cause(own, best, expert_returns(rows), [Estimate(**gain_entry) for gain_entry in gains])
         return verdict, f"return on test seeds: {numbers}{feasible_trainings(rows, (variant, *others))}"
 
     return judge_returns
@@ -282,17 +290,17 @@ def larger_return(study: str, road: str, variant: str, *others: str) -> Assessme
 
 def expert_returns(rows: dict[str, dict[str, Any]]) -> list[float]:
     """Return the returns of PI without learning, with the time constant of the paper and with 3 s."""
-    return [rows[each]["return"]["mean"] for each in (EXPERT, SMOOTH_EXPERT)]
+    return [rows[label]["return"]["mean"] for label in (EXPERT, SMOOTH_EXPERT)]
 
 
 def expert_cause(own: float, other: float, experts: Sequence[float], gains: Sequence[Estimate] = ()) -> str:
-    """Return `BY_EXPERT` if an expert has most of a difference, or some gain over the experts is not shown."""
+    """Return `BY_EXPERT` if an expert has most of a difference, or a gain over one of the experts is not shown."""
     share = (max(experts) - other) / (own - other)
-    return BY_EXPERT if share >= EXPERT_SHARE or (gains and judge(gains) != HELD) else ""
+    return BY_EXPERT if share >= EXPERT_SHARE or (gains and judge_differences(gains) != HELD) else ""
 
 
 def best_feasible(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
-    """Return label and return of the best driver of a table that does not learn and is feasible; empty: none is."""
+    """Return label and return of the best feasible driver of a table that does not learn; empty if there is none."""
     candidates = {
         label: row["return"]["mean"]
         for label, row in rows.items()
@@ -303,11 +311,12 @@ def best_feasible(rows: dict[str, dict[str, Any]]) -> dict[str, float]:
 
 
 def feasible_trainings(rows: dict[str, dict[str, Any]], variants: Sequence[str]) -> str:
-    """Return how many trainings of each variant are feasible as text; empty where that was not measured."""
-    verdicts = {label_of(each): rows[each].get("feasibility", ()) for each in variants}
+    """Return the numbers of feasible trainings of each variant as text; empty if they were not measured."""
+    verdicts = {variant_label(name): rows[name].get("feasibility", ()) for name in variants}
     if not all(verdicts.values()):
         return ""
-    return f"; feasible trainings: {list_values({label: each.count(FEASIBLE) for label, each in verdicts.items()})}"
+    counts = {label: feasibility.count(FEASIBLE) for label, feasibility in verdicts.items()}
+    return f"; feasible trainings: {list_values(counts)}"
 
 
 def curve_extreme(
@@ -320,30 +329,30 @@ def curve_extreme(
     larger: bool = True,
     digits: int = 2,
 ) -> Assessment:
-    """Return how to judge that the first variant has the largest (smallest) value in a part of the training."""
+    """Return the assessment of the largest (smallest) value of the first variant in a part of the training."""
 
     def judge_means(version: Version) -> Finding:
         values = version.curve_means(study, road, variants, quantity, part)
-        verdict, numbers = compare(values, label_of(variants[0]), larger=larger, digits=digits)
+        verdict, numbers = compare_values(values, variant_label(variants[0]), larger=larger, digits=digits)
         verdict += version.validation_cause(verdict, study, road, variants[0], quantity)
         key = PAPER_QUANTITIES.get(quantity)
         if key is None or not verdict.startswith(HELD):
             return verdict, f"{what}: {numbers}"
         rows = version.rows(study, road)
         experts = {
-            label: rows[each]["paper_convention"][key]["mean"]
-            for label, each in ((EXPERT, EXPERT), (SMOOTH_LABEL, SMOOTH_EXPERT))
+            label: rows[name]["paper_convention"][key]["mean"]
+            for label, name in ((EXPERT, EXPERT), (SMOOTH_LABEL, SMOOTH_EXPERT))
         }
-        own = values[label_of(variants[0])]
-        gains = [estimate_over_trainings((own - each).tolist()) for each in experts.values()]
-        alone = "" if judge(gains, larger) == HELD else BY_EXPERT
+        own = values[variant_label(variants[0])]
+        gains = [estimate_over_trainings((own - expert_value).tolist()) for expert_value in experts.values()]
+        alone = "" if judge_differences(gains, larger) == HELD else BY_EXPERT
         return f"{verdict}{alone}", f"{what}: {numbers}; {list_values(experts, digits)}"
 
     return judge_means
 
 
 def first_return(study: str, road: str, quantity: str) -> Assessment:
-    """Return how to judge that the method has the largest return in its first rounds, or at the first validation."""
+    """Return the assessment of the largest return of the method in the first rounds, or at the first validation."""
     at_validation = f"return at the first validation, after about {VALIDATION_STEPS:,} steps", slice(1)
     what, part = at_validation if quantity == VALIDATED else ("return in the first tenth", FIRST)
     return curve_extreme(study, road, quantity, what, part, digits=0)
@@ -352,15 +361,15 @@ def first_return(study: str, road: str, quantity: str) -> Assessment:
 def late_change(
     study: str, road: str, variant: str, quantity: str, what: str, larger: bool, digits: int = 2
 ) -> Assessment:
-    """Return how to judge that a quantity rises (falls) from the third to the last quarter of the training."""
+    """Return the assessment of a rise (fall) of a quantity from the third to the last quarter of the training."""
 
     def change(version: Version, quantity: str) -> Finding:
         parts = {"third quarter": THIRD_QUARTER, "last": LAST_QUARTER}
         values = {
-            name: version.curve_means(study, road, (variant,), quantity, part)[label_of(variant)]
+            name: version.curve_means(study, road, (variant,), quantity, part)[variant_label(variant)]
             for name, part in parts.items()
         }
-        return compare(values, "last", larger=larger, digits=digits)
+        return compare_values(values, "last", larger=larger, digits=digits)
 
     def judge_change(version: Version) -> Finding:
         verdict, numbers = change(version, quantity)
@@ -374,22 +383,22 @@ def late_change(
 def first_arrival(
     study: str, road: str, variant: str, *others: str, quantity: str = TRAINED, is_last: bool = False
 ) -> Assessment:
-    """Return how to judge that a variant reaches 0.9 of TRPO's final return first, or last."""
+    """Return the assessment of the first (last) arrival of a variant at 0.9 of the final return of TRPO."""
 
     def judge_steps(version: Version) -> Finding:
         curves = version.curves(study, road, (variant, *others), quantity)
-        final = float(version.curve_means(study, road, ("trpo",), quantity, LAST)[label_of("trpo")].mean())
+        final = float(version.curve_means(study, road, ("trpo",), quantity, LAST)[variant_label("trpo")].mean())
         goal, values, resolution = final - 0.1 * abs(final), dict[str, np.ndarray](), 0.0
-        for each, curve in zip((variant, *others), curves.values(), strict=True):
-            steps = np.array(version.part(study, road, "curves")[version.study(study, road)[1]][each]["steps"])
+        for name, curve in zip((variant, *others), curves.values(), strict=True):
+            steps = np.array(version.part(study, road, "curves")[version.study(study, road)[1]][name]["steps"])
             if quantity == VALIDATED:  # its curve is linear between validations
                 ends = np.arange(VALIDATION_STEPS, steps[-1] + 1, VALIDATION_STEPS)
                 reaches = np.array([np.interp(ends, steps, row) for row in curve]) >= goal
             else:
                 ends, reaches = steps[BLOCK - 1 :: BLOCK], curve.reshape(len(curve), -1, BLOCK).mean(2) >= goal
             resolution = float(ends[1] - ends[0])
-            values[label_of(each)] = np.where(reaches.any(1), ends[reaches.argmax(1)], steps[-1])
-        verdict, numbers = compare(values, label_of(variant), larger=is_last, resolution=resolution)
+            values[variant_label(name)] = np.where(reaches.any(1), ends[reaches.argmax(1)], steps[-1])
+        verdict, numbers = compare_values(values, variant_label(variant), larger=is_last, resolution=resolution)
         return verdict + version.validation_cause(verdict, study, road, variant, quantity), f"steps: {numbers}"
 
     return judge_steps
@@ -398,29 +407,29 @@ def first_arrival(
 def fluctuation(
     study: str, road: str, variant: str, *others: str, quantity: str = TRAINED, larger: bool = False
 ) -> Assessment:
-    """Return how to judge that the curve of a variant changes less (more) between points, in its second half."""
+    """Return the assessment of smaller (larger) changes of a variant between points of the second half of its curve."""
 
     def judge_changes(version: Version) -> Finding:
         curves = version.curves(study, road, (variant, *others), quantity)
-        values = {label: np.abs(np.diff(each[:, 50:])).mean(1) for label, each in curves.items()}
-        verdict, numbers = compare(values, label_of(variant), larger=larger)
+        values = {label: np.abs(np.diff(curve[:, 50:])).mean(1) for label, curve in curves.items()}
+        verdict, numbers = compare_values(values, variant_label(variant), larger=larger)
         return verdict + version.validation_cause(verdict, study, road, variant, quantity), f"mean change: {numbers}"
 
     return judge_changes
 
 
 def compared_with_idm(road: str, metric: str, what: str, larger: bool) -> Assessment:
-    """Return how to judge that all vehicles have a larger (smaller) value with the method than with IDM in the CAV."""
+    """Return the assessment of a larger (smaller) metric of all vehicles with the method than with IDM in the CAV."""
 
     def judge_metric(version: Version) -> Finding:
         rows = version.rows(f"table-1-{road}", road)
         own = Estimate(**rows["proposed"][metric])
-        others = {each: rows[each][metric]["mean"] for each in ("IDM", EXPERT, SMOOTH_EXPERT)}
+        others = {name: rows[name][metric]["mean"] for name in ("IDM", EXPERT, SMOOTH_EXPERT)}
         idm, *experts = (
-            replace(own, mean=own.mean - each, low=own.low - each, high=own.high - each) for each in others.values()
+            replace(own, mean=own.mean - mean, low=own.low - mean, high=own.high - mean) for mean in others.values()
         )
-        verdict = judge([idm], larger)
-        alone = BY_EXPERT if verdict == HELD and judge(experts, larger) != HELD else ""
+        verdict = judge_differences([idm], larger)
+        alone = BY_EXPERT if verdict == HELD and judge_differences(experts, larger) != HELD else ""
         others[SMOOTH_LABEL] = others.pop(SMOOTH_EXPERT)
         means = list_values({"proposed": own.mean, **others}, 3)
         numbers = f"{what}: {means}; difference to IDM {interval_text(asdict(idm), 3, '+')}"
@@ -430,11 +439,11 @@ def compared_with_idm(road: str, metric: str, what: str, larger: bool) -> Assess
     return judge_metric
 
 
-def collisions(road: str) -> Assessment:
-    """Return how to judge that collisions are rare."""
+def rare_collisions(road: str) -> Assessment:
+    """Return the assessment of rare collisions."""
 
     def judge_collisions(version: Version) -> Finding:
-        rows = [version.rows(f"table-1-{road}", road)[each] for each in TABLE_1]
+        rows = [version.rows(f"table-1-{road}", road)[variant] for variant in TABLE_1]
         most = max(row["collisions"]["largest"] for row in rows)
         episodes = sum(row["trainings"] * row["episodes"] for row in rows)
         gap = min(row["min_time_gap"]["mean"] for row in rows)
@@ -453,72 +462,73 @@ def collisions(road: str) -> Assessment:
 
 
 def similar_return(version: Version) -> Finding:
-    """Are the returns of the other variants of Table 2 within 10 % of TRPO's?"""
+    """Assess whether the returns of the other variants of Table 2 are within 10 % of the return of TRPO."""
     returns = version.returns("table-2", "ring", TABLE_2)
-    trpo, verdicts, texts = returns[label_of("trpo")], list[str](), list[str]()
+    trpo, verdicts, texts = returns[variant_label("trpo")], list[str](), list[str]()
     margin = SIMILAR_SHARE * abs(float(trpo.mean()))
     for label, values in returns.items():
-        if label != label_of("trpo"):
+        if label != variant_label("trpo"):
             gain = estimate_over_trainings((values - trpo).tolist())
             is_similar, differs = -margin < gain.low <= gain.high < margin, gain.low > margin or gain.high < -margin
             verdicts.append(HELD if is_similar else NOT_HELD if differs else UNDECIDED)
             texts.append(f"{label} {interval_text(asdict(gain), 0, '+,')}")
-    verdict, _ = worst([(each, "") for each in verdicts])
+    verdict, _ = combine_findings([(part_verdict, "") for part_verdict in verdicts])
     return f"{verdict} ({len(trpo)} trainings)", f"difference of the return on test seeds to TRPO's: {', '.join(texts)}"
 
 
-def framework(version: Version) -> Finding:
-    """Do PPO and SAC gain within the framework?"""
+def gains_within_framework(version: Version) -> Finding:
+    """Assess whether PPO and SAC have larger returns within the framework."""
     pairs = (("proposed-ppo", "ppo"), ("proposed-sac", "sac"))
-    return worst([larger_return("figure-9", "ring", *pair)(version) for pair in pairs])
+    return combine_findings([larger_return("figure-9", "ring", *pair)(version) for pair in pairs])
 
 
 def higher_throughout(quantity: str) -> Assessment:
-    """Return how to judge that the return within the framework is higher over the whole training."""
+    """Return the assessment of a higher return within the framework over the whole training."""
 
     def judge_means(version: Version) -> Finding:
         findings = []
         for pair in (("proposed-ppo", "ppo"), ("proposed-sac", "sac")):
             values = version.curve_means("figure-9", "ring", pair, quantity, slice(None))
-            verdict, numbers = compare(values, label_of(pair[0]))
+            verdict, numbers = compare_values(values, variant_label(pair[0]))
             findings.append(
                 (verdict + version.validation_cause(verdict, "figure-9", "ring", pair[0], quantity), numbers)
             )
-        verdict, numbers = worst(findings)
+        verdict, numbers = combine_findings(findings)
         return verdict, f"mean return over the training: {numbers}"
 
     return judge_means
 
 
 def stated_gain(learner: str, percent: float) -> Assessment:
-    """Return how to judge that the return within the framework is larger by a percentage."""
-    stated, largest = (PAPER_RESULTS["ring", each][0] for each in (learner, "proposed"))
+    """Return the assessment of a return within the framework that is larger by a percentage."""
+    stated, largest = (PAPER_RESULTS["ring", variant][0] for variant in (learner, "proposed"))
     goal = stated * (1 + percent / 100)
 
     def judge_gain(version: Version) -> Finding:
         without, within = version.returns("figure-9", "ring", (learner, f"proposed-{learner}")).values()
         gain = estimate_over_trainings((100 * linearized_ratio(within - without, without)).tolist())
-        beyond = replace(gain, mean=gain.mean - percent, low=gain.low - percent, high=gain.high - percent)
+        excess = replace(gain, mean=gain.mean - percent, low=gain.low - percent, high=gain.high - percent)
         expert = version.rows("figure-9", "ring")[EXPERT]["return"]["mean"] / without.mean() - 1
         numbers = f"on test seeds {interval_text(asdict(gain), 0, '+')} %, with PI alone {100 * expert:+.0f} %"
-        if is_unknown := judge([estimate_over_trainings(without.tolist())]) != HELD:
+        if is_unknown := judge_differences([estimate_over_trainings(without.tolist())]) != HELD:
             alone = f"{without.mean():,.0f}, is not shown to be above 0"
             numbers = f"on test seeds no percentage: the return alone, {alone}"
         text = f"{stated:,.1f} × {1 + percent / 100:.2f} = {goal:,.0f}"
         if goal > largest:
             return INCONSISTENT, f"{text}, which its Table 1 does not have; {numbers}"
-        return f"{UNDECIDED if is_unknown else judge([beyond])} ({gain.count} trainings)", f"{text}; {numbers}"
+        verdict = UNDECIDED if is_unknown else judge_differences([excess])
+        return f"{verdict} ({gain.count} trainings)", f"{text}; {numbers}"
 
     return judge_gain
 
 
 def lower_return(study: str, road: str, variant: str, other: str) -> Assessment:
-    """Return how to judge that a variant has a smaller return on test seeds than another one."""
+    """Return the assessment of a smaller return of a variant than of another one on test seeds."""
 
     def judge_returns(version: Version) -> Finding:
         returns = version.returns(study, road, (variant, other))
-        verdict, numbers = compare(returns, label_of(variant), larger=False)
-        own, reference = (float(each.mean()) for each in returns.values())
+        verdict, numbers = compare_values(returns, variant_label(variant), larger=False)
+        own, reference = (float(values.mean()) for values in returns.values())
         experts = expert_returns(version.rows(study, road))
         if other.startswith("proposed") and verdict.startswith(HELD):
             verdict += expert_cause(reference, own, experts)
@@ -529,46 +539,49 @@ def lower_return(study: str, road: str, variant: str, other: str) -> Assessment:
 
 
 def larger_return_to_the_letter(road: str) -> Assessment:
-    """Return how to judge that the paper's method to the letter has a larger return than TRPO."""
+    """Return the assessment of a larger return of the method than of TRPO, with the exact settings of the paper."""
     return lambda version: larger_return(f"to-the-letter-{road}", road, *version.exact_variants(road))(version)
 
 
 def larger_last_return(study: str, road: str) -> Assessment:
-    """Return how to judge that the last checkpoint of the paper's method has a larger return than that of TRPO."""
+    """Return the assessment of a larger return of the last checkpoint of the method than of that of TRPO."""
 
     def judge_last(version: Version) -> Finding:
         values = version.curve_means(study, road, ("proposed", "trpo"), VALIDATED, slice(-1, None))
-        verdict, numbers = compare(values, label_of("proposed"))
+        verdict, numbers = compare_values(values, variant_label("proposed"))
         return verdict + version.validation_cause(verdict, study, road, "proposed", VALIDATED), f"return: {numbers}"
 
     return judge_last
 
 
-def volumes(version: Version) -> Finding:
-    """Is the paper's method best with 5, 11 and 22 vehicles?"""
-    found = [(count, larger_return("figure-10", road, *TABLE_1)(version)) for count, road in VOLUMES.items()]
-    return worst([(verdict, f"{count} vehicles: {numbers}") for count, (verdict, numbers) in found])
+def best_with_each_volume(version: Version) -> Finding:
+    """Assess whether the method is best with 5, 11 and 22 vehicles."""
+    findings = list[Finding]()
+    for count, road in VOLUMES.items():
+        verdict, numbers = larger_return("figure-10", road, *TABLE_1)(version)
+        findings.append((verdict, f"{count} vehicles: {numbers}"))
+    return combine_findings(findings)
 
 
 def volume_speed(quantity: str) -> Assessment:
-    """Return how to judge that the paper's method reaches TRPO's return sooner with each number of vehicles."""
+    """Return the assessment of an earlier arrival of the method at the return of TRPO with each number of vehicles."""
 
     def judge_volumes(version: Version) -> Finding:
-        found = {
-            count: first_arrival("figure-10", road, *TABLE_1, quantity=quantity)(version)
-            for count, road in VOLUMES.items()
-        }
-        return worst([(verdict, f"{count} vehicles: {numbers}") for count, (verdict, numbers) in found.items()])
+        findings = list[Finding]()
+        for count, road in VOLUMES.items():
+            verdict, numbers = first_arrival("figure-10", road, *TABLE_1, quantity=quantity)(version)
+            findings.append((verdict, f"{count} vehicles: {numbers}"))
+        return combine_findings(findings)
 
     return judge_volumes
 
 
 def training_time(other: str, stated: float) -> Assessment:
-    """Return how to judge that the training time of the paper's method is at most a stated multiple of another's."""
+    """Return the assessment of a training time of the method of at most a multiple of that of another learner."""
 
     def judge_time(version: Version) -> Finding:
         rounds = version.part("figure-8", "merge", "time")["rounds"]
-        own, reference = (np.array([sum(each.values()) for each in rounds[name]]) for name in ("proposed", other))
+        own, reference = (np.array([sum(seconds.values()) for seconds in rounds[name]]) for name in ("proposed", other))
         ratio = estimate_over_trainings((own / reference).tolist())
         slower = estimate_over_trainings(((own + SLOWER_STEP) / (reference + SLOWER_STEP)).tolist())
         more = replace(ratio, mean=ratio.mean - stated, low=ratio.low - stated, high=ratio.high - stated)
@@ -577,7 +590,7 @@ def training_time(other: str, stated: float) -> Assessment:
             f"{interval_text(asdict(ratio), 2)} times, this implementation with the filter on one core ({processor})"
         )
         numbers += f"; {interval_text(asdict(slower), 2)} if the simulator took {SLOWER_STEP:g} s more for 1,000 steps"
-        return f"{judge([more], larger=False)} ({ratio.count} rounds)", numbers
+        return f"{judge_differences([more], larger=False)} ({ratio.count} rounds)", numbers
 
     return judge_time
 
@@ -585,17 +598,19 @@ def training_time(other: str, stated: float) -> Assessment:
 def model_history(version: Version, variant: str, estimator: str, part: slice) -> np.ndarray:
     """Return the model error of each training, mean over a part of its iterations."""
     trainings = version.part("theory", "ring", "theory")["model"][variant]
-    return np.array([np.mean([row["eps_m_by_estimator"][estimator] for row in each[part]]) for each in trainings])
+    return np.array(
+        [np.mean([row["eps_m_by_estimator"][estimator] for row in training[part]]) for training in trainings]
+    )
 
 
 def exact_model_error_falls(road: str) -> Assessment:
-    """Return how to judge that eps_m on transitions falls during training to the letter."""
+    """Return the assessment of a fall of eps_m on transitions in trainings with the exact settings of the paper."""
 
     def judge_errors(version: Version) -> Finding:
         trainings = version.part(f"to-the-letter-{road}", road, "paper-exact")[version.exact_variants(road)[0]]
-        first, last = np.array([each["eps_m"] for each in trainings]).T
+        first, last = np.array([training["eps_m"] for training in trainings]).T
         values = {"first tenth": first, "last": last}
-        verdict, numbers = compare(values, "last", larger=False, digits=2)
+        verdict, numbers = compare_values(values, "last", larger=False, digits=2)
         limit = " (at its upper limit)" if first.min() == last.min() == 1.0 else ""
         return verdict, f"transitions: {numbers}{limit}"
 
@@ -603,33 +618,33 @@ def exact_model_error_falls(road: str) -> Assessment:
 
 
 def model_error_falls(version: Version) -> Finding:
-    """Does eps_m fall during training?"""
+    """Assess whether eps_m falls during training."""
     findings = []
     for estimator in ERROR_ESTIMATORS:
         parts = {"first iteration": slice(1), "last": slice(-1, None)}
         values = {name: model_history(version, "proposed", estimator, part) for name, part in parts.items()}
-        verdict, numbers = compare(values, "last", larger=False, digits=2)
+        verdict, numbers = compare_values(values, "last", larger=False, digits=2)
         findings.append((verdict, f"{estimator.replace('_', ' ')}: {numbers}"))
-    return worst(findings)
+    return combine_findings(findings)
 
 
 def knowledge_in_model(part: slice, what: str) -> Assessment:
-    """Return how to judge that the model error is smaller with IDM in the model, without an expert."""
+    """Return the assessment of a smaller model error with IDM in the model, without an expert."""
 
     def judge_errors(version: Version) -> Finding:
         variants = {"with IDM": "no-initial-policy", "networks alone": "mb-trpo"}
         findings = []
         for estimator in ERROR_ESTIMATORS:
-            values = {name: model_history(version, each, estimator, part) for name, each in variants.items()}
-            verdict, numbers = compare(values, "with IDM", larger=False, digits=2)
+            values = {name: model_history(version, variant, estimator, part) for name, variant in variants.items()}
+            verdict, numbers = compare_values(values, "with IDM", larger=False, digits=2)
             findings.append((verdict, f"{estimator.replace('_', ' ')}, {what}: {numbers}"))
-        return worst(findings)
+        return combine_findings(findings)
 
     return judge_errors
 
 
 def better_start(road: str) -> Assessment:
-    """Return how to judge that untrained residuals on the expert have larger returns than untrained policies alone."""
+    """Return the assessment of larger returns of untrained residuals on the expert than of untrained policies alone."""
 
     def judge_untrained(version: Version) -> Finding:
         rows = version.part("theory", road, "theory")["untrained"]
@@ -637,12 +652,15 @@ def better_start(road: str) -> Assessment:
         values = {
             row["policy"]: np.array(row["returns"]) for row in rows if row["road"] == road_name and "returns" in row
         }
-        verdict, numbers = compare(values, "expert + random", unit="random networks")
+        verdict, numbers = compare_values(values, "expert + random", unit="random networks")
         better = values["expert + random"] > values["random"]
         expert = next(row["mean"] for row in rows if row["road"] == road_name and row["policy"] == A1_EXPERT)
         smooth = expert_returns(version.rows(f"table-1-{road}", road))[1]
-        own, other = (float(each.mean()) for each in (values["expert + random"], values["random"]))
-        gains = [estimate_over_trainings((values["expert + random"] - each).tolist()) for each in (expert, smooth)]
+        own, other = (float(returns.mean()) for returns in (values["expert + random"], values["random"]))
+        gains = [
+            estimate_over_trainings((values["expert + random"] - expert_return).tolist())
+            for expert_return in (expert, smooth)
+        ]
         if verdict.startswith(HELD):
             verdict += expert_cause(own, other, (expert, smooth), gains)
         numbers = f"{numbers}, larger in {better.sum()} of {len(better)}; {list_values({EXPERT: expert})}"
@@ -652,14 +670,14 @@ def better_start(road: str) -> Assessment:
 
 
 def near_best(version: Version, quantity: str = "") -> Finding:
-    """Do all trainings of the paper's method end within 5 % of the best one: in a `quantity` of curves, or the test?
+    """Assess whether all trainings of the method end within 5 % of the best training, in curves or on test seeds.
 
-    The best one has the paper's settings; the numbers also have that of unjam's residual, which has others.
+    The best training is one with the settings of the paper; the numbers also refer to the best residual of unjam.
     """
     place, variants = ("table-1-ring", "ring"), (*TABLE_1, "without-model", "ours")
     ends = version.curve_means(*place, variants, quantity, LAST) if quantity else version.returns(*place, variants)
-    own, best_of_others = ends[label_of("proposed")], float(ends.pop(label_of("ours")).max())
-    best, count = max(float(each.max()) for each in ends.values()), len(own)
+    own, best_of_others = ends[variant_label("proposed")], float(ends.pop(variant_label("ours")).max())
+    best, count = max(float(values.max()) for values in ends.values()), len(own)
 
     def count_near(values: np.ndarray, reference: float) -> int:
         return int((values >= reference - 0.05 * abs(reference)).sum())
@@ -676,10 +694,10 @@ def near_best(version: Version, quantity: str = "") -> Finding:
     return verdict, f"{numbers}; {others}; on test seeds: {list_values(experts)}, {feasible}"
 
 
-def bound(version: Version) -> Finding:
-    """Does the bound of the difference between returns in model and environment hold, and how tight is it?"""
+def bound_on_returns(version: Version) -> Finding:
+    """Assess whether the bound on the difference between returns in model and environment holds, and is tight."""
     trainings = version.part("theory", "ring", "theory")["model"]["proposed"]
-    rows = [row for each in trainings for row in each if row["gap"] is not None]
+    rows = [row for training in trainings for row in training if row["gap"] is not None]
     broken = sum(row["gap"] > row["bound"] for row in rows)
     times = np.median([row["bound"] / row["gap"] for row in rows])
     numbers = f"broken in {broken} of {len(rows)} iterations; median {times:,.0f} times the measured difference"
@@ -688,18 +706,18 @@ def bound(version: Version) -> Finding:
 
 
 def gain_over_expert(version: Version) -> Finding:
-    """Is the residual worth anything beyond the expert?"""
+    """Assess whether the residual has a larger return than its expert."""
     rows = version.rows("table-2", "ring")
     gain = difference_to_expert(rows, "proposed", EXPERT)
     share = 100 * gain["mean"] / rows[EXPERT]["return"]["mean"]
-    verdict = judge([Estimate(**gain)])
+    verdict = judge_differences([Estimate(**gain)])
     return (
         f"{verdict} ({gain['count']} trainings)",
         f"{interval_text(gain, 0, '+')} ({share:+.1f} %) compared with PI alone",
     )
 
 
-def of_table_1(
+def table_1_claims(
     text: str,
     make_assessment: Callable[[str, str], Assessment],
     column: int = 0,
@@ -709,124 +727,124 @@ def of_table_1(
 ) -> list[Claim]:
     """Return a claim for each road, on Table 1 or another study.
 
-    In the text `{road}` is the road, `{values}` a column of the paper's table, and `{lowest}` the learner with its
-    smallest value.
+    The text can contain `{road}`, `{values}` (a column of the table of the paper), and `{lowest}` (the learner with the
+    smallest value in this column).
     """
     claims = []
     for road in roads:
-        lowest = label_of(min(TABLE_1, key=lambda each: PAPER_RESULTS[road, each][column]))
+        lowest = variant_label(min(TABLE_1, key=lambda variant: PAPER_RESULTS[road, variant][column]))
         words = text.format(road=road, values=paper_values(road, column, digits), lowest=lowest)
         name = study.format(road=road)
         claims.append(Claim(words, name, road, make_assessment(name, road)))
     return claims
 
 
-def of_both_returns(
+def claims_on_both_returns(
     text: str, make_assessment: Callable[..., Assessment], roads: Sequence[str] = PAPER_ROADS
 ) -> list[Claim]:
-    """Return a claim on Table 1 for each road and each return of learning curves, a keyword of `make_assessment`."""
+    """Return a claim on Table 1 for each road and each return of learning curves, the argument `quantity`."""
     return [
         claim
         for road in roads
         for quantity, where in RETURNS.items()
-        for claim in of_table_1(f"{text}, {where}", partial(make_assessment, quantity=quantity), roads=(road,))
+        for claim in table_1_claims(f"{text}, {where}", partial(make_assessment, quantity=quantity), roads=(road,))
     ]
 
 
-def both_returns(text: str, make_assessment: Callable[..., Assessment]) -> list[tuple[str, Assessment]]:
-    """Return the text and the assessment of a claim for each return of learning curves."""
+def both_assessments(text: str, make_assessment: Callable[..., Assessment]) -> list[tuple[str, Assessment]]:
+    """Return text and assessment of a claim for each return of learning curves, the argument `quantity`."""
     return [(f"{text}, {where}", make_assessment(quantity=quantity)) for quantity, where in RETURNS.items()]
 
 
-def of_ring(study: str, *claims: tuple[str, Assessment]) -> list[Claim]:
+def ring_claims(study: str, *claims: tuple[str, Assessment]) -> list[Claim]:
     """Return claims on one study of the ring, from their texts and assessments."""
-    return [Claim(text, study, "ring", each) for text, each in claims]
+    return [Claim(text, study, "ring", assess) for text, assess in claims]
 
 
 TRAINING = "in the last tenth of training"
 PPO_LOSSES = {
     road: 100 * (1 - PAPER_RESULTS[road, "ppo"][0] / PAPER_RESULTS[road, "proposed"][0]) for road in PAPER_ROADS
 }
-"""how much smaller the return of PPO is than that of the method in the paper's table, by road [%]"""
+"""difference of the return of PPO to that of the method in the table of the paper, by road [%]"""
 LEARNED_ROADS = ("ring", "figure-eight")
 """roads with ten trainings of TRPO and the paper's method"""
 PEOPLE_HEADING = "Figure 6: the model of human drivers"
 A2 = "A2: it converges to a policy as close to the optimal one as wanted (here: the best of the paper's trainings)"
 CLAIMS: dict[str, Sequence[Claim]] = {
     "Table 1 and Figure 4: the proposed method, TRPO, PPO and SAC": (
-        *of_table_1("largest return, {road}: {values}", lambda study, road: larger_return(study, road, *TABLE_1)),
-        *of_table_1(
+        *table_1_claims("largest return, {road}: {values}", lambda study, road: larger_return(study, road, *TABLE_1)),
+        *table_1_claims(
             "larger return than TRPO, {road}, ten trainings",
             lambda study, road: larger_return(study, road, "proposed", "trpo"),
             **{"roads": LEARNED_ROADS, "study": "proposed-{road}"},
         ),
-        *of_table_1(
+        *table_1_claims(
             "larger return than TRPO, {road}, ten trainings, last checkpoint, in validation",
             larger_last_return,
             **{"roads": LEARNED_ROADS, "study": "proposed-{road}"},
         ),
-        *of_table_1(
+        *table_1_claims(
             "larger return than TRPO, {road}, last checkpoint, in validation", larger_last_return, roads=("merge",)
         ),
-        *of_table_1(
+        *table_1_claims(
             "larger return than TRPO, {road}, `paper-exact`",
             lambda _, road: larger_return_to_the_letter(road),
             study="to-the-letter-{road}",
         ),
-        *of_table_1(
+        *table_1_claims(
             "highest average speed, {road} [m/s]: {values}",
             partial(curve_extreme, quantity="cav_mean_speed", what=f"speed of the CAV {TRAINING}"),
             *(1, 2),
         ),
-        *of_table_1(
+        *table_1_claims(
             "lower standard deviation of the speed, {road} [m/s]: {values}; in its own table the lowest is {lowest}",
             partial(curve_extreme, quantity="speed_std_cav", what=f"of the CAV {TRAINING}", larger=False),
             *(2, 2),
         ),
-        *of_both_returns("larger return in the first rounds, {road}", first_return),
-        *of_both_returns(
+        *claims_on_both_returns("larger return in the first rounds, {road}", first_return),
+        *claims_on_both_returns(
             "faster convergence, higher sample efficiency, {road}",
             lambda study, road, quantity: first_arrival(study, road, *TABLE_1, quantity=quantity),
         ),
-        *of_both_returns(
+        *claims_on_both_returns(
             "the return rises throughout the training (here: in its second half), {road}",
             partial(late_change, variant="proposed", what="return", larger=True, digits=0),
         ),
-        *of_both_returns(
+        *claims_on_both_returns(
             "more stable learning, {road}",
             lambda study, road, quantity: fluctuation(study, road, *TABLE_1, quantity=quantity),
         ),
         *(
             claim
             for road, loss in PPO_LOSSES.items()
-            for claim in of_table_1(
+            for claim in table_1_claims(
                 f"PPO's final return is lower (42 % on a road not named; in its own table {loss:.0f} %), {{road}}",
                 lambda study, road: lower_return(study, road, "ppo", "proposed"),
                 roads=(road,),
             )
         ),
-        *of_table_1(
+        *table_1_claims(
             "the speed of PPO's CAV falls late, {road}",
             partial(
                 late_change, variant="ppo", quantity="cav_mean_speed", what="speed in training [m/s]", larger=False
             ),
             roads=LEARNED_ROADS,
         ),
-        *of_table_1(
+        *table_1_claims(
             "the standard deviation of the speed of SAC's CAV rises, {road}",
             partial(late_change, variant="sac", quantity="speed_std_cav", what="in training [m/s]", larger=True),
             roads=("figure-eight",),
         ),
-        *of_table_1("collisions are rare with all learners, {road}", lambda _, road: collisions(road)),
+        *table_1_claims("collisions are rare with all learners, {road}", lambda _, road: rare_collisions(road)),
     ),
     "Figure 5: traffic with the proposed method instead of IDM in the CAV": (
-        *of_table_1(
+        *table_1_claims(
             "smoother traffic, {road}",
             lambda _, road: compared_with_idm(
                 road, "speed_std_fleet", "standard deviation across vehicles [m/s]", False
             ),
         ),
-        *of_table_1(
+        *table_1_claims(
             "much faster traffic, {road}",
             lambda _, road: compared_with_idm(road, "mean_speed", "mean speed of all vehicles [m/s]", True),
             roads=("merge",),
@@ -834,23 +852,25 @@ CLAIMS: dict[str, Sequence[Claim]] = {
     ),
     PEOPLE_HEADING: (),
     "Table 2 and Figure 7: parts of the method, on the ring": (
-        *of_ring(
+        *ring_claims(
             "table-2",
             (
                 f"largest return of all variants: {paper_values('ring', 0, 0, TABLE_2)}",
                 larger_return("table-2", "ring", *TABLE_2),
             ),
-            *both_returns("fastest convergence of all variants", partial(first_arrival, "table-2", "ring", *TABLE_2)),
-            *both_returns(
+            *both_assessments(
+                "fastest convergence of all variants", partial(first_arrival, "table-2", "ring", *TABLE_2)
+            ),
+            *both_assessments(
                 "TRPO alone learns most slowly",
                 partial(first_arrival, "table-2", "ring", *TABLE_2[1:], "proposed", is_last=True),
             ),
             ("TRPO's final return is similar to the others'", similar_return),
-            *both_returns(
+            *both_assessments(
                 "MB-TRPO is more sample-efficient than TRPO",
                 partial(first_arrival, "table-2", "ring", "mb-trpo", "trpo"),
             ),
-            *both_returns(
+            *both_assessments(
                 "MB-TRPO's return fluctuates", partial(fluctuation, "table-2", "ring", "mb-trpo", "trpo", larger=True)
             ),
             (
@@ -863,11 +883,11 @@ CLAIMS: dict[str, Sequence[Claim]] = {
             ),
             ("the residual improves its expert (the paper has no expert alone)", gain_over_expert),
         ),
-        *of_table_1(
+        *table_1_claims(
             "the model improves the result, {road} (the paper has no residual without a model)",
             lambda study, road: larger_return(study, road, "proposed", "without-model"),
         ),
-        *of_ring(
+        *ring_claims(
             "theory",
             ("knowledge makes the model more accurate", knowledge_in_model(slice(None), "mean over the training")),
         ),
@@ -882,25 +902,27 @@ CLAIMS: dict[str, Sequence[Claim]] = {
             )
         ),
     ),
-    "Figure 9: PPO and SAC within the framework": of_ring(
+    "Figure 9: PPO and SAC within the framework": ring_claims(
         "figure-9",
-        ("the framework improves PPO and SAC as well", framework),
-        *both_returns("their return is higher throughout the training", higher_throughout),
-        *both_returns("SAC's return is more stable", partial(fluctuation, "figure-9", "ring", "proposed-sac", "sac")),
+        ("the framework improves PPO and SAC as well", gains_within_framework),
+        *both_assessments("their return is higher throughout the training", higher_throughout),
+        *both_assessments(
+            "SAC's return is more stable", partial(fluctuation, "figure-9", "ring", "proposed-sac", "sac")
+        ),
         ("by 483 % for PPO", stated_gain("ppo", 483)),
         ("by 34 % for SAC", stated_gain("sac", 34)),
     ),
-    "Figure 10: 5, 11 and 22 vehicles": of_ring(
+    "Figure 10: 5, 11 and 22 vehicles": ring_claims(
         "figure-10",
-        ("largest return with each number", volumes),
-        *both_returns("faster convergence with each number", volume_speed),
+        ("largest return with each number", best_with_each_volume),
+        *both_assessments("faster convergence with each number", volume_speed),
     ),
     "Appendix A: theorems": (
         *(
             Claim(f"A1: the initial policy starts closer to the optimum, {road}", "theory", road, better_start(road))
             for road in PAPER_ROADS
         ),
-        *of_ring(
+        *ring_claims(
             "theory",
             (f"{A2}, in training", partial(near_best, quantity=TRAINED)),
             (f"{A2}, on test seeds", near_best),
@@ -909,20 +931,20 @@ CLAIMS: dict[str, Sequence[Claim]] = {
                 "A3: with IDM the model starts with a smaller error (here SUMO's human drivers follow that IDM)",
                 knowledge_in_model(slice(1), "first iteration, after a fit"),
             ),
-            ("A3: the bound on returns in the model warrants improvement in the environment", bound),
+            ("A3: the bound on returns in the model warrants improvement in the environment", bound_on_returns),
         ),
-        *of_table_1(
+        *table_1_claims(
             "A3: the model error falls during training, {road}, `paper-exact`",
             lambda _, road: exact_model_error_falls(road),
             study="to-the-letter-{road}",
         ),
     ),
 }
-"""claims by the part of the paper; those of Figure 6 are `people_claims`"""
+"""claims by part of the paper; `people_claims` returns the claims on Figure 6"""
 
 
 def people_rows() -> list[dict[str, str]]:
-    """Return the rows of the claims on the model of human drivers, which have no filter."""
+    """Return the rows of the claims on the model of human drivers, which do not depend on the filter."""
     return [
         {
             "the paper says": row["the paper"],
@@ -936,37 +958,39 @@ def people_rows() -> list[dict[str, str]]:
 
 
 def claims_tables() -> dict[str, pd.DataFrame]:
-    """Return all claims by part of the paper: what it says, what the studies measured, the verdict and the command."""
+    """Return tables of claims by part of the paper: claim, measured numbers, verdicts and command."""
     return {
         heading: pd.DataFrame(people_rows() if heading == PEOPLE_HEADING else [claim.row() for claim in claims])
         for heading, claims in CLAIMS.items()
     }
 
 
-def kind_of(verdict: str) -> str:
-    """Return the kind of a verdict: its first words, and what makes a claim hold if that is not the method."""
-    first = next(kind for kind in (HELD, NOT_HELD, UNDECIDED, INCONSISTENT, NOT_MEASURED) if verdict.startswith(kind))
-    return first + next((cause for cause in CAUSES if cause in verdict), "")
+def verdict_kind(verdict: str) -> str:
+    """Return the kind of a verdict: its first words, and the cause of a claim that holds, if not the method."""
+    first_words = next(
+        kind for kind in (HELD, NOT_HELD, UNDECIDED, INCONSISTENT, NOT_MEASURED) if verdict.startswith(kind)
+    )
+    return first_words + next((cause for cause in CAUSES if cause in verdict), "")
 
 
-def summary(tables: Sequence[pd.DataFrame]) -> str:
-    """Return how many verdicts there are of each kind, without the filter and with it."""
+def verdict_counts(tables: Sequence[pd.DataFrame]) -> str:
+    """Return the numbers of verdicts of each kind, without and with the filter, as text."""
     rows = [row for table in tables for row in table.to_dict("records")]
     with_filter = [row["with the filter"] for row in rows if row["with the filter"] != NO_VALUE_TEXT]
     texts = {
         "without the filter": [row["verdict"] for row in rows],
-        "with the filter": [each.removeprefix("**") for each in with_filter],
+        "with the filter": [text.removeprefix("**") for text in with_filter],
     }
     sentences = []
     for version, verdicts in texts.items():
-        counts = Counter(map(kind_of, verdicts))
+        counts = Counter(map(verdict_kind, verdicts))
         listed = "; ".join(f"{counts[kind]} {kind}" for kind in KINDS if counts[kind])
         sentences.append(f"- {len(verdicts)} {version}: {listed}")
     return "\n".join(sentences)
 
 
 def short_answer() -> str:
-    """Return what was found of the paper's method without the filter, a line for each road and one for the model."""
+    """Return the results of the method without the filter: a line for each road, human traffic and the model."""
     version, lines, parts = Version(has_filter=False), list[str](), list[str]()
     for road in PAPER_ROADS:
         study = f"proposed-{road}" if road in LEARNED_ROADS else f"table-1-{road}"
@@ -977,7 +1001,7 @@ def short_answer() -> str:
         steps, count = VARIANTS[exact[0]].steps, len(next(iter(exact_returns)))
         rows = version.rows(study, road)
         gain, smooth_gain = (
-            interval_text(difference_to_expert(rows, "proposed", each), 0, "+,") for each in (EXPERT, SMOOTH_EXPERT)
+            interval_text(difference_to_expert(rows, "proposed", expert), 0, "+,") for expert in (EXPERT, SMOOTH_EXPERT)
         )
         best = best_feasible(rows)
         feasible = f"; best feasible driver of the table without learning: {list_values(best)}" if best else ""
@@ -1004,7 +1028,7 @@ def page_text() -> str:
     """Return the content of CLAIMS.md."""
     tables = claims_tables()
     parts = [f"## {heading}\n\n{markdown_table(table)}" for heading, table in tables.items()]
-    introduction = INTRODUCTION.replace("SHORT_ANSWER", short_answer()) + summary([*tables.values()])
+    introduction = INTRODUCTION.replace("SHORT_ANSWER", short_answer()) + verdict_counts([*tables.values()])
     blocks = (introduction, *parts, DIFFERENCES, markdown_table(differences_table()), END)
     return "\n\n".join(blocks) + "\n"
 

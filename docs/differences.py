@@ -1,4 +1,4 @@
-"""The table of all that differs from the paper: settings are read from the code, effects from results/."""
+"""The table of differences from the paper: settings come from the code, measured effects from results/."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from people import figure_6
+from people import figure_6_rows
 from tables import metric_mean, results_part
 
 from unjam.measures.statistics import estimate
@@ -27,17 +27,17 @@ RING_SOURCES = ", ".join(f"`results/{study}.json`" for study in RING_STUDIES)
 
 @dataclass(frozen=True)
 class Difference:
-    """One difference, or one choice that the paper leaves open."""
+    """A difference from the paper, or a choice that the paper leaves open."""
 
     what: str
     paper: str
-    """what the paper says, and where"""
+    """text of the paper, with its section, table or equation"""
     settings: tuple[str, ...] = ()
-    """names of the settings that it is about, those of the scenario as `scenario.NAME`; their values are shown"""
+    """names of the settings that differ, of the scenario as `scenario.NAME`; the table has their values"""
     note: str = ""
-    """what the values mean, or what unjam does with all presets where there is no setting"""
+    """meaning of the values, or behavior of unjam with all presets where there is no setting"""
     effect: Callable[[], str] = lambda: NOT_MEASURED
-    """returns the measured effect, with its source"""
+    """returns the measured effect with its source"""
     road: str = "ring"
 
 
@@ -55,19 +55,19 @@ def filter_effect() -> str:
 
 
 def noise_effect() -> str:
-    """Return how human traffic on the ring, and the speed with the paper's PI, differ between both kinds of noise."""
+    """Return the differences of human traffic and of the speed with the PI of the paper by scaling of the noise."""
     texts = []
-    for what, study in (("unscaled", "table-2-unscaled-noise"), ("scaled", "table-2")):
+    for scaling, study in (("unscaled", "table-2-unscaled-noise"), ("scaled", "table-2")):
         rows = {row["name"]: row for row in results_part(f"{study}/table")}
         speeds = [rows[name]["mean_speed"]["mean"] for name in ("PI (paper)", "human")]
         std = rows["human"]["speed_std_fleet"]["mean"]
-        texts.append(f"{what} {std:.2f} m/s, {speeds[0] - speeds[1]:+.2f} m/s")
+        texts.append(f"{scaling} {std:.2f} m/s, {speeds[0] - speeds[1]:+.2f} m/s")
     what = "standard deviation across vehicles of human traffic, mean speed with PI beyond it"
     return f"{what}: {'; '.join(texts)} (`results/table-2-unscaled-noise.json`, `results/table-2.json`)"
 
 
 def expert_effect() -> str:
-    """Return the differences of the return of PI as in the paper to the default one, in ideal and usual cars."""
+    """Return the difference of the return of the PI of the paper to the default PI, in ideal and usual cars."""
     parts = {
         **{"on `ring`": "feasible-ring-ideal/ring", "on `ring-jammed`": "feasible-ring-ideal/ring-jammed"},
         "on `ring` in a usual car, where it oscillates": "feasible-ring/ring-usual-car",
@@ -84,7 +84,7 @@ def expert_effect() -> str:
 
 
 def selection_effect() -> str:
-    """Return the differences of the last to the best checkpoint."""
+    """Return the differences in return of the last checkpoints to the best ones, by learner."""
     versions = []
     for study, road in RING_STUDIES.items():
         curves, texts = results_part(f"{study}/curves")[road], []
@@ -99,17 +99,19 @@ def selection_effect() -> str:
 def exact_effect() -> str:
     """Return the returns on test seeds of trainings with all of `paper-exact`."""
     trainings = results_part("to-the-letter-ring/paper-exact")
-    returns = {name: sorted(round(each["test_return"]) for each in found) for name, found in trainings.items()}
-    texts = (f"{VARIANTS[name].label} {', '.join(f'{each:,}' for each in found)}" for name, found in returns.items())
+    texts = []
+    for name, rows in trainings.items():
+        returns = sorted(round(row["test_return"]) for row in rows)
+        texts.append(f"{VARIANTS[name].label} {', '.join(f'{value:,}' for value in returns)}")
     source = "`results/to-the-letter-ring.json`"
     return f"not alone; all of `paper-exact`, returns of the trainings: {'; '.join(texts)} ({source})"
 
 
 def stop_effect() -> str:
-    """Return how many trainings the rule would have ended."""
+    """Return how many trainings the convergence rule of the paper would have ended, and when."""
     trainings = results_part("to-the-letter-ring/paper-exact").values()
-    ends = [each["converged"] for found in trainings for each in found]
-    steps = [each["steps"] for each in ends if each]
+    ends = [row["converged"] for rows in trainings for row in rows]
+    steps = [end["steps"] for end in ends if end]
     return (
         f"it would end {len(steps)} of {len(ends)} trainings, after {min(steps):,} to {max(steps):,} steps "
         "(`results/to-the-letter-ring.json`)"
@@ -119,13 +121,13 @@ def stop_effect() -> str:
 def reward_effect() -> str:
     """Return the mean speed of trainings with Eq. 16 as printed and as meant."""
     rows = {row["name"]: row["mean_speed"]["mean"] for row in results_part("eq16/table")}
-    speeds = [rows[f"proposed, Eq. 16 as {how}"] for how in ("printed", "meant")]
+    speeds = [rows[f"proposed, Eq. 16 as {version}"] for version in ("printed", "meant")]
     texts = f"{speeds[0]:.2f} m/s as printed, {speeds[1]:.2f} as meant; human drivers {rows['human']:.2f}"
     return f"mean speed of the method, with the filter, 5 trainings: {texts} (`results/eq16.json`)"
 
 
 def merge_effect() -> str:
-    """Return the return of human traffic on the merge with other gaps and starts."""
+    """Return the return of human traffic on the merge with other minimum gaps and initial states."""
     rows = results_part("research-notes/merge-level")["rows"]
     human = {
         (row["gap"], row["standing_vehicles"]): row["return"]["mean"]
@@ -140,34 +142,37 @@ def merge_effect() -> str:
 
 
 def impatience_effect() -> str:
-    """Return the speed of human traffic on the figure eight with other impatience."""
+    """Return the speed of human traffic on the figure eight with other values of impatience."""
     parts = {"": "figure-eight-32", " with impatience 0": "figure-eight-32-impatience=0"}
     parts[" with 1"] = "figure-eight-32-impatience=1"
-    texts = (f"{metric_mean(f'experts/{part}', 'human', 'mean_speed'):.2f} m/s{what}" for what, part in parts.items())
+    texts = (
+        f"{metric_mean(f'experts/{part}', 'human', 'mean_speed'):.2f} m/s{suffix}" for suffix, part in parts.items()
+    )
     return f"human traffic, radius 32 m: {', '.join(texts)} (`results/experts.json`)"
 
 
 def data_effect() -> str:
-    """Return the errors of the networks of Figure 6 with few data of another driver and of the IDM in the model."""
+    """Return the errors of the networks of Figure 6 with few data, of another driver and of the IDM in the model."""
     texts = []
-    for driver, what in (("other", "with another driver"), ("same", "with the same IDM")):
-        rows = figure_6(driver=driver, split="trajectories", is_long=False, size=0.01)
-        errors = {network: found["driver_error"].mean() for network, found in rows.groupby("network")}
-        texts.append(f"{errors['knowledge']:.3f} with IDM and {errors['vanilla']:.3f} without {what}")
+    for driver, data in (("other", "with another driver"), ("same", "with the same IDM")):
+        rows = figure_6_rows(driver=driver, split="trajectories", is_long=False, size=0.01)
+        errors = {network: fits["driver_error"].mean() for network, fits in rows.groupby("network")}
+        texts.append(f"{errors['knowledge']:.3f} with IDM and {errors['vanilla']:.3f} without {data}")
     return f"error with 1 % of the data [m/s²]: {'; '.join(texts)} (`results/figure-6.json`)"
 
 
 def speed_effect() -> str:
-    """Return both speeds of a training."""
+    """Return the mean speed of a variant in the convention of the paper, and on test seeds."""
     texts = []
     for study in RING_STUDIES:
         row = next(row for row in results_part(f"{study}/table") if row["name"] == "TRPO")
-        own, fleet = row["paper_convention"]["speed"]["mean"], row["mean_speed"]["mean"]
-        texts.append(f"{own:.2f} m/s in the paper's convention, {fleet:.2f} on test seeds")
+        cav_speed, fleet_speed = row["paper_convention"]["speed"]["mean"], row["mean_speed"]["mean"]
+        texts.append(f"{cav_speed:.2f} m/s in the paper's convention, {fleet_speed:.2f} on test seeds")
     return f"TRPO, ring: {texts[0]}; with the filter {texts[1]} ({RING_SOURCES})"
 
 
 NOISE_STEP = 0.2 * sqrt(0.1)
+"""noise of human drivers in a step of 0.1 s [m/s2]"""
 TRAFFIC = (
     Difference(
         "safety filter of the CAV",
@@ -377,24 +382,24 @@ DIFFERENCES = {
 
 
 @cache
-def settings_of(preset: str, road: str) -> dict[str, Any]:
-    """Return all settings of a training with a preset by name, those of the scenario as `scenario.NAME`."""
+def preset_settings(preset: str, road: str) -> dict[str, Any]:
+    """Return all settings of a training with a preset by name; settings of the scenario are `scenario.NAME`."""
     config = load_config(preset=preset, changes={"scenario": road})
     scenario = config.make_scenario()
-    own = {"scenario": asdict(scenario), "reward": config.reward or scenario.reward}
-    return flatten_keys({**asdict(config), **own})
+    scenario_settings = {"scenario": asdict(scenario), "reward": config.reward or scenario.reward}
+    return flatten_keys({**asdict(config), **scenario_settings})
 
 
 def unlisted_settings() -> list[str]:
-    """Return the settings in which presets differ that have no row."""
+    """Return the names of settings in which presets differ, but which have no row."""
     listed = {name for rows in DIFFERENCES.values() for row in rows for name in row.settings}
-    by_preset = [settings_of(preset, "ring") for preset in PRESETS.values()]
-    differing = {name for name in by_preset[0] if len({repr(each[name]) for each in by_preset}) > 1}
+    by_preset = [preset_settings(preset, "ring") for preset in PRESETS.values()]
+    differing = {name for name in by_preset[0] if len({repr(settings[name]) for settings in by_preset}) > 1}
     return sorted(differing - listed - {"preset"})
 
 
 def setting_text(value: Any) -> str:
-    """Return the value of a setting as pages show it."""
+    """Return the value of a setting as text."""
     if isinstance(value, (tuple, list)):
         return "`" + ", ".join(map(str, value)) + "`"
     if isinstance(value, bool):
@@ -411,7 +416,7 @@ def differences_table() -> pd.DataFrame:
             cells = {"": topic, "what": f"{row.what} ({names})" if names else row.what, "the paper": row.paper}
             topic = ""
             for heading, preset in PRESETS.items():
-                values = settings_of(preset, row.road)
+                values = preset_settings(preset, row.road)
                 cells[heading] = ", ".join(setting_text(values[name]) for name in row.settings)
             table.append({**cells, "note": row.note, "measured effect": row.effect()})
     return pd.DataFrame(table)

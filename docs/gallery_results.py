@@ -31,7 +31,7 @@ ROADS: dict[str, tuple[str, dict[str, Any]]] = {
     "figure-eight-best": ("figure-eight", {}),
     "on-ramp-tuned": ("on-ramp", {"penetration_rate": 0.05}),
 }
-"""the road of each controller, with changes to it"""
+"""road of each controller, and changes to the road"""
 PICTURES = Path(__file__).parent / "pictures"
 
 
@@ -45,32 +45,32 @@ def certify(name: str) -> dict[str, Any]:
 
 
 def measure_card(name: str) -> dict[str, Any]:
-    """Return what the card of a controller shows, and write its picture."""
+    """Return the content of the card of a controller, and write its picture."""
     road, changes = ROADS[name]
     driver, is_open = f"unjam:{name}", road == "on-ramp"
     result = unjam.drive(
         road, ["human", driver], episodes=20 if is_open else 10, scenario_options=changes, workers=2, test_seeds=True
     )
     titles = {"human": "human", driver: driver}
-    panels = [to_plot_episode(title, result.plot_episodes[each]) for each, title in titles.items()]
+    panels = [to_plot_episode(title, result.plot_episodes[label]) for label, title in titles.items()]
     (PICTURES / f"gallery-{name}.png").write_bytes(png_bytes(space_time_figure(panels)))
-    own, human = result.rows[driver], result.rows["human"]
+    rows, human_rows = result.rows[driver], result.rows["human"]
     return {
         "road": road,
         "changes": changes,
         "made_for": road_description(read_controller(packaged_file(name)).manifest),
-        "compared with the human baseline": effect_of(own, human).summary,
-        "seeds": len(own),
-        "min_time_gap": metric_estimate(own, "min_time_gap").mean,
-        "max_braking": metric_estimate(own, "cav_max_braking").mean,
-        "feasibility": overall_feasibility(own, human),
+        "compared with the human baseline": effect_of(rows, human_rows).summary,
+        "seeds": len(rows),
+        "min_time_gap": metric_estimate(rows, "min_time_gap").mean,
+        "max_braking": metric_estimate(rows, "cav_max_braking").mean,
+        "feasibility": overall_feasibility(rows, human_rows),
         **({"string_stability": "", "domain": None} if is_open else certify(name)),
         "manifest": manifest(),
     }
 
 
 def main(names: list[str]) -> None:
-    """Measure the cards of some controllers, or of all."""
+    """Measure and store the cards of the named controllers, or of all."""
     cards = results_part("gallery/cards")
     for name in names or ROADS:
         cards[name] = measure_card(name)

@@ -30,7 +30,7 @@ REASONS = {
 
 
 def packaged_table() -> str:
-    """Return for each controller in a usual car its road, string gain, speed, feasibility, and why it ships."""
+    """Return road, string gain, speed and feasibility of each controller in a usual car, and why it is included."""
     rows: list[dict[str, Any]] = []
     for road in ("ring", "ring-jammed", "figure-eight"):
         measured = [row for row in results_part(f"string-stability/packaged-{road}") if row["car"] == "usual"]
@@ -39,7 +39,7 @@ def packaged_table() -> str:
             name = row["driver"].removeprefix("unjam:")
             if name not in REASONS:
                 continue
-            feasible = sum(each["feasibility"] == FEASIBLE for each in row["episodes"])
+            feasible_count = sum(episode["feasibility"] == FEASIBLE for episode in row["episodes"])
             difference = paired_difference(row["episodes"], human, "mean_speed")
             rows.append(
                 {
@@ -48,7 +48,7 @@ def packaged_table() -> str:
                     "string stable": "yes" if row["gain"] <= 1.0 + GAIN_TOLERANCE else "no",
                     "string gain": f"{row['gain']:.2f}",
                     "mean speed [m/s], difference to human": str(estimate_cell(difference, 2, sign="+")),
-                    "feasible": f"{feasible} of {len(row['episodes'])}",
+                    "feasible": f"{feasible_count} of {len(row['episodes'])}",
                     "why it ships": REASONS[name],
                 }
             )

@@ -2,7 +2,8 @@
 
     python docs/pages.py
 
-A page has its code in cells. They share their variables; `display` shows values, and so does a last expression:
+The cells of a page contain its code and share their variables. A cell shows the values that it passes to `display`, and
+its last expression:
 
     <!-- cell
     show(page_table("fuel", "ring"))
@@ -30,7 +31,7 @@ CELL = re.compile(rf"^{BEGIN}((?:(?!-->).)*)^-->\n(.*?)^<!-- end -->$", re.DOTAL
 
 
 def run_cell(code: str, name: str, variables: dict[str, Any]) -> list[str | Picture]:
-    """Run a cell and return the values that it shows, as in a notebook; error messages contain `name`."""
+    """Run a cell and return the values that it shows; error messages contain `name`."""
     shown: list[str | Picture] = []
     variables["display"] = lambda *values: shown.extend(value for value in values if value is not None)
     module = ast.parse(code, name)
@@ -43,7 +44,7 @@ def run_cell(code: str, name: str, variables: dict[str, Any]) -> list[str | Pict
 def render_page(page: Path) -> tuple[str, list[Picture]]:
     """Return the text of a page with the current outputs of its cells, and its pictures.
 
-    Raises `ValueError` if a cell has no end, or its comment an early one.
+    Raise `ValueError` if a cell has no end, or if its code contains the end of a comment.
     """
     text, variables, pictures = page.read_text(), dict[str, Any](), list[Picture]()
     if text.count(BEGIN) != len(CELL.findall(text)):
@@ -52,9 +53,10 @@ def render_page(page: Path) -> tuple[str, list[Picture]]:
     def update(cell: re.Match[str]) -> str:
         line = text.count("\n", 0, cell.start(1))
         shown = run_cell("\n" * line + cell[1], str(page), variables)
-        pictures.extend(each for each in shown if isinstance(each, Picture))
+        pictures.extend(value for value in shown if isinstance(value, Picture))
         outputs = [
-            f"![{each.alt}](pictures/pages/{each.name}.png)" if isinstance(each, Picture) else each for each in shown
+            f"![{value.alt}](pictures/pages/{value.name}.png)" if isinstance(value, Picture) else value
+            for value in shown
         ]
         return "\n\n".join([f"{BEGIN}{cell[1]}-->", *outputs, "<!-- end -->"])
 
@@ -65,7 +67,9 @@ def write_pages() -> None:
     """Write all pages and their pictures, and remove pictures that no page shows."""
     updated = {page: render_page(page) for page in sorted(DOCS.glob("*.md"))}
     pictures = {
-        PICTURES / f"{each.name}.png": png_bytes(each.figure) for _, found in updated.values() for each in found
+        PICTURES / f"{picture.name}.png": png_bytes(picture.figure)
+        for _, page_pictures in updated.values()
+        for picture in page_pictures
     }
     for path in set(PICTURES.glob("*")) - set(pictures):
         path.unlink()

@@ -19,20 +19,20 @@ from unjam_paper.study import STUDY_ROADS, UNFILTERED_ROADS, DriverComparison, i
 from unjam_paper.variants import REFERENCE_DRIVERS, TUNED_REFERENCES, VARIANTS
 
 JAM_FREE_SPEED = 15.0
-"""an episode on the merge with a larger mean speed has no jam at its end [m/s]"""
+"""mean speed from which on an episode on the merge has no jam at its end [m/s]"""
 PAPER_COLUMNS = {"reward": "return", "speed": "CAV's speed [m/s]", "std": "its std [m/s]"}
 
 
 def page_table(study: str, name: str) -> pd.DataFrame:
-    """Return a table that the study itself defines for its page."""
+    """Return a table of a study from its stored results."""
     return STUDIES[study].tables[name](RESULTS / f"{study}.json")
 
 
 def study_rows(study: str, road: str) -> list[dict[str, Any]]:
-    """Return the rows of a study's table on a road, compared with the best tuned expert.
+    """Return the rows of the table of a study on a road, compared with the best tuned expert.
 
-    Trainings have the present label of their variant. Older results have percentile intervals, which are computed again
-    from the gains of the trainings if the file has them.
+    Trainings have the present label of their variant. Intervals of older results, which are percentiles, are computed
+    again from the gains of the trainings if the results contain these.
     """
     rows = results_part(f"{study}/table")
     for row in rows:
@@ -50,46 +50,43 @@ def study_rows(study: str, road: str) -> list[dict[str, Any]]:
 
 
 def add_tuned_experts(rows: list[dict[str, Any]], tuned: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the rows of a table with tuned experts that were evaluated later, on the same seeds.
+    """Return the rows of a table with tuned experts that were evaluated later on the same seeds.
 
-    Differences of trainings are to the best tuned expert. The results do not contain their episodes, so that confidence
-    intervals are over the means of the trainings only.
+    Differences of trainings refer to the best tuned expert. The results do not contain the episodes of trainings, so
+    that confidence intervals are over the means of trainings only.
     """
     metric = next(row["gain_reference"]["metric"] for row in rows if row["is_learned"])
     names = {name: label for label, name in TUNED_REFERENCES[rows[0]["road"]].items()}
-    driven = [
-        {"name": names[name], "is_learned": False, "trainings": 0, **estimate_metrics(found, COMPARISON_METRICS)}
-        for name, found in tuned.items()
+    tuned_rows = [
+        {"name": names[name], "is_learned": False, "trainings": 0, **estimate_metrics(episodes, COMPARISON_METRICS)}
+        for name, episodes in tuned.items()
         if name in names
     ]
-    best = max(driven, key=lambda row: row[metric]["mean"])
-    before = next(row for row in rows if row.get("best_expert"))
-    more = best[metric]["mean"] - before[metric]["mean"]
-    if more <= 0:
+    best = max(tuned_rows, key=lambda row: row[metric]["mean"])
+    previous_best = next(row for row in rows if row.get("best_expert"))
+    increase = best[metric]["mean"] - previous_best[metric]["mean"]
+    if increase <= 0:
         return rows
     learned = [
-        {**row, "gain_over_best_expert": asdict(estimate_over_trainings([gain - more for gain in row["gains"]]))}
+        {**row, "gain_over_best_expert": asdict(estimate_over_trainings([gain - increase for gain in row["gains"]]))}
         for row in rows
         if row["is_learned"]
     ]
     others = [{**row, "best_expert": False, "gain_over_best_expert": None} for row in rows if not row["is_learned"]]
-    driven = [{**row, "best_expert": row is best} for row in driven]
-    return [*others, *driven, *({**row, "probability_of_improvement": None} for row in learned)]
+    tuned_rows = [{**row, "best_expert": row is best} for row in tuned_rows]
+    return [*others, *tuned_rows, *({**row, "probability_of_improvement": None} for row in learned)]
 
 
 def difference_to_expert(rows: dict[str, dict[str, Any]], name: str, expert: str) -> dict[str, Any]:
-    """Return the difference between the return of trainings and that of an expert of their table.
-
-    The confidence interval is over the means of the trainings.
-    """
+    """Return the difference of the return of trainings to an expert of their table, with a CI over the trainings."""
     row = rows[name]
     metric, best = row["gain_reference"]["metric"], row["gain_reference"]["expert"]
-    more = rows[best][metric]["mean"] - rows[expert][metric]["mean"]
-    return asdict(estimate_over_trainings([gain + more for gain in row["gains"]]))
+    best_gain = rows[best][metric]["mean"] - rows[expert][metric]["mean"]
+    return asdict(estimate_over_trainings([gain + best_gain for gain in row["gains"]]))
 
 
 def jammed_ring_table() -> pd.DataFrame:
-    """Return differences on the jammed ring with usual cars by its length, of the tuned formulas and of residuals."""
+    """Return differences of the tuned formula and of residuals on the jammed ring with usual cars, by length."""
     parts, trainings = _jammed_ring()
     formula, residuals = "tuned formula", "residuals"
     columns = {
@@ -102,7 +99,7 @@ def jammed_ring_table() -> pd.DataFrame:
     }
     roads = {f"{length} m": [part] for length, part in parts.items()} | {"these six": [*parts.values()]}
     return pd.DataFrame(
-        {"length": length, **{name: DriverComparison(road).difference(*each) for name, each in columns.items()}}
+        {"length": length, **{name: DriverComparison(road).difference(*column) for name, column in columns.items()}}
         for length, road in roads.items()
     )
 
@@ -129,7 +126,7 @@ def _jammed_ring() -> tuple[dict[str, Any], list[str]]:
 
 
 def paper_convention_table(study: str, road: str) -> pd.DataFrame:
-    """Return a table in the paper's convention: its numbers, and those measured without and with the safety filter."""
+    """Return the numbers of the paper, and the numbers in its convention without and with the safety filter."""
     with_filter = {row["name"]: row for row in study_rows(study, road)}
     unfiltered = f"{study}-unfiltered", UNFILTERED_ROADS.get(road, "")
     is_measured = (RESULTS / f"{unfiltered[0]}.json").is_file()
@@ -161,7 +158,7 @@ COLUMNS = {
     "outflow [veh/h]": ("outflow_veh_per_h", 0),
     "insertion backlog [veh]": ("insertion_backlog_veh", 0),
 }
-"""columns of `evaluation_table`: a metric and its digits"""
+"""metric and digits of the columns of `evaluation_table`, by heading"""
 RING_COLUMNS = ("return", "mean speed [m/s]", "speed / limit, steady", "std across vehicles [m/s]")
 RING_COLUMNS += ("min time gap [s]",)
 FIGURE_EIGHT_COLUMNS = ("return", "return, Eq. 16", "mean speed [m/s]", "steady [m/s]", "std across vehicles [m/s]")
@@ -197,12 +194,12 @@ def evaluation_table(
 
 
 def unfiltered_table(study: str, road: str, columns: tuple[str, ...] = RING_COLUMNS) -> pd.DataFrame:
-    """Return `evaluation_table` of `study` without the safety filter."""
+    """Return the `learned_table` of a study without the safety filter."""
     return learned_table(f"{study}-unfiltered", UNFILTERED_ROADS[road], columns)
 
 
 def learned_table(study: str, road: str, columns: tuple[str, ...] = RING_COLUMNS) -> pd.DataFrame:
-    """Return `evaluation_table` with braking, for PI, tuned experts and the trainings."""
+    """Return the `evaluation_table` of PI, tuned experts and trainings, with braking."""
     learned = tuple(row["name"] for row in study_rows(study, road) if row["is_learned"])
     drivers = ("PI (paper)", "tuned PI", "tuned pacer", *learned)
     return evaluation_table(study, road, (*columns, "max braking [m/s²]"), drivers)
@@ -216,7 +213,7 @@ def _feasibility_text(verdicts: str | list[str]) -> str:
 
 
 def merge_capacity_table() -> pd.DataFrame:
-    """Return the metrics of human-only traffic on the merge by inflow and by the state at the start."""
+    """Return the metrics of human-only traffic on the merge by inflow and initial state."""
     names = ("mean_speed", "mean_speed_steady", "outflow_veh_per_h", "insertion_backlog_veh")
     tables = []
     for part in read_parts(RESULTS / "research-notes.json"):
@@ -231,7 +228,7 @@ def merge_capacity_table() -> pd.DataFrame:
 
 
 def closing_absorber_table() -> pd.DataFrame:
-    """Return the metrics of the jam absorber with and without closing up, and the episodes without a jam at the end."""
+    """Return the metrics of the jam absorber with and without closing gaps, and its episodes that end without a jam."""
     names = ("return", "mean_speed", "mean_speed_steady", "outflow_veh_per_h", "insertion_backlog_veh")
     table = metric_table("research-notes/merge-closing", names)
     table["without a jam"] = [
@@ -242,7 +239,7 @@ def closing_absorber_table() -> pd.DataFrame:
 
 
 def command_table() -> pd.DataFrame:
-    """Return the command that repeats the training of a row with the first seed, by study and road."""
+    """Return for each study, road and row the command that repeats the training with the first seed."""
     table = {}
     for name, study in STUDIES.items():
         for run in study.make_runs(1):
@@ -259,10 +256,10 @@ def command_table() -> pd.DataFrame:
 
 def driver_name_table() -> pd.DataFrame:
     """Return the command-line names of drivers that do not learn."""
-    on_all = [{"row": label, "`--driver`": f"`{name}`", "on": ""} for label, name in REFERENCE_DRIVERS.items()]
+    for_all_roads = [{"row": label, "`--driver`": f"`{name}`", "on": ""} for label, name in REFERENCE_DRIVERS.items()]
     tuned = [
         {"row": label, "`--driver`": f"`{name}`", "on": road}
-        for road, found in TUNED_REFERENCES.items()
-        for label, name in found.items()
+        for road, experts in TUNED_REFERENCES.items()
+        for label, name in experts.items()
     ]
-    return pd.DataFrame([*on_all, *tuned])
+    return pd.DataFrame([*for_all_roads, *tuned])

@@ -19,7 +19,7 @@ from unjam_paper.results_file import read_part
 
 RESULTS = Path(__file__).parent.parent / "results"
 NUMBERS = re.compile(r"[-+−–±.,%\s\[\]]*\d[-+−–±.,%\s\[\]\d]*")
-"""content of columns that are aligned to the right"""
+"""pattern of the content of columns that are aligned to the right"""
 NOTE_TERMS = {
     "also beside the acceleration lane": "also next to the acceleration lane",
     "` as it is": "` with default parameters",
@@ -48,7 +48,7 @@ def results_part(name: str) -> Any:
 
 
 def driver_rows(name: str) -> dict[str, list[dict]]:
-    """Return the rows of a part of a results file, FILE/PART, by driver."""
+    """Return the rows of a part of a results file, FILE/PART, by driver; null is NaN."""
     rows: dict[str, list[dict]] = {}
     for row in results_part(name)["rows"]:
         rows.setdefault(row["driver"], []).append(
@@ -69,9 +69,9 @@ def metric_table(name: str, metrics: Sequence[str], compared: bool = True) -> pd
     for driver, rows in by_driver.items():
         cells = {}
         for metric in metrics:
-            found, about = metric_estimate(rows, metric), METRICS[metric]
-            heading = f"{about.label} [{about.unit}]" if about.unit else about.label
-            cells[heading] = str(estimate_cell(found, about.digits, len(rows))) if found.count else "never"
+            value, info = metric_estimate(rows, metric), METRICS[metric]
+            heading = f"{info.label} [{info.unit}]" if info.unit else info.label
+            cells[heading] = str(estimate_cell(value, info.digits, len(rows))) if value.count else "never"
         first = METRICS[metrics[0]]
         if "human" in by_driver and len(by_driver) > 1 and "cav_max_braking" in rows[0]:
             cells["feasible"] = overall_feasibility(rows)
@@ -89,13 +89,13 @@ def metric_mean(name: str, driver: str, metric: str) -> float:
 
 
 def batch_size_table() -> pd.DataFrame:
-    """Return vehicle steps per second by number of rings in a batch and by device."""
+    """Return vehicle steps per second by number of rings in a batch, device and model of human drivers."""
     columns = {}
     for name in ("cpu", "gpu"):
         measured = results_part(f"batch/sizes-{name}")
-        for humans, found in measured["batches"].items():
+        for humans, batches in measured["batches"].items():
             columns[f"{measured['device']}, {humans} [million/s]"] = {
-                entry["rings"]: f"{entry['vehicle_steps_per_s'] / 1e6:,.1f}" for entry in found
+                batch["rings"]: f"{batch['vehicle_steps_per_s'] / 1e6:,.1f}" for batch in batches
             }
     table = pd.DataFrame(columns).fillna("")
     table.insert(0, "rings per batch", [f"{rings:,}" for rings in table.index])
@@ -103,15 +103,15 @@ def batch_size_table() -> pd.DataFrame:
 
 
 def knowledge_rows(road: str) -> pd.DataFrame:
-    """Return the rows of the study of prior knowledge on a road: one per model, number of steps and seed."""
+    """Return the results on prior knowledge on a road, a row for each model, number of steps and seed."""
     rows = results_part("model/knowledge")["rows"]
     return pd.json_normalize([row for row in rows if row["road"] == road])
 
 
 def knowledge_table(road: str, columns: dict[str, str], ranges: bool = True) -> pd.DataFrame:
-    """Return a table of the study of prior knowledge: mean, smallest and largest value over the seeds.
+    """Return errors by prior knowledge and number of steps: mean, and with `ranges` the range over the seeds.
 
-    `columns` has the headings of the shown quantities by name.
+    `columns` has the headings of the shown errors by name.
     """
     table = []
     for (steps, model), rows in knowledge_rows(road).groupby(["steps", "model"], sort=False):
@@ -128,27 +128,27 @@ def knowledge_table(road: str, columns: dict[str, str], ranges: bool = True) -> 
 def knowledge_gain_table(roads: Sequence[str], columns: dict[str, str]) -> pd.DataFrame:
     """Return the reduction of errors by IDM + residual relative to networks alone, paired on the same data.
 
-    Brackets have the number of seeds with a reduction.
+    Brackets contain the number of seeds with a reduction.
     """
     table = []
     for road in roads:
         rows = knowledge_rows(road)
-        for steps, found in rows[rows["steps"] > 0].groupby("steps"):
+        for steps, step_rows in rows[rows["steps"] > 0].groupby("steps"):
             cells = {"road": road, "environment steps": f"{steps:,}"}
             for name, heading in columns.items():
-                errors = found.pivot(index="seed", columns="model", values=name)
-                less = 1.0 - errors["IDM + residual"] / errors["networks alone"]
-                cells[heading] = f"{100 * less.mean():+.0f} % [{(less > 0).sum()} of {len(less)}]"
+                errors = step_rows.pivot(index="seed", columns="model", values=name)
+                reduction = 1.0 - errors["IDM + residual"] / errors["networks alone"]
+                cells[heading] = f"{100 * reduction.mean():+.0f} % [{(reduction > 0).sum()} of {len(reduction)}]"
             table.append(cells)
     return pd.DataFrame(table)
 
 
 def road_model_table(road: str) -> pd.DataFrame:
-    """Return the mean errors of whole-road models by prior knowledge of human drivers and by amount of data.
+    """Return the mean errors of whole-road models by prior knowledge of human drivers and amount of data.
 
-    Columns are one-step errors, and differences of episodes in the model to those in the environment: mean speed, and
-    standard deviation of speeds in the second half, with PI and with a CAV that follows as a human driver. Brackets
-    have the range over the seeds.
+    Columns are one-step errors, and differences between episodes in the model and the environment: of the mean speed,
+    and of the standard deviation of speeds in the second half, with PI and with a CAV that follows as a human driver.
+    Brackets contain the range over the seeds.
     """
     rows = results_part("model/whole_roads")["rows"]
     drivers = {"PI": "PI", "CAV that follows as a human driver": "as a human driver"}
@@ -157,7 +157,7 @@ def road_model_table(road: str) -> pd.DataFrame:
 
 
 def on_ramp_model_table() -> pd.DataFrame:
-    """Return the errors of on-ramp models, as `road_model_table`: differences of travel time and flow."""
+    """Return the same as `road_model_table` for models of the on-ramp, with differences of travel time and flow."""
     rows = results_part("model/on_ramps")["rows"]
     drivers = {"expert of the data": "the expert", "human baseline": "human baseline"}
     metrics = {"travel_time": ("travel time", "s", 1), "outflow_veh_per_h": ("flow", "veh/h", 0)}
@@ -169,70 +169,71 @@ Metrics = dict[str, tuple[str, str, int]]
 
 
 def _model_error_table(rows: list[dict], drivers: dict[str, str], metrics: Metrics) -> pd.DataFrame:
-    """Return a table of `rows`, one of which is the environment, by `drivers` with their labels.
+    """Return a table of the models in `rows`, compared with the environment, the row without prior knowledge.
 
-    Differences are omitted if half of the episodes or more ended in a collision.
+    `drivers` has labels by driver. Models in which half of the episodes or more end in a collision have no differences.
     """
     (actual,) = (row for row in rows if not row["known"])
-    found, table = pd.DataFrame([row for row in rows if row["known"]]), []
-    for (known, steps), of in found.groupby(["known", "steps"], sort=False):
+    models, table = pd.DataFrame([row for row in rows if row["known"]]), []
+    for (known, steps), seeds in models.groupby(["known", "steps"], sort=False):
         cells = {"prior knowledge": known, "environment steps": f"{steps:,}" if steps else "none"}
-        cells["one-step error [m/s]"] = f"{of['step_error'].mean():.4f}"
+        cells["one-step error [m/s]"] = f"{seeds['step_error'].mean():.4f}"
         for driver, label in drivers.items():
             for name, (heading, unit, digits) in metrics.items():
-                valid = [each for each in of[driver] if 2 * each["collisions"] < len(each[name])]
-                differences = [np.mean(each[name]) - np.mean(actual[driver][name]) for each in valid]
+                valid = [episodes for episodes in seeds[driver] if 2 * episodes["collisions"] < len(episodes[name])]
+                differences = [np.mean(episodes[name]) - np.mean(actual[driver][name]) for episodes in valid]
                 cells[f"{heading}, {label} [{unit}]"] = _range_text(differences, digits) if valid else "–"
-        crashed = sum(each["collisions"] for driver in drivers for each in of[driver])
-        episodes = len(drivers) * len(of) * len(actual[driver][name])
-        cells["episodes with collisions"] = f"{crashed} of {episodes}"
+        collisions = sum(episodes["collisions"] for driver in drivers for episodes in seeds[driver])
+        episode_count = len(drivers) * len(seeds) * len(actual[driver][name])
+        cells["episodes with collisions"] = f"{collisions} of {episode_count}"
         table.append(cells)
     return pd.DataFrame(table)
 
 
-LEVELS = {
+RETURN_COLUMNS = {
     "return": ("return", 0),
     "cav_mean_speed": ("CAV's speed [m/s]", 2),
     "speed_std_cav": ("its std over time [m/s]", 2),
 }
 
 
-def driver_return_table(name: str, columns: dict[str, str], chosen: dict[str, tuple]) -> pd.DataFrame:
-    """Return return and speed of drivers that do not learn, from a part of `results/research-notes.json`.
+def driver_return_table(name: str, columns: dict[str, str], selected: dict[str, tuple]) -> pd.DataFrame:
+    """Return returns and speeds of drivers that do not learn, from a part of `results/research-notes.json`.
 
-    `columns` has the headings of the columns that identify a row, `chosen` their values in the shown rows.
+    `columns` has the headings of the entries that identify a row, `selected` the values of entries in the shown rows.
     """
     rows = results_part(f"research-notes/{name}")["rows"]
     return pd.DataFrame(
         {heading: row[key] for key, heading in columns.items()}
-        | {heading: estimate_cell(Estimate(**row[key]), digits) for key, (heading, digits) in LEVELS.items()}
+        | {heading: estimate_cell(Estimate(**row[key]), digits) for key, (heading, digits) in RETURN_COLUMNS.items()}
         for row in rows
-        if all(row[key] in values for key, values in chosen.items())
+        if all(row[key] in values for key, values in selected.items())
     )
 
 
 def _range_text(values: Sequence[float], digits: int = 2) -> str:
     mean, low, high = (
-        f"{round(each, digits) + 0.0:+.{digits}f}" for each in (np.mean(values), min(values), max(values))
+        f"{round(value, digits) + 0.0:+.{digits}f}" for value in (np.mean(values), min(values), max(values))
     )
     return mean if low == high else f"{mean} [{low}, {high}]"
 
 
 def _count_in_text(text: str) -> int:
+    """Return the number whose digits a text contains; 0 without digits."""
     return int("".join(digit for digit in text if digit.isdigit()) or 0)
 
 
 def memory_table() -> pd.DataFrame:
     """Return the explained variance of properties of a ring by memory of the policy, on training and unseen rings."""
     explained = results_part("research-notes/memory")["explained"]
-    seen, held_out = next(iter(explained.values()))
+    training_rings, unseen_rings = next(iter(explained.values()))
     rows = []
-    for form, of in explained.items():
-        row = {"memory": form}
-        for target in of[seen]:
-            for rings, where in ((seen, "training"), (held_out, "unseen")):
-                share = of[rings][target]
-                row[f"{target}, {where}"] = f"{share['mean']:.2f} [{share['low']:.2f}, {share['high']:.2f}]"
+    for memory, by_rings in explained.items():
+        row = {"memory": memory}
+        for target in by_rings[training_rings]:
+            for rings, heading in ((training_rings, "training"), (unseen_rings, "unseen")):
+                share = by_rings[rings][target]
+                row[f"{target}, {heading}"] = f"{share['mean']:.2f} [{share['low']:.2f}, {share['high']:.2f}]"
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -258,21 +259,21 @@ def note_tables() -> dict[str, pd.DataFrame]:
 
 
 def _in_glossary_terms(text: str) -> str:
-    for older, term in NOTE_TERMS.items():
-        text = text.replace(older, term)
+    for old_term, term in NOTE_TERMS.items():
+        text = text.replace(old_term, term)
     return text
 
 
 def networks_table() -> pd.DataFrame:
-    """Return the human baseline compared with plain SUMO on public networks: a row for each."""
+    """Return the comparison of the human baseline with plain SUMO on public networks, a row for each network."""
     rows = {}
-    for name, found in results_part("networks/networks").items():
-        about = {"simulated [s]": f"{found['seconds']:.0f}"}
-        if "refused" in found:
-            rows[name] = {**about, "result": f"refused: {found['refused']}"}
+    for name, network in results_part("networks/networks").items():
+        cells = {"simulated [s]": f"{network['seconds']:.0f}"}
+        if "refused" in network:
+            rows[name] = {**cells, "result": f"refused: {network['refused']}"}
             continue
-        baseline, plain = found["human_baseline"], found["plain_sumo"]
-        both = {
+        baseline, plain = network["human_baseline"], network["plain_sumo"]
+        counts = {
             label: f"{baseline[key]:.{digits}f} / {plain[key]:.{digits}f}"
             for key, label, digits in (
                 ("departures", "departures", 0),
@@ -282,9 +283,9 @@ def networks_table() -> pd.DataFrame:
             )
         }
         rows[name] = {
-            **about,
-            **both,
-            "result": f"{found['different_trips']} trips differ",
+            **cells,
+            **counts,
+            "result": f"{network['different_trips']} trips differ",
             "CPU time": f"{baseline['seconds'] / plain['seconds']:.1f} x ({plain['seconds']:.1f} s)",
             "memory [MB]": f"{baseline['megabytes']:.0f} / {plain['megabytes']:.0f}",
         }
@@ -292,26 +293,26 @@ def networks_table() -> pd.DataFrame:
 
 
 def soak_table() -> pd.DataFrame:
-    """Return the faults of the last soak: what was injected, how often, and the outcomes."""
+    """Return the faults of the last soak test: what was injected, how often, and the outcomes."""
     table = []
     for row in results_part("soak/rows"):
-        happened = [f"{count:,}: {words}" for words, count in row["happened"].items()]
+        outcomes = [f"{count:,}: {outcome}" for outcome, count in row["happened"].items()]
         facts = [f"{name}: {value}" for name, value in row["facts"].items()]
         table.append(
             {
                 "what was injected": row["about"],
                 "how often": f"{row['injected']:,}",
-                "what happened": "; ".join([*happened, *facts]),
+                "what happened": "; ".join([*outcomes, *facts]),
             }
         )
     return pd.DataFrame(table)
 
 
 def soak_origin() -> str:
-    """Return the SUMO version, commits and date of the rows of the soak."""
-    made = results_part("soak/manifest")
+    """Return SUMO version, commits and date of the results of the soak test."""
+    manifest = results_part("soak/manifest")
     commits = dict.fromkeys(row["commit"] for row in results_part("soak/rows"))
-    return f"SUMO {made['packages']['libsumo']}, commit {', '.join(commits)}, {made['started'][:10]}"
+    return f"SUMO {manifest['packages']['libsumo']}, commit {', '.join(commits)}, {manifest['started'][:10]}"
 
 
 @dataclass(frozen=True)
@@ -324,7 +325,7 @@ class Picture:
 
 
 def show(table: pd.DataFrame, index: bool = False, digits: int = 3) -> str:
-    """Return a table in Markdown; lines break after commas of parameters, but not in commands and intervals."""
+    """Return a table in Markdown, with breaks after commas of parameters, but not in commands and intervals."""
     texts = table.map(lambda cell: _cell_text(cell, digits))
     if index:
         texts.insert(0, "", [_cell_text(name, digits) for name in table.index], allow_duplicates=True)
@@ -336,11 +337,12 @@ def _cell_text(cell: Any, digits: int) -> str:
     text = text.replace("\n", " ").replace("|", r"\|")
     if not text.startswith("`"):
         text = re.sub(r",(?=\w+=)", ", ", text)
-    return re.sub(r"\[[^\[\]]*\]", lambda found: use_no_break_spaces(found[0]), text)
+    return re.sub(r"\[[^\[\]]*\]", lambda match: use_no_break_spaces(match[0]), text)
 
 
 def markdown_table(texts: pd.DataFrame) -> str:
     """Return a table of texts in Markdown, with columns of numbers aligned to the right."""
-    rules = ["--:" if NUMBERS.fullmatch("".join(texts.iloc[:, n])) else "---" for n in range(texts.shape[1])]
+    columns = (texts.iloc[:, index] for index in range(texts.shape[1]))
+    rules = ["--:" if NUMBERS.fullmatch("".join(column)) else "---" for column in columns]
     lines = [texts.columns, rules, *texts.itertuples(index=False, name=None)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

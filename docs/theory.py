@@ -31,7 +31,7 @@ def untrained_table() -> pd.DataFrame:
 
 
 def convergence_table() -> pd.DataFrame:
-    """Return when trainings come within 5 % of the best known return, and how many are there at the end (A2)."""
+    """Return when trainings come within 5 % of the best known return, and how many are within it at the end (A2)."""
     table = []
     for row in theory_results()["convergence"]:
         arrivals = ["never" if steps is None else f"{steps:,}" for steps in row["convergence_steps"]]
@@ -48,19 +48,19 @@ def convergence_table() -> pd.DataFrame:
 
 
 def model_error_table() -> pd.DataFrame:
-    """Return the model error and what depends on it in the first and the last tenth of the trainings (A3)."""
+    """Return model error, rollout length, gap of returns and bound in the first and last tenth of trainings (A3)."""
     table = []
     for variant, runs in theory_results()["model"].items():
         cells: dict[str, Any] = {"": VARIANTS[variant].label}
-        first = [row for run in runs for row in run[: max(1, len(run) // 10)]]
-        last = [row for run in runs for row in run[-max(1, len(run) // 10) :]]
+        first_rows = [row for run in runs for row in run[: max(1, len(run) // 10)]]
+        last_rows = [row for run in runs for row in run[-max(1, len(run) // 10) :]]
         for name, heading, digits in (
             ("eps_m", "eps_m", 3),
             ("k_star", "k*", 0),
             ("gap", "gap of returns", 2),
             ("bound", "bound on it", 0),
         ):
-            ends = [_mean(rows, name) for rows in (first, last)]
+            ends = [_known_mean(rows, name) for rows in (first_rows, last_rows)]
             cells[f"{heading}, first and last tenth"] = " → ".join(
                 "–" if np.isnan(end) else f"{end:,.{digits}f}" for end in ends
             )
@@ -68,6 +68,6 @@ def model_error_table() -> pd.DataFrame:
     return pd.DataFrame(table)
 
 
-def _mean(rows: list[dict[str, Any]], name: str) -> float:
+def _known_mean(rows: list[dict[str, Any]], name: str) -> float:
     values = [row[name] for row in rows if row[name] is not None]
     return float(np.mean(values)) if values else float("nan")

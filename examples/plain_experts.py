@@ -1,6 +1,6 @@
-"""The experts of unjam in plain Python: the wanted acceleration, for parameters p, state s and memory m.
+"""The experts of unjam in plain Python: the commanded acceleration for parameters p, state s and memory m.
 
-A controller needs the one that its residual is added to.
+A controller needs only the expert to which its residual is added.
 """
 
 import math
@@ -36,7 +36,7 @@ def clip(value: float, low: float, high: float) -> float:
 
 
 def mean(p: Any, m: Any, speed: float) -> float:
-    """The mean of what was seen so far, over a sliding window."""
+    """Return the mean speed over a sliding window, or over all steps so far."""
     if not hasattr(m, "window"):
         m.window, m.total, m.seen = deque([0.0] * max(1, round(p.window / p.time_step))), 0.0, 0
     m.total, m.seen = m.total + speed - m.window.popleft(), m.seen + 1
@@ -65,7 +65,7 @@ def pi_from_gap(p: Any, s: State, m: Any) -> float:
 
 
 def toward(wanted: float, average: float, p: Any, s: State, m: Any) -> float:
-    """PI with saturation for the mean that it follows, next to the mean that the policy observes."""
+    """Return the acceleration of PI with saturation toward a wanted speed; the policy observes the average speed."""
     command = getattr(m, "command", s.speed if p.first_command == "own-speed" else 0.0)
     room = (s.leader_gap - p.gap_lower) / (p.gap_upper - p.gap_lower)
     target = wanted + p.catch_up_speed * clip(room, 0.0, 1.0)
@@ -111,7 +111,7 @@ def ovm(p: Any, s: State, m: Any) -> float:
     return p.gap_gain * (optimal - s.speed) + p.speed_gain * (s.leader_speed - s.speed)
 
 
-# What `use_tuned` stands for, by the length of the lap [m]: harmonics, gain, wanted gap.
+# Parameters of `use_tuned` by length of the lap [m]: harmonics, gap gain, target gap.
 TUNED = {
     422.2: ((6.729, -2.092, 1.602, -0.929, 0.851, -0.096, 0.105), 0.051, 0.483),
     449.0: ((7.449, -2.059, 1.966, -0.94, 0.791, -0.028, 0.01), 0.047, 0.509),
@@ -207,7 +207,7 @@ def constant(p: Any, s: State, m: Any) -> float:
 
 
 def nearness(way: float) -> tuple[float, ...]:
-    """How near 0, 250, 500, 1,000 and 2,000 m before a ramp joins are: piecewise linear, in all one."""
+    """Return piecewise linear weights of 0, 250, 500, 1,000 and 2,000 m before a ramp joins; their sum is one."""
     places, found = (0.0, 250.0, 500.0, 1000.0, 2000.0), [1.0]
     for low, high in pairwise(places):
         share = clip((way - low) / (high - low), 0.0, 1.0)
@@ -216,7 +216,7 @@ def nearness(way: float) -> tuple[float, ...]:
 
 
 def remember(m: SimpleNamespace, s: State, time_step: float) -> tuple[float, ...]:
-    """Own speed, its spread and the gap over 10, 40 and 160 s, as networks that remember see them."""
+    """Return the mean and spread of the speed, and the mean gap, over 10, 40 and 160 s, for networks with history."""
     m.watched, m.means = getattr(m, "watched", 0) + 1, getattr(m, "means", [[0.0] * 3 for _ in range(3)])
     found: tuple[float, ...] = ()
     for span, means in zip((10.0, 40.0, 160.0), m.means, strict=True):

@@ -9,7 +9,7 @@ import gymnasium
 import torch
 from torch import nn
 
-import unjam  # tells Gymnasium of the roads
+import unjam  # registers the environments
 
 EPISODES = int(sys.argv[1]) if len(sys.argv) > 1 else 50
 GAMMA = 0.99
@@ -26,18 +26,18 @@ for episode in range(EPISODES):
     observation, _ = environment.reset(seed=episode)
     observations, actions, rewards, done = [], [], [], False
     while not done:
-        seen = torch.as_tensor(observation)
+        inputs = torch.as_tensor(observation)
         with torch.no_grad():
-            action = policy(seen) + 0.2 * torch.randn(1)
+            action = policy(inputs) + 0.2 * torch.randn(1)
         observation, reward, terminated, truncated, _ = environment.step(action.numpy())
-        observations.append(seen)
+        observations.append(inputs)
         actions.append(action)
         rewards.append(float(reward))
         done = terminated or truncated
-    later, returns = 0.0, []
-    for earned in reversed(rewards):
-        later = earned + GAMMA * later
-        returns.append(later)
+    value_after, returns = 0.0, []
+    for reward in reversed(rewards):
+        value_after = reward + GAMMA * value_after
+        returns.append(value_after)
     target = torch.tensor(returns[::-1])
     rows = torch.stack(observations)
     advantage = target - value(rows).squeeze(1)

@@ -1,4 +1,4 @@
-"""The safety filter of a .unjam controller in plain Python: see docs/safety.md for what it proves."""
+"""The safety filter of a .unjam controller in plain Python; docs/safety.md has the proofs."""
 
 import math
 from types import SimpleNamespace
@@ -8,7 +8,7 @@ from plain_experts import State
 
 
 class Actuator:
-    """Delay and lag with which a vehicle carries out commands; a recipe without them means a car without."""
+    """Delay and lag with which a vehicle carries out commands; without entries in the recipe there are none."""
 
     def __init__(self, recipe: dict[str, Any], step: float) -> None:
         lag = recipe.get("lag", 0.0)
@@ -16,18 +16,18 @@ class Actuator:
         self.acceleration, self.pending = 0.0, [0.0] * round(recipe.get("delay", 0.0) / step)
 
     def apply(self, command: float, speed: float) -> None:
-        """Give a command: the first one pending becomes effective in this step."""
+        """Add a command; the oldest pending command becomes effective in this step."""
         arriving, *self.pending = *self.pending, command
         acceleration = self.acceleration * self.decay + arriving * (1.0 - self.decay)
         self.acceleration = max(acceleration, -speed / self.step)
 
     def equivalent_speed(self, speed: float, acceleration: float, braking: float) -> float:
-        """The speed of a car without lag that drives at least as far."""
+        """Return the speed of a car without lag that drives at least as far."""
         return speed + self.step * self.decay / (1.0 - self.decay) * (acceleration + braking)
 
 
 def highest(f: SimpleNamespace, s: State, step: float, actuator: Actuator) -> float:
-    """The highest acceleration after which it can still stop, and keep its time gap [m/s2]."""
+    """Return the highest acceleration after which the CAV can still stop and keep its time gap [m/s2]."""
     if not f.active:
         return math.inf
     leader, room = max(s.leader_speed - f.speed_error, 0.0), s.leader_gap - f.gap_error - f.standstill_gap
@@ -41,7 +41,7 @@ def highest(f: SimpleNamespace, s: State, step: float, actuator: Actuator) -> fl
 
 
 def time_gap_bound(f: SimpleNamespace, v: float, leader: float, room: float, step: float, actuator: Actuator) -> float:
-    """The highest command that keeps the time gap while both brake with `time_gap_braking` after it [m/s2]."""
+    """Return the highest command with which the time gap is kept if both then brake with `time_gap_braking` [m/s2]."""
     c, change, decay, a = f.time_gap_braking, f.time_gap_braking * step, actuator.decay, actuator.acceleration
     if not decay and not actuator.pending:
         later, end = max(leader - change, 0.0), room + stopping(leader, c, step)
@@ -65,13 +65,13 @@ def time_gap_bound(f: SimpleNamespace, v: float, leader: float, room: float, ste
 
 
 def stopping(speed: float, braking: float, step: float) -> float:
-    """How far a car drives that brakes from the next step on [m]."""
+    """Return the stopping distance of a car that brakes from the next step on [m]."""
     steps = math.floor(speed / (braking * step))
     return step * steps * (speed - braking * step * (steps + 1) / 2)
 
 
 def speed_to_stop_within(distance: float, braking: float, step: float) -> float:
-    """The highest speed after this step from which it still stands within a distance [m/s]."""
+    """Return the highest speed after this step from which a car can stop within a distance [m/s]."""
     room, change = max(distance, 0.0) / step, braking * step
     steps = math.floor((math.sqrt(1.0 + 8.0 * room / change) - 1.0) / 2.0)
     return (room + change * steps * (steps + 1) / 2.0) / (steps + 1.0)

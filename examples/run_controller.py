@@ -1,4 +1,4 @@
-"""Runs a .unjam controller with Python and NumPy alone; copy it with plain_experts.py and plain_safety.py.
+"""Run a .unjam controller with Python and NumPy only; copy this file with plain_experts.py and plain_safety.py.
 
     controller = Controller("ring.unjam")
     while driving:  # once every controller.time_step seconds, for one vehicle
@@ -60,7 +60,7 @@ class Driver:
         return clip(expert + self.held, -limit, limit)
 
     def network(self, s: State, expert: float) -> float:
-        """Return what the network answers, before its bound."""
+        """Return the output of the network before it is bounded."""
         ahead, behind = s.leader_speed - s.speed, s.follower_speed - s.speed
         parts = {
             "local": (s.speed / 10.0, ahead / 5.0, s.leader_gap / 20.0, behind / 5.0, s.follower_gap / 20.0),

@@ -1,4 +1,4 @@
-"""PPO with one policy for all CAVs of the merge, which come and go, in eight slots that stay.
+"""PPO with one policy for all CAVs of the merge, which enter and leave, in eight constant slots.
 
 Run: python examples/shared_policy.py [updates] [horizon]. Policy and updates are those of ppo_single_file.py.
 """
@@ -29,7 +29,7 @@ for update in range(UPDATES):
         observation = column(observations)
         is_occupied = column({slot: info["is_occupied"] for slot, info in infos.items()})
         action = (chosen := policy(observation)).sample()
-        actions = dict(zip(merge.agents, action.numpy(), strict=True))  # those of empty slots are ignored
+        actions = dict(zip(merge.agents, action.numpy(), strict=True))  # actions of empty slots are ignored
         observations, rewards, terminations, truncations, infos = merge.step(actions)
         # The trip of a CAV that leaves ends; its slot has its last observation, and is empty in the next step.
         has_left = column({slot: info["has_left"] for slot, info in infos.items()})

@@ -1,13 +1,13 @@
-"""Drives a vehicle of a running SUMO by a .unjam controller, over TraCI; needs traci and run_controller.py.
+"""Drive a vehicle of a running SUMO by a .unjam controller over TraCI; needs traci and run_controller.py.
 
     sumo -c my.sumocfg --step-length 0.1 --remote-port 8813 &
     python examples/traci_client.py ring.unjam 8813 VEHICLE
 
-A controller decides at times of its own, so SUMO's step must divide them: with its step of 1 s a controller
-of 0.1 s would drive on for ten times as long as its filter allows for. The vehicle's type should have the
-car-following model Krauss: SUMO then carries out each command exactly until it is unsafe. The vehicle is told
-of its leader and its follower alone: a controller that looks at more, such as its place on a loop or speeds
-ahead, is refused. Whoever can reach that port can steer SUMO: do not open it to a network.
+The control step of the controller must be a multiple of the step of SUMO: with steps of 1 s, each command of a
+controller with a control step of 0.1 s would last ten times as long as its filter assumes. The type of the vehicle
+should have the car-following model Krauss: SUMO then carries out each command exactly unless it is unsafe. The
+controller observes the leader and the follower only; controllers that need more, such as the position on a loop or
+speeds ahead, are refused. All programs that reach the port can control SUMO: do not open it to a network.
 """
 
 import sys
@@ -18,9 +18,9 @@ import traci
 from run_controller import Controller, State
 
 LARGEST_GAP = 100.0
-"""[m]; where no vehicle is near"""
+"""gap where no vehicle is near [m]"""
 OBEDIENT = {"Accel": 20.0, "Decel": 20.0, "EmergencyDecel": 20.0, "ApparentDecel": 20.0, "MinGap": 0.5}
-"""limits of SUMO's own that are wider than any command; only its check for a safe speed stays"""
+"""limits of SUMO that are wider than any command; only its check for a safe speed remains"""
 LOOK_FARTHER = (
     "pacer jam-absorber cruise jam-ahead adaptive-acc loop_length route_position lap_position merge_proximity"
 )
@@ -29,7 +29,7 @@ LOOK_FARTHER += " distance_to_merge allowed_speed lane_speeds road_speeds adjace
 
 
 def observe(vehicles: Any, name: str) -> State:
-    """What the vehicle observes now. The minimum gap of the follower is added to gaps of SUMO."""
+    """Return what the vehicle observes; gaps of SUMO do not contain the minimum gap of the following vehicle."""
     speed, seen = vehicles.getSpeed(name), []
     leader, gap = vehicles.getLeader(name, LARGEST_GAP) or ("", 0.0)
     follower, gap_behind = vehicles.getFollower(name, LARGEST_GAP)
@@ -41,7 +41,7 @@ def observe(vehicles: Any, name: str) -> State:
 
 
 def words(recipe: Any) -> Iterator[str]:
-    """All words of a driver's recipe, the names of its experts and features among them."""
+    """Yield all texts of the recipe of a driver, including the names of its experts and features."""
     if isinstance(recipe, str):
         yield recipe
     elif isinstance(recipe, dict | list):

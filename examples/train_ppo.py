@@ -1,7 +1,7 @@
 """Train Stable-Baselines3's own PPO on the ring, as a residual on PI with saturation, and compare it with PI alone.
 
-Run: python examples/train_ppo.py [steps]. It shows how to connect them, and no good policy: with these settings it gets
-worse with more steps, one training of 300,000 had a return of 850 where PI alone has 1,980. docs/rl.md says why.
+Run: python examples/train_ppo.py [steps]. It shows how to connect both, and does not train a good policy: with these
+settings a training of 300,000 steps had a return of 850, where PI alone has 1,980. docs/rl.md explains why.
 """
 
 import sys
@@ -11,7 +11,7 @@ import numpy as np
 from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
-import unjam  # tells Gymnasium of the roads
+import unjam  # registers the environments
 
 STEPS = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
 

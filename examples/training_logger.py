@@ -1,4 +1,4 @@
-"""Log a training with a logger of your own, here into a database, and end it when its time is over.
+"""Log a training with a logger of your own, here into a database, and end the training after a time limit.
 
 Run: python examples/training_logger.py [steps] [folder]
 """
@@ -13,7 +13,7 @@ from unjam.parameters import flatten_keys
 
 
 class DatabaseLogger:
-    """Writes all numbers of a row of progress into a database that several runs share."""
+    """Writes all numbers of the progress into a database that several runs share."""
 
     def __init__(self, path: str, run: str, max_seconds: float) -> None:
         self.database, self.run, self.end = sqlite3.connect(path), run, time.monotonic() + max_seconds

@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Settings, fixtures and helpers of all tests."""
 
 import itertools
 import os
@@ -20,30 +20,29 @@ from unjam.files import sha256_of
 from unjam.worlds.sumo.backend import SumoBackend
 from unjam.worlds.sumo.simulation import Simulation
 
-if "UNJAM_STATE" not in os.environ:  # which code the tests ran is not what the user ran
+if "UNJAM_STATE" not in os.environ:  # code that tests trust is not trusted for the user
     os.environ["UNJAM_STATE"] = STATE = tempfile.mkdtemp(prefix="state-of-tests-")
 else:
     STATE = ""
 
-# What a shell starts in the background ignores interrupts, and so would all that a test starts to interrupt
+# Programs that a shell starts in the background ignore interrupts, and so would processes that tests interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# No timed tests, and the same each time. `make test-all` takes the thorough one.
+# Tests of hypothesis have no deadline and the same examples each time; `make test-all` uses the profile `thorough`.
 settings.register_profile("unjam", deadline=None, derandomize=True, max_examples=10)
 settings.register_profile("thorough", deadline=None, derandomize=True, max_examples=200)
 settings.load_profile("unjam")
 
 
 LONGEST_FOLDERS = ("system", "training", "paper", "reports", "worlds")
-
-
+"""folders whose tests take longest"""
 LONG_TESTS = {*(Path(__file__).parent / "long_tests.txt").read_text().splitlines()}
-"""tests that took more than 1.2 s on two cores, by `pytest --durations=0`, without those of trust and of drift"""
+"""tests that took more than 1.2 s on two cores, by `pytest --durations=0`, except tests of trust and of drift"""
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are selected by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark long tests, and put the folders that take longest first, so that both processes end at about one time."""
+    """Mark long tests, and run the slowest folders first, so that both processes end at about the same time."""
     for item in items:
         if item.nodeid in LONG_TESTS:
             item.add_marker("long")
@@ -59,26 +58,26 @@ def pytest_unconfigure() -> None:
 
 @pytest.fixture
 def simulation() -> Iterator[Simulation]:
-    with Simulation() as opened:
-        yield opened
+    with Simulation() as running:
+        yield running
 
 
 @pytest.fixture
 def sumo() -> Iterator[SumoBackend]:
-    with SumoBackend() as opened:
-        yield opened
+    with SumoBackend() as backend:
+        yield backend
 
 
 @pytest.fixture
 def without_pictures() -> Iterator[None]:
-    """For a test in which reports need no pictures."""
+    """Leave the pictures of reports empty."""
     with empty_pictures():
         yield
 
 
 @pytest.fixture
 def my_drivers(tmp_path: Path) -> Path:
-    """A user's file with drivers and rewards, good and bad."""
+    """Return a file of a user with valid and invalid drivers and rewards."""
     path = tmp_path / "mine.py"
     path.write_text(
         """
@@ -125,13 +124,13 @@ not_callable = 3
 
 
 def state_of(speed: object, leader_speed: object, gap: object) -> LocalState:
-    """A local state in which only the leader matters."""
-    own, leader, distance = (np.asarray(values, float) for values in (speed, leader_speed, gap))
-    return LocalState(own, leader, distance, own, distance, own * 0.0, own * 0.0 + 230.0)
+    """Return a local state in which only the leader matters."""
+    speeds, leader_speeds, gaps = (np.asarray(values, float) for values in (speed, leader_speed, gap))
+    return LocalState(speeds, leader_speeds, gaps, speeds, gaps, speeds * 0.0, speeds * 0.0 + 230.0)
 
 
 def random_network(inputs: int = 5, seed: int = 0, size: int = 16, scale: float = 0.3, outputs: int = 1) -> Network:
-    """A network with random weights; with two outputs it sizes its own noise."""
+    """Return a network with random weights; with two outputs, the second one is the size of its exploration noise."""
     generator = np.random.default_rng(seed)
     sizes = [inputs, size, size, outputs]
     layers = tuple(
@@ -141,9 +140,9 @@ def random_network(inputs: int = 5, seed: int = 0, size: int = 16, scale: float 
     return Network(layers, authority=1.0, exploration_std=0.2)
 
 
-def strangers_driver(code: Path, first: str) -> FileDriver:
-    """The driver `gentle` of a file that does something `first`, as a stranger has it: none of it has run."""
+def unrun_driver(code: Path, prefix: str) -> FileDriver:
+    """Return the driver `gentle` of a file, of which no code has run, after adding code at the begin of the file."""
     driver = FileDriver(code, "gentle")
-    code.write_text(first + code.read_text())
+    code.write_text(prefix + code.read_text())
     object.__setattr__(driver, "sha256", sha256_of(code.read_bytes()))
     return driver

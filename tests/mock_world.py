@@ -1,4 +1,4 @@
-"""A world without a simulator: vehicles behind leaders of constant speed, for tests of drivers."""
+"""A world without a simulator, for tests of drivers: vehicles behind leaders of constant speed."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from unjam.worlds.world import DriverLog, ProgressCallback
 
 
 class MockWorld:
-    """`rows` CAVs, each behind a leader at 4 m/s; with `turnover`, the first one leaves now and then."""
+    """CAVs behind leaders at 4 m/s; after each `turnover` control steps the first CAV leaves and another one enters."""
 
     def __init__(self, rows: int = 3, decisions: int = 40, single: bool = False, turnover: int = 0) -> None:
         self.cav_count, self.entered_count, self.is_scalar, self.limits = rows, rows, single, Limits(-1.0, 1.0)
@@ -38,16 +38,16 @@ class MockWorld:
         self._speed = np.maximum(self._speed + 0.1 * self.applied[-1], 0.0)
         self._gap = self._gap + 0.1 * (4.0 - self._speed)
         self.remaining_rows = None
-        if self._turnover and len(self.applied) % self._turnover == 0:  # the first leaves, another one enters
+        if self._turnover and len(self.applied) % self._turnover == 0:
             self.remaining_rows, self.entered_count = list(range(1, self.cav_count)), self.entered_count + 1
-            self._speed, self._gap = (np.append(each[1:], 9.0) for each in (self._speed, self._gap))
+            self._speed, self._gap = (np.append(values[1:], 9.0) for values in (self._speed, self._gap))
 
     def noise(self, episode_noise_size: int = 0) -> Any:
         if episode_noise_size:
-            same = np.random.default_rng(1).standard_normal(episode_noise_size)
-            return same if self.is_scalar else np.tile(same, (self.cav_count, 1))
-        drawn = self._generator.standard_normal(self.cav_count)
-        return float(drawn[0]) if self.is_scalar else drawn
+            noise = np.random.default_rng(1).standard_normal(episode_noise_size)
+            return noise if self.is_scalar else np.tile(noise, (self.cav_count, 1))
+        noise = self._generator.standard_normal(self.cav_count)
+        return float(noise[0]) if self.is_scalar else noise
 
     def record(self, driver_log: DriverLog) -> tuple[np.ndarray, DriverLog]:
         return np.array(self.applied), driver_log

@@ -50,17 +50,17 @@ def test_each_setting_in_which_presets_differ_has_a_row_in_the_table_of_differen
 def test_a_claim_is_judged_by_intervals_of_paired_differences(
     claims: Any, others: dict[str, list[float]], verdict: str, decisive: str
 ) -> None:
-    values = {name: np.array(found) for name, found in {"own": [4.0, 5.0, 6.2], **others}.items()}
-    found, numbers = claims.compare(values, "own")
-    assert found == f"{verdict} (3 trainings)"
+    values = {name: np.array(series) for name, series in {"own": [4.0, 5.0, 6.2], **others}.items()}
+    judged, numbers = claims.compare_values(values, "own")
+    assert judged == f"{verdict} (3 trainings)"
     assert f"difference{f' to {decisive}' if decisive else ''} " in numbers
-    opposite, _ = claims.compare({name: -each for name, each in values.items()}, "own", larger=False)
-    assert opposite == found
+    opposite, _ = claims.compare_values({name: -series for name, series in values.items()}, "own", larger=False)
+    assert opposite == judged
 
 
 def test_trainings_in_two_groups_are_undecided(claims: Any) -> None:
     values = {"own": np.array([9.0, 9.1, 5.0, 5.1]), "other": np.zeros(4)}
-    assert claims.compare(values, "own")[0] == "undecided (4 trainings)"
+    assert claims.compare_values(values, "own")[0] == "undecided (4 trainings)"
 
 
 def test_two_groups_of_compared_values_leave_a_verdict_open_only_if_the_differences_have_both_signs(
@@ -68,8 +68,8 @@ def test_two_groups_of_compared_values_leave_a_verdict_open_only_if_the_differen
 ) -> None:
     groups = np.array([-41.6, -32.1, -35.6, 11.7, 11.9, 8.4, 10.7, -1.6, -2.1, 1.6])
     own = np.array([8.7, 8.4, 10.4, 10.7, 7.6, 8.0, 7.9, 11.3, 7.4, 9.0])
-    assert claims.compare({"own": own, "other": groups}, "own")[0] == "undecided (10 trainings)"
-    assert claims.compare({"own": groups + own, "other": groups}, "own")[0] == "held (10 trainings)"
+    assert claims.compare_values({"own": own, "other": groups}, "own")[0] == "undecided (10 trainings)"
+    assert claims.compare_values({"own": groups + own, "other": groups}, "own")[0] == "held (10 trainings)"
 
 
 def test_a_method_that_is_hardly_better_than_its_expert_holds_by_the_expert(claims: Any) -> None:
@@ -94,13 +94,13 @@ def test_returns_that_rise_only_in_training_are_said_to_rise_by_less_exploration
 
 @pytest.mark.parametrize("has_filter", [True, False])
 def test_the_settings_to_the_letter_have_a_verdict_on_each_road(claims: Any, has_filter: bool) -> None:
-    listed = [each for found in claims.CLAIMS.values() for each in found if each.study.startswith("to-the-letter")]
-    verdicts = {(each.road, each.assess(claims.Version(has_filter))[0]) for each in listed}
+    listed = [claim for group in claims.CLAIMS.values() for claim in group if claim.study.startswith("to-the-letter")]
+    verdicts = {(claim.road, claim.assess(claims.Version(has_filter))[0]) for claim in listed}
     assert {road for road, _ in verdicts} == set(claims.PAPER_ROADS)
     assert ("figure-eight", f"held (5 trainings){claims.BY_EXPERT}") in verdicts
 
 
 def test_a_stated_multiple_of_a_time_is_judged_for_each_learner(claims: Any) -> None:
     version = claims.Version(has_filter=False)
-    found = [claims.training_time(*each)(version)[0] for each in (("trpo", 1.37), ("ppo", 0.954), ("sac", 0.954))]
-    assert found == ["not held (3 rounds)", "undecided (3 rounds)", "held (3 rounds)"]
+    verdicts = [claims.training_time(*claim)(version)[0] for claim in (("trpo", 1.37), ("ppo", 0.954), ("sac", 0.954))]
+    assert verdicts == ["not held (3 rounds)", "undecided (3 rounds)", "held (3 rounds)"]

@@ -1,4 +1,4 @@
-"""Other defaults of torch, as a program of the user can set them."""
+"""Other defaults of torch, which programs of users can set."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,7 @@
-"""Human traffic on a motorway that matches facts: a search over how humans drive, and the comparison with the facts.
+"""Calibration of human drivers on a motorway with empirical facts: a search for settings, and a comparison of the best.
 
-Each candidate, a set of settings, drives on a road with one on-ramp whose demand rises until a jam has formed. That
-with the smallest deviation from empirical targets then drives on test seeds, with two simulation steps.
+Each candidate, a set of settings, drives on a road with one on-ramp, where the demand rises until traffic breaks down.
+The candidate with the smallest deviation from the targets is then measured on test seeds with two simulation steps.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,9 +23,9 @@ from unjam_paper.results_file import read_part
 from unjam_paper.study import NO_VALUE_TEXT, Study, Table, mean_text, measure_tasks
 
 CANDIDATES, CANDIDATE_SEEDS, FINAL_SEEDS = 60, 3, 20
-"""number of candidates, of episodes of each, and of episodes with the best one and each simulation step"""
+"""numbers of candidates, of episodes of each one, and of episodes of the best one with each simulation step"""
 SIMULATION_STEPS = (0.5, 0.25)
-"""[s]"""
+"""simulation steps of the comparison [s]"""
 TRUCK_SHARE = 0.1
 CANDIDATES_PART, BEST_PART = "candidates", "best"
 CAPACITY_ROAD: dict[str, Any] = {
@@ -37,12 +37,12 @@ CAPACITY_ROAD: dict[str, Any] = {
     "peak_rise": 1800.0,
     "horizon": 2700,
 }
-"""a road whose demand rises for half an hour, from far below capacity to far above it"""
+"""a road with a demand that rises for half an hour, from far below to far above the capacity"""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A fact that simulated traffic should match: a value and an accepted range, from recordings of real motorways."""
+    """An empirical fact of motorways that simulated traffic should match: a value and an accepted range."""
 
     name: str
     value: float
@@ -50,10 +50,10 @@ class Target:
     digits: int
     source: str
     factor: float = 1.0
-    """by which facts have the unit of the value"""
+    """factor that converts a simulated fact into the unit of the value"""
 
     def deviation(self, value: float) -> float:
-        """Return the distance to the value, in half widths of the accepted range."""
+        """Return the absolute difference to the target, relative to half the width of the accepted range."""
         low, high = self.accepted
         return abs(value - self.value) / ((high - low) / 2.0)
 
@@ -109,7 +109,7 @@ TARGETS: dict[str, Target] = {
 
 
 def make_candidate(number: int) -> dict[str, Any]:
-    """Return the settings of a candidate, drawn from wide ranges; the first one is SUMO's lane changing of today."""
+    """Return the settings of a candidate, drawn from wide ranges; candidate 0 has the default lane changing of SUMO."""
     generator = np.random.default_rng((20_261_128, number))
 
     def draw(low: float, high: float) -> float:
@@ -137,14 +137,14 @@ POPULATIONS = tuple(make_candidate(number) for number in (17, 56, 49))
 
 
 def capacity_road(settings: Mapping[str, Any]) -> Motorway:
-    """Return the road with rising demand, with these settings of its human traffic."""
+    """Return the scenario with rising demand and these settings of human traffic."""
     scenario = make_scenario("on-ramp", {**CAPACITY_ROAD, "penetration_rate": 0.0, **settings})
     assert isinstance(scenario, Motorway)
     return scenario
 
 
 def measure_traffic_candidate(number: int, workers: int) -> list[dict[str, Any]]:
-    """Return the settings of a candidate with the facts of its episodes, as a list of one row."""
+    """Return the settings of a candidate and the facts of its episodes, as a list of one row."""
     settings = make_candidate(number)
     episodes = measure_scenario(capacity_road(settings), tuning_seeds(CANDIDATE_SEEDS), workers)
     return [{"settings": settings, "episodes": episodes}]
@@ -160,50 +160,52 @@ def measure_step(settings: Mapping[str, Any], step: float, workers: int) -> dict
 def measure_scenario(scenario: Motorway, seeds: Sequence[tuple[int, ...]], workers: int) -> Table:
     """Return the facts at the last ramp of a motorway with human drivers only, one row for each seed."""
 
-    def facts_row(number: int, episode: Episode, row: dict[str, Any]) -> dict[str, Any]:
+    def make_row(index: int, episode: Episode, metrics: dict[str, Any]) -> dict[str, Any]:
         facts = asdict(measure_traffic(episode, scenario, ramp_number=-1))
-        return {**facts, "delay": row["delay"], "status": row["status"]}
+        return {**facts, "delay": metrics["delay"], "status": metrics["status"]}
 
-    return measure_tasks([EpisodeTask(scenario, Human(), seed) for seed in seeds], workers, facts_row)
+    return measure_tasks([EpisodeTask(scenario, Human(), seed) for seed in seeds], workers, make_row)
 
 
 def mean_facts(rows: Table) -> dict[str, float]:
-    """Return the mean of each fact of `TARGETS`, over the episodes that show it; NaN if none does."""
-    values = {name: fact_values(rows, name) for name in TARGETS}
-    return {name: float(np.mean(each)) if each else nan for name, each in values.items()}
+    """Return the mean of each fact of `TARGETS` over the episodes that have it; NaN if no episode has it."""
+    values_by_fact = {name: fact_values(rows, name) for name in TARGETS}
+    return {name: float(np.mean(values)) if values else nan for name, values in values_by_fact.items()}
 
 
 def fact_values(rows: Table, target: str) -> list[float]:
-    """Return the values of a fact in its unit, without those of episodes that do not show it."""
-    names = [each.name for each in fields(TrafficFacts)]
-    facts = (TrafficFacts(**{name: nan if row[name] is None else row[name] for name in names}) for row in rows)
-    return [value for each in facts if isfinite(value := TARGETS[target].factor * getattr(each, target))]
+    """Return the values of a fact in the unit of its target, from the episodes that have it."""
+    names = [field.name for field in fields(TrafficFacts)]
+    episodes = (TrafficFacts(**{name: nan if row[name] is None else row[name] for name in names}) for row in rows)
+    return [value for facts in episodes if isfinite(value := TARGETS[target].factor * getattr(facts, target))]
 
 
 def total_deviation(rows: Table) -> float:
-    """Return the root mean square deviation from the targets; infinite if a fact was never observed."""
+    """Return the root mean square deviation from the targets; infinity if no episode has one of the facts."""
     deviations = [TARGETS[name].deviation(value) for name, value in mean_facts(rows).items()]
     return float(np.sqrt(np.mean(np.square(deviations)))) if np.isfinite(deviations).all() else inf
 
 
 def facts_table(folder: Path) -> pd.DataFrame:
-    """Return each fact of the chosen human traffic, its target and the source of the target."""
-    steps = {step: read_part(folder, BEST_PART)[f"{step:g} s"]["episodes"] for step in SIMULATION_STEPS}
+    """Return each fact of the best candidate, its target and the source of the target."""
+    rows_by_step = {step: read_part(folder, BEST_PART)[f"{step:g} s"]["episodes"] for step in SIMULATION_STEPS}
     table: Table = []
     for name, target in TARGETS.items():
         row: dict[str, Any] = {"fact": target.name, "target": "{:g} to {:g}".format(*target.accepted)}
-        for step, rows in steps.items():
+        for step, rows in rows_by_step.items():
             row[f"step of {step:g} s"] = mean_text(fact_values(rows, name), target.digits)
         table.append({**row, "source": target.source})
-    cells = {f"step of {step:g} s": mean_text([each["delay"] for each in rows], 0) for step, rows in steps.items()}
-    same = "within 10 % of each other"
-    table.append({"fact": "mean delay with that at the entrance [s]", "target": same, **cells, "source": NO_VALUE_TEXT})
+    row = {"fact": "mean delay with that at the entrance [s]", "target": "within 10 % of each other"}
+    for step, rows in rows_by_step.items():
+        row[f"step of {step:g} s"] = mean_text([episode["delay"] for episode in rows], 0)
+    table.append({**row, "source": NO_VALUE_TEXT})
     return pd.DataFrame(table)
 
 
 def traffic_candidates_table(folder: Path) -> pd.DataFrame:
-    """Return the settings of all candidates and their facts, the smallest deviation first."""
-    candidates = sorted(read_part(folder, CANDIDATES_PART), key=lambda each: total_deviation(each["episodes"]))
+    """Return the settings and facts of all candidates, ordered by their deviation."""
+    candidates = read_part(folder, CANDIDATES_PART)
+    candidates.sort(key=lambda candidate: total_deviation(candidate["episodes"]))
     return pd.DataFrame(map(_candidate_row, candidates))
 
 
@@ -213,7 +215,7 @@ def _candidate_row(candidate: Mapping[str, Any]) -> dict[str, Any]:
         TARGETS[name].name: f"{value:.{TARGETS[name].digits}f}" if isfinite(value) else NO_VALUE_TEXT
         for name, value in mean_facts(candidate["episodes"]).items()
     }
-    changing = {
+    lane_changing = {
         name: "{:g} to {:g}".format(*value) if isinstance(value, Sequence) else f"{value:g}"
         for name, value in settings["lane_changing"].items()
     }
@@ -221,7 +223,7 @@ def _candidate_row(candidate: Mapping[str, Any]) -> dict[str, Any]:
         "deviation": f"{deviation:.2f}" if isfinite(deviation) else NO_VALUE_TEXT,
         "time headways [s]": "{:g} to {:g}".format(*settings["time_headways"]),
         "accelerations [m/s²]": "{:g} to {:g}".format(*settings["accelerations"]),
-        **{name.replace("_", " "): changing.get(name, NO_VALUE_TEXT) for name in CHANGING_COLUMNS},
+        **{name.replace("_", " "): lane_changing.get(name, NO_VALUE_TEXT) for name in CHANGING_COLUMNS},
         **facts,
     }
 
@@ -229,12 +231,12 @@ def _candidate_row(candidate: Mapping[str, Any]) -> dict[str, Any]:
 def effects_table(folder: Path) -> pd.DataFrame:
     """Return the change of each fact per standard deviation of each setting, by regression without candidate 0."""
     candidates = read_part(folder, CANDIDATES_PART)[1:]
-    columns = {name: np.array([setting(each["settings"]) for each in candidates]) for name, setting in FACTORS.items()}
-    standardized = np.array([(values - values.mean()) / values.std() for values in columns.values()])
-    facts = [mean_facts(each["episodes"]) for each in candidates]
+    columns = [np.array([read_factor(row["settings"]) for row in candidates]) for read_factor in FACTORS.values()]
+    standardized = np.array([(values - values.mean()) / values.std() for values in columns])
+    facts = [mean_facts(candidate["episodes"]) for candidate in candidates]
     table: Table = []
     for name, target in TARGETS.items():
-        values = np.array([each[name] for each in facts])
+        values = np.array([means[name] for means in facts])
         is_known = np.isfinite(values)
         design = np.vstack([np.ones(is_known.sum()), standardized[:, is_known]]).T
         coefficients = np.linalg.lstsq(design, values[is_known], rcond=None)[0]
@@ -253,7 +255,7 @@ FACTORS: dict[str, Callable[[Mapping[str, Any]], float]] = {
     "speed cooperation": lambda settings: settings["lane_changing"]["speed_cooperation"][0],
     "uncooperative share": lambda settings: settings["lane_changing"]["uncooperative_share"],
 }
-"""what differs among the candidates"""
+"""functions that return a varied setting of a candidate, by name in the table"""
 CHANGING_COLUMNS = ("assertiveness", "speed_cooperation", "uncooperative_share")
 HUMAN_TRAFFIC_STUDY = Study(
     title="human traffic on a motorway compared with empirical facts",

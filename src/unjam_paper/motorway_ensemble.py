@@ -1,7 +1,7 @@
-"""An ensemble of motorways: populations, ways to change lanes, trucks, roads and demands, half of them for tuning.
+"""An ensemble of 24 motorways with different roads, demands and human traffic, one half for tuning, one for tests.
 
-The settings are a balanced random design, drawn before anything is tuned on them. The demand of a setting is relative
-to the flow that this very traffic reaches before it breaks down.
+The settings are a balanced random design that was drawn before any tuning. The demand of a setting is relative to its
+capacity, the flow that the same traffic reaches before it breaks down.
 """
 
 from collections.abc import Sequence
@@ -25,18 +25,18 @@ from unjam_paper.study import Study, Table, mean_text
 
 SETTINGS_PER_HALF, DESIGN_SEED = 12, 20261128
 CAPACITY_SEEDS = 5
-"""number of episodes in which the capacity of a setting is measured"""
+"""number of episodes from which the capacity of a setting is measured"""
 RAMP_SHARE, OFF_PEAK_SHARE = 0.15, 0.6
-"""share of the ramps in the demand; demand before and after the peak, as a share of capacity"""
+"""share of all ramps in the demand; demand before and after the peak, relative to the capacity"""
 ROADS: dict[str, dict[str, Any]] = {
     "two lanes": {"ramps": [{"position": 3000.0}]},
     "three lanes": {"lanes": 3, "ramps": [{"position": 3000.0}]},
     "two ramps": {"length": 5500.0, "ramps": [{"position": 3000.0}, {"position": 4500.0}]},
     "lane drop": {"ramps": [{**{"position": 2500.0, "merging_length": 500.0, "length": 2000.0}, "speed_limit": 27.78}]},
 }
-"""a lane that closes is a long ramp at the speed of the motorway: vehicles leave it in its last 500 m"""
+"""a closing lane is a long ramp with the speed limit of the motorway, which vehicles leave in its last 500 m"""
 CAPACITY_GUESS, MAX_DEMAND, FREE_DEMAND = 1900.0, 1.3, 0.2
-"""flow of a lane [veh/h], and demands relative to it: the highest to measure capacity, and one that hardly hinders"""
+"""flow of a lane [veh/h]; demands relative to it: the highest in measurements of capacity, and one without delays"""
 RISING_DEMAND = {"peak": (1800.0, 2400.0), "peak_rise": 1800.0, "horizon": 2400, "penetration_rate": 0.0}
 LEVELS: dict[str, Sequence[Any]] = {
     "road": (*("two lanes",) * 5, *("three lanes",) * 3, *("two ramps",) * 2, *("lane drop",) * 2),
@@ -48,7 +48,7 @@ LEVELS: dict[str, Sequence[Any]] = {
     "merging_length": (*(300.0,) * 6, *(200.0,) * 3, *(400.0,) * 3),
     "demand": (*(0.9,) * 2, *(1.02,) * 3, *(1.05,) * 3, *(1.08,) * 2, *(1.15,) * 2),
 }
-"""the levels of each factor in the settings of one half"""
+"""levels of each factor in the settings of one half of the ensemble"""
 
 
 @dataclass(frozen=True)
@@ -66,31 +66,31 @@ class EnsembleSetting:
     ordinary_acc: float
     """share of cars with an ordinary ACC"""
     merging_length: float
-    """of acceleration lanes; a lane drop has its own [m]"""
+    """length of acceleration lanes [m]; lane drops have their own"""
     demand: float
-    """demand in the peak, relative to the flow before a breakdown"""
+    """demand in the peak, relative to the capacity"""
 
     @property
     def is_test(self) -> bool:
-        """Whether nothing is tuned on it."""
+        """Whether the setting is for tests, and not for tuning."""
         return self.number >= SETTINGS_PER_HALF
 
     @property
     def capacity(self) -> float:
-        """The highest flow before a breakdown, of all lanes, as the study measured it [veh/h]."""
+        """The measured flow of all lanes before a breakdown [veh/h]."""
         return CAPACITIES[self.number] * self.traffic["lanes"]
 
     @property
     def free_flow_time(self) -> float:
-        """The mean travel time at little demand, as the study measured it [s]."""
+        """The measured mean travel time with little demand [s]."""
         return SETTING_FREE_FLOW_TIMES[self.number]
 
     @cached_property
     def traffic(self) -> dict[str, Any]:
-        """Road and human traffic as settings of a scenario, without a demand."""
+        """Road and human traffic as settings of a scenario, without the demand."""
         population, road = POPULATIONS[self.population], ROADS[self.road]
-        accelerations = tuple(round(each + self.acceleration, 2) for each in population["accelerations"])
-        # A queue may reach the entrance of a ramp.
+        accelerations = tuple(round(limit + self.acceleration, 2) for limit in population["accelerations"])
+        # Ramp vehicles enter with the speed of the last one, because a queue may reach the entrance.
         common = {"merging_length": self.merging_length, "entry_speed": "last"}
         ramps = [{**common, **ramp} for ramp in road["ramps"]]
         changes = {
@@ -103,7 +103,7 @@ class EnsembleSetting:
 
     @property
     def unavoidable_delay(self) -> float:
-        """Mean delay of a vehicle if the bottleneck always discharged at its capacity: a queue without length [s]."""
+        """Mean delay if the bottleneck always discharged at its capacity, with a queue that has no length [s]."""
         scenario = self.scenario(self.capacity, self.demand)
         seconds = np.arange(scenario.horizon * scenario.control_step)
         is_peak = (seconds >= scenario.peak[0]) & (seconds < scenario.peak[1])
@@ -113,23 +113,23 @@ class EnsembleSetting:
         return float(queue.sum() / arrivals.sum())
 
     def scenario(self, capacity: float, demand: float, **changes: Any) -> Motorway:
-        """Return the scenario with a demand in the peak relative to `capacity`, that of the carriageway [veh/h]."""
+        """Return the scenario with a demand in the peak relative to the `capacity` of all lanes [veh/h]."""
         ramps, lanes = self.traffic["ramps"], self.traffic["lanes"]
-        # The closing lane carries what each other lane does.
-        share = 1.0 / (lanes + 1) if self.road == "lane drop" else RAMP_SHARE / len(ramps)
+        # The closing lane has the same flow as each other lane.
+        ramp_share = 1.0 / (lanes + 1) if self.road == "lane drop" else RAMP_SHARE / len(ramps)
 
-        own, ramp_flows = (
-            {"inflow": round(demand * each * capacity), "off_peak_inflow": round(OFF_PEAK_SHARE * each * capacity)}
-            for each in (1.0 - share * len(ramps), share)
+        main_flows, ramp_flows = (
+            {"inflow": round(demand * share * capacity), "off_peak_inflow": round(OFF_PEAK_SHARE * share * capacity)}
+            for share in (1.0 - ramp_share * len(ramps), ramp_share)
         )
-        settings = {**self.traffic, **own, "ramps": [{**ramp, **ramp_flows} for ramp in ramps]}
-        made = make_scenario("on-ramp", {**settings, **changes})
-        assert isinstance(made, Motorway)
-        return made
+        settings = {**self.traffic, **main_flows, "ramps": [{**ramp, **ramp_flows} for ramp in ramps]}
+        scenario = make_scenario("on-ramp", {**settings, **changes})
+        assert isinstance(scenario, Motorway)
+        return scenario
 
 
 def _draw_settings() -> list[EnsembleSetting]:
-    """Return the balanced random design: in each half, each factor has its levels in an order of its own."""
+    """Return the balanced random design: each half has all levels of each factor, in random order."""
     generator, settings = np.random.default_rng(DESIGN_SEED), list[EnsembleSetting]()
     for half in range(2):
         columns = {name: generator.permutation(np.array(levels, object)) for name, levels in LEVELS.items()}
@@ -144,18 +144,18 @@ CAPACITIES: tuple[float, ...] = (
     *(1926, 1806, 1627, 1694, 1836, 1758, 1757, 1644, 1766, 1721, 1670, 1579),
     *(1710, 1657, 1717, 1655, 1742, 1744, 1781, 1736, 1787, 1612, 1507, 1877),
 )
-"""flow before a breakdown of each setting: means of the part `capacity` [veh/h per lane]"""
+"""flow of each setting before a breakdown, from the part `capacity` [veh/h per lane]"""
 SETTING_FREE_FLOW_TIMES: tuple[float, ...] = (
     *(132.2, 140.7, 133.9, 134.0, 184.4, 136.3, 141.2, 134.1, 136.5, 135.7, 183.9, 134.9),
     *(137.1, 136.5, 137.1, 142.3, 143.1, 185.4, 132.1, 180.1, 131.8, 133.2, 132.5, 133.5),
 )
-"""travel time of each setting at little demand: the part `free-flow` [s]"""
+"""travel time of each setting with little demand, from the part `free-flow` [s]"""
 SETTINGS = _draw_settings()
-"""the tuning half, then the test half"""
+"""settings of the ensemble: first the tuning half, then the test half"""
 
 
 def measure_capacity(number: int, workers: int) -> dict[str, Table]:
-    """Return the facts of a setting with a demand that rises until traffic breaks down, one row for each seed."""
+    """Return facts of a setting while its demand rises until traffic breaks down, one row for each seed."""
     setting = SETTINGS[number]
     capacity = CAPACITY_GUESS * setting.traffic["lanes"]
     scenario = setting.scenario(capacity, MAX_DEMAND, **RISING_DEMAND)
@@ -163,7 +163,7 @@ def measure_capacity(number: int, workers: int) -> dict[str, Table]:
 
 
 def measure_free_flow(number: int, workers: int) -> dict[str, float]:
-    """Return the mean travel time of a setting with human drivers at little demand [s]."""
+    """Return the mean travel time of a setting with human drivers and little demand [s]."""
     setting = SETTINGS[number]
     capacity = CAPACITY_GUESS * setting.traffic["lanes"]
     scenario = setting.scenario(capacity, FREE_DEMAND, peak=(0.0, 2400.0), penetration_rate=0.0)
@@ -171,16 +171,16 @@ def measure_free_flow(number: int, workers: int) -> dict[str, float]:
 
 
 def settings_table(folder: Path) -> pd.DataFrame:
-    """Return all settings with their flow before a breakdown, its drop, the speed of waves, and delays."""
+    """Return for each setting its factors, flow before a breakdown, capacity drop, speed of waves, and delays."""
     capacities, table = read_part(folder, CAPACITY_PART), list[dict[str, Any]]()
     for setting in SETTINGS:
         rows = capacities[str(setting.number)]["episodes"]
         targets = {name: TARGETS[name] for name in ("highest_flow", "discharge", "capacity_drop")}
-        facts = {each.name: mean_text(fact_values(rows, name), each.digits) for name, each in targets.items()}
-        # The median, because the estimate of a single episode may be many times any real speed.
+        facts = {target.name: mean_text(fact_values(rows, name), target.digits) for name, target in targets.items()}
+        # The median is insensitive to single episodes with unrealistic estimates.
         wave, speeds = TARGETS["wave_speed"], fact_values(rows, "wave_speed")
         facts[f"{wave.name}: median (episodes)"] = f"{np.median(speeds):.{wave.digits}f} ({len(speeds)})"
-        factors = {each.name.replace("_", " "): getattr(setting, each.name) for each in fields(setting)[1:]}
+        factors = {field.name.replace("_", " "): getattr(setting, field.name) for field in fields(setting)[1:]}
         times = {"free travel time [s]": setting.free_flow_time, "unavoidable delay [s]": setting.unavoidable_delay}
         texts = {name: f"{value:.0f}" for name, value in times.items()}
         table.append({"half": "test" if setting.is_test else "tuning", **factors, **facts, **texts})
@@ -191,9 +191,9 @@ CAPACITY_PART, FREE_FLOW_PART = "capacity", "free-flow"
 MOTORWAY_ENSEMBLE = Study(
     title="ensemble of motorways: the flow of each setting before it breaks down",
     make_parts=lambda study_folder, seeds: {
-        f"{part}/{each.number}": (function, (each.number,))
+        f"{part}/{setting.number}": (function, (setting.number,))
         for part, function in ((CAPACITY_PART, measure_capacity), (FREE_FLOW_PART, measure_free_flow))
-        for each in SETTINGS
+        for setting in SETTINGS
     },
     minutes=30.0,
     tables={"settings": settings_table},

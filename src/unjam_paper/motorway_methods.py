@@ -1,6 +1,6 @@
-"""Ways to reduce delays at bottlenecks of motorways, with the candidates among which each of them is tuned.
+"""Methods that reduce delays at bottlenecks of motorways, and the candidates from which their parameters are selected.
 
-All have the same budget: `CANDIDATES_PER_METHOD` sets of parameters, drawn at random before anything is evaluated.
+Each method has `CANDIDATES_PER_METHOD` candidates: sets of parameters that are drawn at random before any evaluation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,27 +18,29 @@ Range = tuple[float, float] | Sequence[Any]
 
 @dataclass(frozen=True)
 class Candidate:
-    """What drives the CAVs, and what else is changed on the road."""
+    """A driver of the CAVs, and changes to the scenario."""
 
     driver: str
     settings: Mapping[str, Any]
-    """settings of the scenario"""
+    """changed settings of the scenario"""
 
     @property
     def numbers(self) -> dict[str, float]:
-        """All parameters as numbers: a way to change lanes is 1 if it is set, a choice 1 if it is true."""
+        """All parameters as numbers; settings of lane changing are 1 if they are set, and booleans if they are true."""
         _, parameters = split_parameters(self.driver)
-        values = {**parameters, **self.settings}
-        kept = {name: each for name, each in values.items() if not name.endswith(".active")}
-        return {name: float(each is not None if name in LANE_CHANGING else each) for name, each in kept.items()}
+        return {
+            name: float(value is not None if name in LANE_CHANGING else value)
+            for name, value in {**parameters, **self.settings}.items()
+            if not name.endswith(".active")
+        }
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way to reduce delays, and the ranges of its parameters."""
+    """A method that reduces delays, and the ranges of its parameters."""
 
     description: str
-    """what it does; its candidates are drawn from this text: another text is another tuning"""
+    """what the method does; a part of the random seed of its candidates, so other words give other candidates"""
     driver: str
     driver_ranges: Mapping[str, Range] = field(default_factory=dict)
     """ranges of parameters of the driver"""
@@ -48,18 +50,19 @@ class Method:
     """settings of the scenario that all candidates have"""
 
     def candidate(self, number: int) -> Candidate:
-        """Return a candidate; the first one has the default parameters."""
+        """Return a candidate by its number; candidate 0 has the default parameters."""
         generator = np.random.default_rng([CANDIDATE_SEED, number, *self.description.encode()])
         if number == 0:
             return Candidate(self.driver, self.settings)
-        values = {name: _draw(generator, each) for name, each in self.driver_ranges.items()}
-        settings = {name: _draw(generator, each) for name, each in self.setting_ranges.items()}
+        values = {name: _draw_value(generator, limits) for name, limits in self.driver_ranges.items()}
+        settings = {name: _draw_value(generator, limits) for name, limits in self.setting_ranges.items()}
         parameters = ",".join(f"{name}={value}" for name, value in values.items())
         driver = f"{self.driver}:{parameters}" if parameters else self.driver
         return Candidate(driver, {**self.settings, **settings})
 
 
-def _draw(generator: np.random.Generator, values: Range) -> Any:
+def _draw_value(generator: np.random.Generator, values: Range) -> Any:
+    """Draw a number of three digits from a range, or a value of a list."""
     if isinstance(values, tuple):
         low, high = values
         return float(f"{generator.uniform(low, high):.3g}")
@@ -67,7 +70,7 @@ def _draw(generator: np.random.Generator, values: Range) -> Any:
 
 
 LANE_CHANGING: dict[str, Range] = {"cruise.cooperation": [1.0, 1.0, None], "cruise.speed_gain": [0.0, None]}
-"""how CAVs change lanes; two in three candidates cooperate"""
+"""settings of the lane changing of CAVs; two of three candidates cooperate"""
 METHODS = {
     "ACC": Method(
         "the ACC alone",
@@ -114,4 +117,4 @@ METHODS = {
         settings={"ramp_meter.active": True},
     ),
 }
-"""the methods that are compared; all but `jam-ahead` are its opponents"""
+"""the compared methods: `jam-ahead` and its opponents"""

@@ -1,4 +1,4 @@
-"""Small SUMO networks, as a user would write them: their files, and the open roads of the study `do-no-harm`."""
+"""Files of small SUMO networks, as a user would write them, and the open roads of the study `do-no-harm`."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,11 +14,11 @@ from unjam.scenarios.road import Connection
 from unjam.worlds.sumo.networks import run_netconvert, xml_document, xml_element
 
 EPISODE_SECONDS, ROAD_SIMULATION_STEP = 900.0, 0.5
-"""length of an episode, and simulation step [s]"""
+"""duration of an episode, and simulation step [s]"""
 CAR_LENGTH, TRUCK_LENGTH, TRUCK_SPEED = 4.8, 12.0, 24.0
 """lengths of vehicles [m]; speed limit of trucks [m/s]"""
 CROSSING_SHARE = 0.05
-"""demand on each road that crosses at a signal, as a share of the demand on the main road"""
+"""demand on each crossing road, as a share of the demand on the main road"""
 SIDE_ROAD = (1, 20.0)
 """lanes and speed limit [m/s] of ramps and of crossing roads"""
 RoadNode = tuple[str, float, float, str]
@@ -28,7 +28,7 @@ RoadEdge = tuple[str, str, str, int, float]
 
 
 class RoadSection(NamedTuple):
-    """A part of a road with the same lanes and speed limit; lanes begin and end on the right."""
+    """A section of a road with constant lanes and speed limit; lanes begin and end on the right."""
 
     length: float
     """[m]"""
@@ -36,21 +36,21 @@ class RoadSection(NamedTuple):
     speed: float
     """speed limit [m/s]"""
     turn: float = 0.0
-    """change of direction at its start [degrees]"""
+    """change of direction at the start of the section [degrees]"""
     ramp_flow: float = 0.0
-    """share of all vehicles that enter at its start, from a ramp onto the rightmost lane"""
+    """share of all vehicles that enter from a ramp onto the rightmost lane, at the start of the section"""
     has_signal: bool = False
-    """whether there is a signal at its end"""
+    """whether there is a signal at the end of the section"""
 
 
 USUAL_HUMANS = IDMParameters(
     desired_speed=60.0, time_headway=1.4, max_acceleration=1.3, comfortable_deceleration=2.0, minimum_gap=2.2
 )
-"""human drivers that use the speed limit of each road"""
+"""human drivers that drive at the speed limit of each road"""
 CALM_HUMANS = IDMParameters(
     desired_speed=35.5, time_headway=1.66, max_acceleration=2.37, comfortable_deceleration=3.2, minimum_gap=2.94
 )
-"""human drivers that near capacity drive far slower than a limit of 40 m/s"""
+"""human drivers that drive far below a limit of 40 m/s if the flow is near capacity"""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class OpenTestRoad:
 
     sections: tuple[RoadSection, ...]
     demand: tuple[float, ...]
-    """share of the capacity of the narrowest section, in equally long parts of the episode"""
+    """shares of the capacity of the narrowest section, in equal periods of the episode"""
     trucks: float = 0.0
     """share of trucks among the vehicles"""
     model: str = "EIDM"
@@ -67,7 +67,7 @@ class OpenTestRoad:
     humans: IDMParameters = USUAL_HUMANS
     """parameters of the human drivers; the desired speed is a limit in addition to that of the road"""
     speed_spread: float = 0.1
-    """standard deviation of the factor by which drivers exceed the speed limit"""
+    """standard deviation of the speed factor of drivers"""
     entry_speed: str = "avg"
     """departSpeed of SUMO: a name or a speed [m/s]"""
 
@@ -79,19 +79,23 @@ class OpenTestRoad:
     def free_speed(self, begin: float, end: float) -> float:
         """Return the free-flow speed of cars on the slowest section between two positions [m/s]."""
         ends = accumulate(section.length for section in self.sections)
-        sections = [(last - each.length, last, each.speed) for each, last in zip(self.sections, ends, strict=True)]
-        limits = [speed for first, last, speed in sections if last > begin and first < end]
+        limits = [
+            section.speed
+            for section, section_end in zip(self.sections, ends, strict=True)
+            if section_end > begin and section_end - section.length < end
+        ]
         return min(*limits, self.humans.desired_speed)
 
     @property
     def capacity(self) -> float:
         """The maximum steady flow of equally spaced cars, on the narrowest section [veh/h]."""
-        return 3600.0 * min(each.lanes * self._highest_flow(each.speed) for each in self.sections)
+        return 3600.0 * min(section.lanes * self._highest_flow(section.speed) for section in self.sections)
 
     def _highest_flow(self, limit: float) -> float:
-        fastest = min(limit, self.humans.desired_speed)
-        humans = IDMParameters(fastest, self.humans.time_headway, minimum_gap=self.humans.minimum_gap)
-        speeds = np.arange(1.0, fastest, 0.25).tolist()
+        """Return the maximum steady flow of a lane with a speed limit [veh/s]."""
+        max_speed = min(limit, self.humans.desired_speed)
+        humans = IDMParameters(max_speed, self.humans.time_headway, minimum_gap=self.humans.minimum_gap)
+        speeds = np.arange(1.0, max_speed, 0.25).tolist()
         return max(speed / (CAR_LENGTH + equilibrium_gap(speed, humans)) for speed in speeds)
 
 
@@ -132,19 +136,19 @@ OPEN_TEST_ROADS: dict[str, OpenTestRoad] = {
 
 
 def write_road_files(road: OpenTestRoad, folder: Path) -> Path:
-    """Write the files of a road into a folder, and return its configuration."""
+    """Write the files of a road into a folder, and return the path of its configuration."""
     main = [f"main{number}" for number in range(len(road.sections))]
     routes = {"main": (main, 1.0 - sum(section.ramp_flow for section in road.sections))}
     nodes, edges, links = list[RoadNode](), list[RoadEdge](), list[Connection]()
     x = y = heading = 0.0
     for number, section in enumerate(road.sections):
-        before = road.sections[number - 1] if number else None
-        has_signal = before is not None and before.has_signal
+        previous = road.sections[number - 1] if number else None
+        has_signal = previous is not None and previous.has_signal
         nodes.append((f"n{number}", round(x, 2), round(y, 2), "traffic_light" if has_signal else "priority"))
         edges.append((main[number], f"n{number}", f"n{number + 1}", section.lanes, section.speed))
-        if before:
-            more = section.lanes - before.lanes
-            pairs = [(lane, lane + more) for lane in range(before.lanes) if lane + more >= 0]
+        if previous:
+            added = section.lanes - previous.lanes
+            pairs = [(lane, lane + added) for lane in range(previous.lanes) if lane + added >= 0]
             links += [Connection(main[number - 1], main[number], *lanes) for lanes in pairs]
         if has_signal:
             nodes.append((f"south{number}", round(x, 2), round(y - 300.0, 2), "priority"))
@@ -165,33 +169,35 @@ def write_road_files(road: OpenTestRoad, folder: Path) -> Path:
     nodes.append((f"n{len(main)}", round(x, 2), round(y, 2), "priority"))
     route_elements = [xml_element("route", id=name, edges=" ".join(route)) for name, (route, _) in routes.items()]
     shares = {name: share for name, (_, share) in routes.items()}
-    traffic = [*_vehicle_types(road), *route_elements, *_flows(road, shares)]
-    # Curves have the speed limit of their definition.
+    traffic = [*_vehicle_types(road), *route_elements, *_flow_elements(road, shares)]
+    # netconvert does not reduce the speed limits of curves.
     return write_network(folder, nodes, edges, links, traffic, "--junctions.limit-turn-speed=-1")
 
 
-def _flows(road: OpenTestRoad, shares: Mapping[str, float]) -> list[str]:
-    kinds, parts = {"car": 1.0 - road.trucks, "truck": road.trucks}, len(road.demand)
+def _flow_elements(road: OpenTestRoad, shares: Mapping[str, float]) -> list[str]:
+    """Return the flows of each route, period and vehicle type in the order of their begin."""
+    type_shares, periods = {"car": 1.0 - road.trucks, "truck": road.trucks}, len(road.demand)
     flows = list[tuple[float, str]]()
-    for (route, share), part, kind in product(shares.items(), range(parts), kinds):
-        begin, end = EPISODE_SECONDS * part / parts, EPISODE_SECONDS * (part + 1) / parts
-        flow = road.demand[part] * road.capacity * share * kinds[kind]
+    for (route, share), period, vehicle_type in product(shares.items(), range(periods), type_shares):
+        begin, end = EPISODE_SECONDS * period / periods, EPISODE_SECONDS * (period + 1) / periods
+        flow = road.demand[period] * road.capacity * share * type_shares[vehicle_type]
         if flow:
-            about = {"id": f"{route}.{part}.{kind}", "type": kind, "route": route, "begin": begin, "end": end}
-            about |= {"vehsPerHour": round(flow, 1), "departLane": "best", "departSpeed": road.entry_speed}
-            flows.append((begin, xml_element("flow", **about)))
+            attributes = {"id": f"{route}.{period}.{vehicle_type}", "type": vehicle_type, "route": route}
+            attributes |= {"begin": begin, "end": end, "vehsPerHour": round(flow, 1)}
+            attributes |= {"departLane": "best", "departSpeed": road.entry_speed}
+            flows.append((begin, xml_element("flow", **attributes)))
     return [element for _, element in sorted(flows)]
 
 
 def _vehicle_types(road: OpenTestRoad) -> Iterator[str]:
-    """Yield the vehicle types: trucks follow as cars do, and are longer and slower."""
+    """Yield the vehicle types; trucks have the following parameters of cars, and are longer and slower."""
     humans = road.humans
     shared = {"carFollowModel": road.model, "tau": humans.time_headway, "minGap": humans.minimum_gap}
     shared |= {"decel": humans.comfortable_deceleration, "speedDev": road.speed_spread}
-    fast = {"accel": humans.max_acceleration, "maxSpeed": humans.desired_speed}
-    slow = {"accel": humans.max_acceleration / 2.0, "maxSpeed": TRUCK_SPEED, "vClass": "truck"}
-    yield xml_element("vType", id="car", length=CAR_LENGTH, **shared, **fast)
-    yield xml_element("vType", id="truck", length=TRUCK_LENGTH, **shared, **slow)
+    car_limits = {"accel": humans.max_acceleration, "maxSpeed": humans.desired_speed}
+    truck_limits = {"accel": humans.max_acceleration / 2.0, "maxSpeed": TRUCK_SPEED, "vClass": "truck"}
+    yield xml_element("vType", id="car", length=CAR_LENGTH, **shared, **car_limits)
+    yield xml_element("vType", id="truck", length=TRUCK_LENGTH, **shared, **truck_limits)
 
 
 def write_network(
@@ -202,23 +208,26 @@ def write_network(
     traffic: Sequence[str],
     *options: str,
 ) -> Path:
-    """Write a network and its traffic with options of netconvert, and return the SUMO configuration."""
-    parts = (
+    """Write a network, made with options of netconvert, and its traffic; return the path of the configuration."""
+    tables = (
         ("node", "nod", ("id", "x", "y", "type"), nodes),
         ("edge", "edg", ("id", "from", "to", "numLanes", "speed", "priority"), [(*edge, 3) for edge in edges]),
         ("connection", "con", ("from", "to", "fromLane", "toLane"), connections),
     )
-    tables = {(tag, suffix): [dict(zip(names, row, strict=True)) for row in rows] for tag, suffix, names, rows in parts}
-    used = [(f"--{tag}-files", f"road.{suffix}.xml", tag, rows) for (tag, suffix), rows in tables.items() if rows]
-    inputs = {(option, name): xml_document(f"{tag}s", tag, rows) for option, name, tag, rows in used}
+    inputs = {
+        (f"--{tag}-files", f"road.{suffix}.xml"): xml_document(
+            f"{tag}s", tag, [dict(zip(names, row, strict=True)) for row in rows]
+        )
+        for tag, suffix, names, rows in tables
+        if rows
+    }
     run_netconvert(inputs, ["--no-turnarounds=true", *options], folder)
-    routes = f"<routes>{''.join(traffic)}</routes>"
-    (folder / "road.rou.xml").write_text(routes)
+    (folder / "road.rou.xml").write_text(f"<routes>{''.join(traffic)}</routes>")
     return write_configuration(folder, {})
 
 
 def write_configuration(folder: Path, options: Mapping[str, str]) -> Path:
-    """Write and return the SUMO configuration of `road.net.xml` and `road.rou.xml`."""
+    """Write the SUMO configuration of `road.net.xml` and `road.rou.xml`, and return its path."""
     files = {"net-file": "road.net.xml", "route-files": "road.rou.xml"}
     values = {**files, "end": EPISODE_SECONDS, "step-length": ROAD_SIMULATION_STEP, **options}
     path = folder / "road.sumocfg"

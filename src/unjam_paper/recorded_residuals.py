@@ -1,4 +1,4 @@
-"""Residuals on a tuned law, trained behind recorded vehicles with and without the model, and with more recordings."""
+"""Residuals on a tuned formula, trained behind recorded vehicles with and without the model and more recordings."""
 
 import os
 from dataclasses import dataclass
@@ -19,8 +19,9 @@ from unjam_paper.study import Table, group_rows, trainings_text
 
 RESIDUALS_PART = "residuals"
 STEPS_PER_ITERATION, TRAINING_STEPS = 400_000, 4_000_000
-"""environment steps; with the model, model steps are a part of them"""
+"""steps of an iteration and of a training, including model steps"""
 TASK_OPTIONS = {"window": 200.0}
+"""options of all tasks: windows of the drives [s]"""
 TRAINING_CHANGES: dict[str, Any] = {
     **{"scenario": "recorded", "backend": "batch", "scenario_options": TASK_OPTIONS, "workers": 1},
     **{"policy.history_features": True, "policy.authority": 0.15},
@@ -29,19 +30,18 @@ TRAINING_CHANGES: dict[str, Any] = {
     **{"evaluation.validation_episodes": 64, "evaluation.validation_interval": 3},
     **{"evaluation.episodes": 2, "evaluation.baselines": []},
 }
-"""the best of nine trials in validation, one training each with up to 12,000,000 steps; windows are drawn from the
-training drives"""
+"""the best settings, in validation, of nine trials with one training each of up to 12,000,000 steps; windows are drawn
+from the training drives"""
 MORE_RECORDINGS_LABEL = "without model, more recordings"
 MODEL_RATIOS = {"without model": 0.0, "with model": 1.0, MORE_RECORDINGS_LABEL: 0.0}
-"""model steps for each environment step, by the name of the residual"""
+"""model steps for each environment step, by label of the residual"""
 I24_TASK = "i24"
 OTHER_RECORDINGS: dict[str, dict[str, Any]] = {
     "openacc": {"recordings": "recordings/openacc_astazero_pairs.parquet"},
     "ngsim": {"recordings": "recordings/ngsim_i80_recon_pairs.parquet", "window": 30.0},
 }
-"""leaders behind which `MORE_RECORDINGS_LABEL` learns besides the training drives and artificial waves: on a test track
-(OpenACC, Makridis et al. 2021), and in a jam on I-80 (NGSIM, 30 s and more); all four tasks have equal shares of the
-steps"""
+"""recordings of `MORE_RECORDINGS_LABEL`, besides the training drives and artificial waves: on a test track (OpenACC,
+Makridis et al. 2021), and in a jam on I-80 (NGSIM, at least 30 s long); all four tasks have equal shares of steps"""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class PlannedResidual:
     """A training on recorded drives."""
 
     folder: str
-    """of all residuals of the study"""
+    """folder of all residuals of the study"""
     drives: str
     """pattern of the files of the training drives"""
     expert: str
@@ -59,17 +59,17 @@ class PlannedResidual:
 
     @property
     def name(self) -> str:
-        """Its name among all residuals."""
+        """Name of the training: label and seed."""
         return f"{self.label} {self.seed}"
 
     @property
     def controller(self) -> Path:
-        """The file of the trained controller."""
+        """Path of the trained controller."""
         return Path(self.folder, f"{self.name}.unjam")
 
     @property
     def config(self) -> RunConfig:
-        """Its configuration: with the model, there are as many updates of the policy from fewer environment steps."""
+        """Run configuration; with the model, the same number of policy updates needs fewer environment steps."""
         ratio = MODEL_RATIOS[self.label]
         changes = {"scenario_options.recordings": self.drives, "expert": self.expert, "seed": self.seed}
         changes |= {"trpo.steps_per_iteration": round(STEPS_PER_ITERATION / (1.0 + ratio)), "model.model_ratio": ratio}
@@ -81,27 +81,30 @@ class PlannedResidual:
         return load_config(changes=TRAINING_CHANGES | changes | {"steps": round(TRAINING_STEPS / (1.0 + ratio))})
 
     def _task_options(self) -> dict[str, dict[str, Any]]:
-        others = {name: {**each, "recordings": _path(self.drives, each)} for name, each in OTHER_RECORDINGS.items()}
-        return {I24_TASK: {"recordings": self.drives}, **others, "artificial": {}}
+        tasks: dict[str, dict[str, Any]] = {I24_TASK: {"recordings": self.drives}}
+        for name, options in OTHER_RECORDINGS.items():
+            tasks[name] = {**options, "recordings": _recordings_path(self.drives, options)}
+        return {**tasks, "artificial": {}}
 
 
 def planned_residuals(folder: Path, drives: str, expert: str, seeds: int) -> list[PlannedResidual]:
-    """Return the trainings with and without the model, ordered by seed; `InputError` if recordings are missing."""
+    """Return the trainings of all labels, ordered by seed; raise `InputError` if recordings are missing."""
     for name, options in OTHER_RECORDINGS.items():
-        if not os.path.isfile(file := _path(drives, options)):
+        if not os.path.isfile(file := _recordings_path(drives, options)):
             allowed = "pairs of vehicles that follow each other, in a format of unjam fit-drivers"
             raise InputError(f"{name}: {file} does not exist; allowed: {allowed}")
-    planned = product(range(seeds), MODEL_RATIOS)
-    return [PlannedResidual(str(folder), drives, expert, label, seed) for seed, label in planned]
+    return [
+        PlannedResidual(str(folder), drives, expert, label, seed) for seed, label in product(range(seeds), MODEL_RATIOS)
+    ]
 
 
-def _path(drives: str, options: dict[str, Any]) -> str:
-    """Return the path of other recordings, which is relative to the folder of all studies."""
+def _recordings_path(drives: str, options: dict[str, Any]) -> str:
+    """Return the path of other recordings in the folder of all studies, which contains the training drives."""
     return str(Path(drives).parents[2] / options["recordings"])
 
 
 def train_residual(run: PlannedResidual, workers: int) -> Table:
-    """Train a residual, store its controller, and return its validations."""
+    """Train a residual, store its controller, and return a row for each validation."""
     folder = Path(run.folder, run.name)
     rmtree(folder, ignore_errors=True)
     make_folder(folder.parent)
@@ -115,15 +118,15 @@ def train_residual(run: PlannedResidual, workers: int) -> Table:
 
 
 def residuals_table(folder: Path) -> pd.DataFrame:
-    """Return the gains of the trainings over their law on validation windows of the training drives."""
+    """Return the gains of the trainings over their expert on validation windows of the training drives."""
     rows = read_part(folder, RESIDUALS_PART)
     table: Table = []
     for label in MODEL_RATIOS:
-        own = [row for row in rows if row["residual"] == label]
-        trainings = group_rows(own, "seed").values()
-        gains = [[row["return_validation"] - row["return_expert"] for row in each] for each in trainings]
-        steps = f"{max(row['environment_steps'] for row in own):,}"
+        label_rows = [row for row in rows if row["residual"] == label]
+        trainings = group_rows(label_rows, "seed").values()
+        gains = [[row["return_validation"] - row["return_expert"] for row in training] for training in trainings]
+        steps = f"{max(row['environment_steps'] for row in label_rows):,}"
         cells = {"residual": label, "trainings": len(gains), "environment steps": steps}
-        cells["best gain in validation"] = trainings_text([max(each) for each in gains], 1, sign="+")
-        table.append({**cells, "last gain in validation": trainings_text([each[-1] for each in gains], 1, sign="+")})
+        cells["best gain in validation"] = trainings_text([max(curve) for curve in gains], 1, sign="+")
+        table.append({**cells, "last gain in validation": trainings_text([curve[-1] for curve in gains], 1, sign="+")})
     return pd.DataFrame(table)

@@ -1,4 +1,4 @@
-"""Controllers on roads, among humans or with sensors that differ from training, and other numbers of vehicles."""
+"""Controllers on roads, in traffic, with sensors or with numbers of vehicles that differ from training."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -40,7 +40,7 @@ COMMON_CONDITIONS: dict[str, dict[str, Any]] = {
     "0.3 s delay": {"impairments": {"delay": 0.3}},
     "two CAVs": {"cavs": 2},
 }
-"""differences from training: changes to the scenario, and `impairments`, the arguments of `ImpairedDriver`"""
+"""changes to the scenario of the training, and arguments of `ImpairedDriver` as `impairments`, by name"""
 RING_CONDITIONS: dict[str, dict[str, Any]] = {
     **COMMON_CONDITIONS,
     "one CAV in 44, 520 m": {"vehicles": 44, "length": [520, 520]},
@@ -62,11 +62,12 @@ ROAD_CONTROLLERS = {
     "ring-jammed": ("unjam:ring-jammed-best-ideal", "unjam:ring-jammed-tuned-ideal"),
     "figure-eight": ("unjam:figure-eight-best-ideal", "unjam:figure-eight-tuned-ideal"),
 }
-"""packaged controller of a road and its best tuned expert"""
+"""trained packaged controller and best tuned expert by road"""
 VOLUME_ROADS = ("ring-5", "ring-11", "ring")
-"""roads of Figure 10; controllers of the last are transferred to `TRANSFER_ROADS`"""
+"""roads of Figure 10"""
 VOLUME_VARIANTS = ("trpo", "ppo", "sac", "without-model", "proposed", "ours")
 TRANSFER_VARIANTS, TRANSFER_SOURCE, TRANSFER_EPISODES = ("proposed", "ours"), "ring", 20
+"""variants, road of their trainings, and number of episodes on each of the `TRANSFER_ROADS`"""
 LONG_RING = {"scenario_options.vehicles": 44, "scenario_options.length": [520, 520]}
 TRANSFER_ROADS: dict[str, dict[str, Any]] = {
     **{f"{count} vehicles": study.STUDY_ROADS[road] for count, road in ((5, "ring-5"), (11, "ring-11"), (22, "ring"))},
@@ -77,32 +78,34 @@ TRANSFER_ROADS: dict[str, dict[str, Any]] = {
 def condition_rows(
     road: str, condition: str, changes: Mapping[str, Any], controllers: tuple[str, str], episodes: int, workers: int
 ) -> study.Table:
-    """Return a row for the human baseline and for both `controllers`, the trained one and the tuned expert."""
+    """Return a row for the human baseline and for both `controllers`: the trained one, then the tuned expert."""
     trained, tuned = controllers
     names = {HUMAN_LABEL: HUMAN_LABEL, TUNED_EXPERT: tuned, TRAINED_LABEL: trained}
     options = {f"scenario_options.{key}": value for key, value in changes.items() if key != "impairments"}
     scenario = load_config(changes={**study.STUDY_ROADS[road], **options}).make_scenario()
     drivers = {label: partial(_impaired_driver, name, changes.get("impairments", {})) for label, name in names.items()}
-    found = study.evaluate_drivers(scenario, drivers, episodes, workers)
+    rows = study.evaluate_drivers(scenario, drivers, episodes, workers)
     return [
         {
             **{"road": road, "condition": condition, "driver": label},
-            **{"feasibility": overall_feasibility(own, found[HUMAN_LABEL])},
-            **estimate_metrics(own, ROBUSTNESS_METRICS),
-            "speed_gain_over_expert": asdict(paired_difference(own, found[TUNED_EXPERT], "mean_speed")),
+            **{"feasibility": overall_feasibility(driver_rows, rows[HUMAN_LABEL])},
+            **estimate_metrics(driver_rows, ROBUSTNESS_METRICS),
+            "speed_gain_over_expert": asdict(paired_difference(driver_rows, rows[TUNED_EXPERT], "mean_speed")),
         }
-        for label, own in found.items()
+        for label, driver_rows in rows.items()
     ]
 
 
 def _impaired_driver(name: str, impairments: Mapping[str, float], scenario: Scenario) -> Driver:
-    driver, step = make_driver(name, scenario.control_step), scenario.control_step
-    is_exact = driver.is_native or not impairments
-    return driver if is_exact else ImpairedDriver(driver, **impairments, time_step=step)
+    """Return a driver with impairments; human drivers have none."""
+    driver = make_driver(name, scenario.control_step)
+    if driver.is_native or not impairments:
+        return driver
+    return ImpairedDriver(driver, **impairments, time_step=scenario.control_step)
 
 
 def _robustness_table(road: str, folder: Path) -> pd.DataFrame:
-    """Return the mean speed of all vehicles by condition and driver, and the gain of training."""
+    """Return the mean speed of all vehicles by condition and driver, and the gain of training over the expert."""
     table: dict[str, dict[str, str]] = {}
     for row in read_part(folder, "robustness"):
         if row["road"] == road:
@@ -117,10 +120,13 @@ def _robustness_table(road: str, folder: Path) -> pd.DataFrame:
 
 
 def transfer_rows(road: str, drivers: Mapping[str, str], workers: int) -> study.Table:
-    """Return the metrics of drivers on a road with another number of vehicles than in training."""
+    """Return the metrics of drivers on one of the `TRANSFER_ROADS`."""
     scenario = load_config(changes=TRANSFER_ROADS[road]).make_scenario()
-    found = study.evaluate_drivers(scenario, drivers, TRANSFER_EPISODES, workers)
-    return [{"road": road, "driver": name, **estimate_metrics(own, COMPARISON_METRICS)} for name, own in found.items()]
+    rows = study.evaluate_drivers(scenario, drivers, TRANSFER_EPISODES, workers)
+    return [
+        {"road": road, "driver": name, **estimate_metrics(driver_rows, COMPARISON_METRICS)}
+        for name, driver_rows in rows.items()
+    ]
 
 
 def _transfer_parts(study_folder: study.StudyFolder, seeds: int) -> dict[str, StudyPart]:
@@ -141,7 +147,7 @@ def _figure_10_study(title: str, roads: tuple[str, ...]) -> study.Study:
 
 
 def _transfer_table(folder: Path) -> pd.DataFrame:
-    """Return the mean speed by driver and traffic: the mean and the range over trainings."""
+    """Return the mean speed of all vehicles by driver and road, with the range over trainings."""
 
     def mean_and_range(values: pd.Series) -> str:
         return study.interval_text(

@@ -1,4 +1,4 @@
-"""What string stability costs on closed roads: experts of usual cars, tuned with several limits on their string gain.
+"""Cost of string stability on closed roads: experts in usual cars are tuned with several limits of their string gain.
 
 The study also compares packaged controllers in ideal and usual cars.
 """
@@ -46,10 +46,10 @@ from unjam_paper.study import (
 )
 
 OTHER_EXPERT = {"ring": "pi-from-gap", "ring-jammed": "pi-from-gap", "figure-eight": "pacer"}
-"""expert that is tuned without a limit, by road"""
+"""expert, besides `smooth-acc`, that is tuned without a limit, by road"""
 STRING_ROADS = tuple(OTHER_EXPERT)
 GAIN_LIMITS = {"ring": (1.02, 0.0, 1.1, 1.3), "ring-jammed": (1.02, 0.0, 1.1, 1.3), "figure-eight": (1.02, 0.0)}
-"""largest allowed string gains, by road; 0: any"""
+"""limits of the string gain by road; 0: no limit"""
 PACKAGED = {
     "ring": ("ring-tuned", "ring-gap-tuned", "rings-tuned", "shared-rings-tuned", "ring-best-ideal", "ring-best"),
     "ring-jammed": ("ring-jammed-tuned-ideal", "ring-jammed-best-ideal", "ring-jammed-tuned", "ring-jammed-best"),
@@ -57,11 +57,11 @@ PACKAGED = {
 }
 """packaged controllers, by the road on which they are compared"""
 EXPERT_COLUMNS = "largest gain allowed", "string gain", "set time gap [s]"
-"""headings of what a tuned expert has, and human drivers do not"""
-SHOWN_METRICS = ("return", "return", 0), ("mean_speed", "mean speed [m/s]", 2)
-"""metrics with their headings and digits"""
+"""headings of columns that have no values for human drivers"""
+TABLE_METRICS = ("return", "return", 0), ("mean_speed", "mean speed [m/s]", 2)
+"""metrics of tables, with headings and digits"""
 CARS = {"ideal": INSTANT_ACTUATOR, "usual": STANDARD_ACTUATOR}
-"""actuators of CAVs"""
+"""actuators of CAVs by kind of car"""
 STRING_SEEDS = 20
 """test seeds of each tuned expert"""
 SMOOTH_ACC_SPACE: SearchSpace = {
@@ -75,7 +75,7 @@ SMOOTH_ACC_SPACE: SearchSpace = {
     "history_factor": FloatDistribution(0.0, 1.1),
 }
 TUNING_STEPS = {"ring": 3_000_000, "ring-jammed": 3_000_000, "figure-eight": 1_500_000}
-"""control steps of each tuning: 113 settings"""
+"""control steps of each tuning, for 113 sets of parameters"""
 FAMILY_SEEDS = 10
 """test seeds of each road of the family"""
 FAMILY_METRIC = "mean_speed_steady"
@@ -87,7 +87,7 @@ RETUNED = {
     "time_constant=4.2,first_command=zero,human_time_headway=1.186,human_standstill_gap=1.397,fade_time=97.99,"
     "history_factor=0.8567",
 }
-"""experts of `unjam:best`, tuned again for usual cars (results/tuned.json), by the group of their roads"""
+"""experts of `unjam:best`, tuned again for usual cars (results/tuned.json), by group of roads"""
 FAMILY_PART = "family"
 STORED_METRICS = ("seed", "return", "mean_speed", "speed_std_fleet_steady", "min_time_gap", "feasibility")
 
@@ -98,7 +98,7 @@ def closed_road(name: str, car: str = "usual") -> Scenario:
 
 
 def measure_tuned(road: str, expert: str, limit: float, workers: int) -> Table:
-    """Return an expert that was tuned with a limit on its string gain, with its gain and its test episodes."""
+    """Tune an expert with a limit of its string gain; return its gain and test episodes as a list of one row."""
     scenario = closed_road(road)
     space = SMOOTH_ACC_SPACE if expert == "smooth-acc" else default_search_space(expert, scenario.control_step)
     with WorkerPool(workers) as pool, tempfile.TemporaryDirectory() as folder:
@@ -117,7 +117,7 @@ def measure_episodes(scenario: Scenario, driver: str, workers: int) -> Table:
 
 
 def measure_human_baseline(road: str, workers: int) -> Table:
-    """Return the test episodes of the human baseline."""
+    """Return the test episodes of the human baseline as a list of one row."""
     episodes = measure_episodes(closed_road(road), HUMAN_LABEL, workers)
     return [{"expert": HUMAN_LABEL, "limit": 0.0, "episodes": episodes}]
 
@@ -128,15 +128,15 @@ def measure_car(road: str, car: str, workers: int) -> Table:
     rows: Table = []
     with WorkerPool(workers) as pool:
         point = find_operating_points({road: scenario}, pool)[road]
-    for name in ("pi", *(f"{PACKAGED_PREFIX}{each}" for each in PACKAGED[road]), "unjam:best"):
+    for name in ("pi", *(f"{PACKAGED_PREFIX}{name}" for name in PACKAGED[road]), "unjam:best"):
         driver = make_driver(name, scenario.control_step)
-        gain = None if name == "unjam:best" else point.string_gain(driver)  # it selects its controller on the road
+        gain = None if name == "unjam:best" else point.string_gain(driver)  # no single formula
         rows.append({"car": car, "driver": name, "gain": gain, "episodes": measure_episodes(scenario, name, workers)})
     return rows
 
 
 def family_groups() -> dict[str, list[str]]:
-    """Return the closed roads of the family that have ideal cars, by the expert of `unjam:best` on them."""
+    """Return the closed roads of the family with ideal cars, by group; each group has an expert of `unjam:best`."""
     shared, groups = family_roads(SHARED_RINGS_GROUP), dict[str, list[str]]()
     for group in ("rings", SHARED_RINGS_GROUP, "figure-eights"):
         names = (name for name in family_roads(group) if group != "rings" or name not in shared)
@@ -145,15 +145,15 @@ def family_groups() -> dict[str, list[str]]:
 
 
 def measure_family(group: str, name: str, workers: int) -> Table:
-    """Return the speeds of human drivers, `unjam:best` with both cars, and the retuned expert, on a family road."""
+    """Return the speeds on a family road: of human drivers, of `unjam:best` with both cars, of the retuned expert."""
     road, rows = make_scenario(f"{FAMILY_PREFIX}{name}"), list[dict[str, Any]]()
-    usual = {FAMILY_CONTROLLER: FAMILY_CONTROLLER, HUMAN_LABEL: HUMAN_LABEL}
-    usual |= {"retuned": RETUNED[group]} if group in RETUNED else {}
+    usual_car_drivers = {FAMILY_CONTROLLER: FAMILY_CONTROLLER, HUMAN_LABEL: HUMAN_LABEL}
+    usual_car_drivers |= {"retuned": RETUNED[group]} if group in RETUNED else {}
     evaluate_road = evaluate_in_batches if group in RETUNED else evaluate_metrics  # figure eights run in SUMO
-    for car, drivers in {"ideal": {FAMILY_CONTROLLER: FAMILY_CONTROLLER}, "usual": usual}.items():
+    for car, drivers in {"ideal": {FAMILY_CONTROLLER: FAMILY_CONTROLLER}, "usual": usual_car_drivers}.items():
         scenario = replace(road, actuator=CARS[car])
-        for label, measured in evaluate_road(scenario, drivers, FAMILY_SEEDS, (FAMILY_METRIC,), workers).items():
-            speeds = [row[FAMILY_METRIC] for row in measured["episodes"]]
+        for label, results in evaluate_road(scenario, drivers, FAMILY_SEEDS, (FAMILY_METRIC,), workers).items():
+            speeds = [row[FAMILY_METRIC] for row in results["episodes"]]
             rows.append({"group": group, "road": name, "car": car, "driver": label, "speeds": speeds})
     return rows
 
@@ -163,11 +163,11 @@ def measure_string_gains(road: str, drivers: Mapping[str, DriverSource], workers
     scenario = closed_road(road)
     with WorkerPool(workers) as pool:
         point = find_operating_points({road: scenario}, pool)[road]
-    return {label: point.string_gain(made) for label, made in make_drivers(scenario, drivers).items()}
+    return {label: point.string_gain(driver) for label, driver in make_drivers(scenario, drivers).items()}
 
 
 def car_table(road: str, folder: Path) -> pd.DataFrame:
-    """Return gain, return and mean speed of packaged controllers with both cars, and what usual cars lose."""
+    """Return gain, return and mean speed of packaged controllers with both cars, and the differences to ideal cars."""
     _, human = tuned_rows(road, folder)
     measured = read_part(folder, f"packaged-{road}")
     ideal = {row["driver"]: row["episodes"] for row in measured if row["car"] == "ideal"}
@@ -187,40 +187,41 @@ def tuned_rows(road: str, folder: Path) -> tuple[list[dict[str, Any]], Table]:
 
 
 def string_table(road: str, folder: Path) -> pd.DataFrame:
-    """Return gain, set time gap, return and mean speed with differences to the human baseline, by expert and limit."""
+    """Return gain, time gap, return and mean speed, with differences to the human baseline, by expert and limit."""
     rows, human = tuned_rows(road, folder)
     cells = dict.fromkeys(EXPERT_COLUMNS, NO_VALUE_TEXT)
     table = [{"expert": HUMAN_LABEL, **cells, **_mean_cells(human, {"human": human})}]
     for row in rows:
         time_gap = getattr(driver_from_name(row["driver"], 0.1), "time_gap", None)
-        own = f"{row['limit']:g}" if row["limit"] else "any", number_text(row["gain"], 3), number_text(time_gap, 1)
-        cells = dict(zip(EXPERT_COLUMNS, own, strict=True))
+        limit = f"{row['limit']:g}" if row["limit"] else "any"
+        texts = limit, number_text(row["gain"], 3), number_text(time_gap, 1)
+        cells = dict(zip(EXPERT_COLUMNS, texts, strict=True))
         table.append({"expert": row["expert"], **cells, **_mean_cells(row["episodes"], {"human": human})})
     return pd.DataFrame(table)
 
 
 def _mean_cells(episodes: Table, baselines: Mapping[str, Table | None]) -> dict[str, str]:
-    """Return mean return and speed with their differences to other episodes, if any, time gap and feasibility."""
+    """Return mean return and speed, their differences to other episodes, the smallest time gap and the feasibility."""
     cells: dict[str, str] = {}
-    for metric, heading, digits in SHOWN_METRICS:
+    for metric, heading, digits in TABLE_METRICS:
         cells[heading] = f"{metric_estimate(episodes, metric).mean:.{digits}f}"
-        for name, others in baselines.items():
-            difference = None if others in (None, episodes) else paired_difference(episodes, others, metric)
+        for name, baseline in baselines.items():
+            difference = None if baseline in (None, episodes) else paired_difference(episodes, baseline, metric)
             cells[f"{heading}, difference to {name}"] = estimate_text(difference, digits, "+")
-    feasible = sum(row["feasibility"] == FEASIBLE for row in episodes)
+    feasible_count = sum(row["feasibility"] == FEASIBLE for row in episodes)
     cells["min time gap [s]"] = f"{min(row['min_time_gap'] for row in episodes):.2f}"
     is_human = baselines["human"] is episodes
-    return cells | {"feasible episodes": NO_VALUE_TEXT if is_human else f"{feasible} of {len(episodes)}"}
+    return cells | {"feasible episodes": NO_VALUE_TEXT if is_human else f"{feasible_count} of {len(episodes)}"}
 
 
 def family_table(folder: Path) -> pd.DataFrame:
-    """Return what `unjam:best` and the retuned experts gain over human drivers, with both cars, by kind of road."""
+    """Return the gain in speed of `unjam:best` and the retuned experts, with both cars, by group of roads."""
     rows, table = read_part(folder, FAMILY_PART), list[dict[str, Any]]()
     speed = {(row["road"], row["car"], row["driver"]): np.mean(row["speeds"]) for row in rows}
     for group, roads in family_groups().items():
 
-        def difference(car: str, driver: str, other: tuple[str, str], roads: list[str] = roads) -> str:
-            values = [speed[road, car, driver] - speed[(road, *other)] for road in roads]
+        def difference(car: str, driver: str, baseline: tuple[str, str], roads: list[str] = roads) -> str:
+            values = [speed[road, car, driver] - speed[(road, *baseline)] for road in roads]
             return estimate_text(estimate(values), 2, "+")
 
         best, human = FAMILY_CONTROLLER, HUMAN_LABEL
@@ -233,18 +234,18 @@ def family_table(folder: Path) -> pd.DataFrame:
 
 
 def string_figure(folder: Path) -> Figure:
-    """Draw the mean speed of all vehicles over the string gain of the tuned experts, for each road."""
+    """Draw the mean speed of all vehicles over the string gain of the tuned experts on each road."""
     figure = new_figure(3.0)
     panels: Sequence[Any] = figure.subplots(1, len(STRING_ROADS), squeeze=False)[0]
     for axes, road in zip(panels, STRING_ROADS, strict=True):
         rows, human = tuned_rows(road, folder)
-        speed = np.mean([row["mean_speed"] for row in human])
-        axes.axhline(speed, color=LINE_COLORS[2], ls="--", label="human drivers")
+        human_speed = np.mean([row["mean_speed"] for row in human])
+        axes.axhline(human_speed, color=LINE_COLORS[2], ls="--", label="human drivers")
         for color, expert in zip(LINE_COLORS, dict.fromkeys(row["expert"] for row in rows), strict=False):
-            own = sorted((row for row in rows if row["expert"] == expert), key=lambda row: row["gain"])
-            speeds = [metric_estimate(row["episodes"], "mean_speed") for row in own]
-            bars = [[each.mean - each.low for each in speeds], [each.high - each.mean for each in speeds]]
-            gains, means = [row["gain"] for row in own], [each.mean for each in speeds]
+            expert_rows = sorted((row for row in rows if row["expert"] == expert), key=lambda row: row["gain"])
+            speeds = [metric_estimate(row["episodes"], "mean_speed") for row in expert_rows]
+            bars = [[speed.mean - speed.low for speed in speeds], [speed.high - speed.mean for speed in speeds]]
+            gains, means = [row["gain"] for row in expert_rows], [speed.mean for speed in speeds]
             axes.errorbar(gains, means, bars, color=color, ls="", marker="o", label=expert)
         axes.axvline(MAX_STRING_GAIN, color="0.7", lw=0.8)
         axes.set(title=road, xlabel="largest string gain", ylabel="mean speed [m/s]")

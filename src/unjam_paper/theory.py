@@ -1,6 +1,6 @@
-"""Measurable quantities of the theorems of the paper, and the cost of training (Figure 8).
+"""Measurable quantities of the theorems of the paper, and training times (Figure 8).
 
-Theorem A1 is about untrained policies, A2 about convergence, A3 about the model and its bound.
+Theorem A1 is about untrained policies, A2 about convergence, and A3 about the model and its bound.
 """
 
 import tempfile
@@ -41,7 +41,7 @@ CONVERGENCE_TOLERANCE = 0.05
 TIMED_ROAD = "ring"
 TIMED_VARIANTS = ("trpo", "ppo", "sac", "mb-trpo", "without-model", "proposed", "proposed-ppo", "proposed-sac", "ours")
 TIMED_STEPS, TIMED_START_STEPS, TIMING_ROUNDS = 24_000, 3_000, 3
-"""environment steps of each timed training, those before SAC's first update, and rounds over all variants"""
+"""environment steps of each timed training and before the first update of SAC; rounds over all variants"""
 
 
 def random_network(inputs: int, authority: float, seed: int) -> Network:
@@ -56,7 +56,7 @@ def random_network(inputs: int, authority: float, seed: int) -> Network:
 
 
 def untrained_rows(road: str, policies: int, workers: int) -> Table:
-    """A1: return of the expert plus a random residual and of a random network alone, on the same seeds."""
+    """Return the returns of the expert, of the expert with random residuals, and of random networks alone (A1)."""
     config = PlannedRun(road, "proposed", 0).config
     scenario, expert, inputs = config.make_scenario(), config.make_expert(), config.policy.inputs
     limit = scenario.action_limit
@@ -66,7 +66,7 @@ def untrained_rows(road: str, policies: int, workers: int) -> Table:
         drivers[f"{kind} {number}"] = ResidualDriver(base, network, limit, inputs)
     with WorkerPool(workers) as pool:
         evaluation = evaluate(scenario, drivers, held_out_seeds(4), pool)
-    returns = {label: metric_estimate(own, "return").mean for label, own in evaluation.rows.items()}
+    returns = {label: metric_estimate(rows, "return").mean for label, rows in evaluation.rows.items()}
     rows: Table = []
     for kind in bases:
         values = [returns[f"{kind} {number}"] for number in range(policies)]
@@ -76,28 +76,33 @@ def untrained_rows(road: str, policies: int, workers: int) -> Table:
 
 
 def convergence_rows(study_folder: StudyFolder, road: str, seeds: int) -> Table:
-    """A2: which trainings come within a tolerance of the best known return, and after how many steps."""
+    """Return the steps after which trainings come within a tolerance of the best known return, by variant (A2)."""
     runs = study_folder.trained_runs(road, CONVERGENCE_VARIANTS, seeds)
-    best = max(row["return_mean"] for found in runs.values() for run in found for row in run.progress)
+    best = max(row["return_mean"] for trainings in runs.values() for run in trainings for row in run.progress)
     threshold = best - CONVERGENCE_TOLERANCE * abs(best)
     rows = []
-    for variant, found in runs.items():
-        close = ((row["environment_steps"] for row in run.progress if row["return_mean"] >= threshold) for run in found)
-        steps = [next(each, None) for each in close]
-        last = [run.final_training_mean("return_mean") for run in found]
+    for variant, trainings in runs.items():
+        steps = [
+            next((row["environment_steps"] for row in run.progress if row["return_mean"] >= threshold), None)
+            for run in trainings
+        ]
+        last = [run.final_training_mean("return_mean") for run in trainings]
         row = {"variant": variant, "name": VARIANTS[variant].label, "best_known": best, "convergence_steps": steps}
-        row |= {"converged_at_end": sum(value >= threshold for value in last), "trainings": len(found)}
+        row |= {"converged_at_end": sum(value >= threshold for value in last), "trainings": len(trainings)}
         rows.append({**row, "last": asdict(estimate_over_trainings(last))})
     return rows
 
 
 def model_error_history(study_folder: StudyFolder, road: str, seeds: int) -> dict[str, list[Table]]:
-    """A3: eps_m, k*, the bound and the gap between returns in model and environment, by variant and seed."""
+    """Return eps_m, k*, the bound and the gap between returns in model and environment, by variant and seed (A3)."""
     runs = study_folder.trained_runs(road, MODEL_VARIANTS, seeds)
-    return {variant: [[_model_facts(row) for row in run.progress] for run in found] for variant, found in runs.items()}
+    return {
+        variant: [[_model_quantities(row) for row in run.progress] for run in trainings]
+        for variant, trainings in runs.items()
+    }
 
 
-def _model_facts(row: dict[str, Any]) -> dict[str, Any]:
+def _model_quantities(row: dict[str, Any]) -> dict[str, Any]:
     model = row["model"]
     returns = model.get("return_model"), model.get("return_environment")
     gap = None if None in returns else abs(returns[0] - returns[1])
@@ -107,15 +112,15 @@ def _model_facts(row: dict[str, Any]) -> dict[str, Any]:
 
 @rc_context(PLOT_STYLE)
 def model_error_figure(by_variant: dict[str, list[Table]]) -> Figure:
-    """Draw the model error and the rollout length over training, one line per training."""
+    """Draw model error and rollout length over environment steps, one line per training."""
     figure = new_figure(3.4)
     panels = figure.subplots(1, 2)
     titles = {"eps_m": "model error eps_m (unexplained variance)", "k_star": "rollout length k* [control steps]"}
     for (name, title), axes in zip(titles.items(), panels, strict=True):
         for (variant, runs), color in zip(by_variant.items(), LINE_COLORS[1:], strict=False):
-            for number, run in enumerate(runs):
+            for seed, run in enumerate(runs):
                 steps = [row["steps"] / 1000.0 for row in run]
-                label = VARIANTS[variant].label if number == 0 else None
+                label = VARIANTS[variant].label if seed == 0 else None
                 axes.plot(steps, [row[name] for row in run], color=color, lw=1.2, label=label)
         axes.set(title=title, xlabel="environment steps [thousands]")
     panels[1].set_yscale("log")  # from 2 to 500
@@ -124,7 +129,7 @@ def model_error_figure(by_variant: dict[str, list[Table]]) -> Figure:
 
 
 def theory_study(title: str, road: str, untrained_roads: Sequence[str]) -> Study:
-    """Return the study of trainings on a road, and of untrained policies on several."""
+    """Return the study of trainings on a road, and of untrained policies on several roads."""
     variants = tuple(dict.fromkeys((*CONVERGENCE_VARIANTS, *MODEL_VARIANTS)))
 
     def write(study_folder: StudyFolder, seeds: int, folder: Path) -> None:
@@ -136,7 +141,8 @@ def theory_study(title: str, road: str, untrained_roads: Sequence[str]) -> Study
         title,
         make_runs=lambda seeds: planned_runs([road], variants, seeds),
         make_parts=lambda study_folder, seeds: {
-            f"theory/{each}": (untrained_rows, (each, RANDOM_POLICIES)) for each in untrained_roads
+            f"theory/{untrained_road}": (untrained_rows, (untrained_road, RANDOM_POLICIES))
+            for untrained_road in untrained_roads
         },
         write=write,
         minutes=8.0,
@@ -145,35 +151,37 @@ def theory_study(title: str, road: str, untrained_roads: Sequence[str]) -> Study
 
 
 def measure_training_time(steps: int, rounds: int, workers: int) -> dict[str, Any]:
-    """Return the wall time of the parts of training per 1,000 environment steps [s], by variant and round.
+    """Return the wall time of each part of training per 1,000 environment steps [s], by variant and round.
 
-    The variants are trained in turn, so that other load affects all of them; figures show the `median` round.
+    The variants are trained in turn, so that other load on the machine affects all of them. Figures show median rounds.
     """
     torch.set_num_threads(1)
-    measured: dict[str, list[dict[str, float]]] = {variant: [] for variant in TIMED_VARIANTS}
-    with WorkerPool(1) as pool, tempfile.TemporaryDirectory() as place:
+    times: dict[str, list[dict[str, float]]] = {variant: [] for variant in TIMED_VARIANTS}
+    with WorkerPool(1) as pool, tempfile.TemporaryDirectory() as parent:
         for number, variant in product(range(rounds), TIMED_VARIANTS):
             config = PlannedRun(TIMED_ROAD, variant, number).config
-            # SAC begins earlier, otherwise mostly its start would be measured.
+            # With an earlier first update, less of the time is that of the start of SAC.
             sac = replace(config.sac, learning_starts=TIMED_START_STEPS)
             evaluation = replace(config.evaluation, validation_interval=0)
             config = replace(config, steps=steps, sac=sac, evaluation=evaluation)
-            folder = Path(place) / f"{variant}-{number}"
+            folder = Path(parent) / f"{variant}-{number}"
             create_run_folder(folder, config)
             Trainer(folder, config, pool).train()
             rows = read_progress(folder)
             thousands, parts = rows[-1]["environment_steps"] / 1000.0, seconds_by_part(rows)
             parts.pop("validation", None)  # switched off, because it is the same for all variants
-            measured[variant].append({part: each / thousands for part, each in parts.items()})
-    ordered = {variant: sorted(each, key=lambda parts: sum(parts.values())) for variant, each in measured.items()}
-    medians = {variant: each[len(each) // 2] for variant, each in ordered.items()}
+            times[variant].append({part: seconds / thousands for part, seconds in parts.items()})
+    medians = {
+        variant: sorted(seconds, key=lambda parts: sum(parts.values()))[len(seconds) // 2]
+        for variant, seconds in times.items()
+    }
     totals = {variant: sum(parts.values()) for variant, parts in medians.items()}
     relative = {variant: total / totals[TIMED_VARIANTS[0]] for variant, total in totals.items()}
-    return {"rounds": measured, "median": medians, "relative_to_trpo": relative}
+    return {"rounds": times, "median": medians, "relative_to_trpo": relative}
 
 
 def training_time_bars(seconds: dict[str, dict[str, float]]) -> Figure:
-    """Draw the parts of training as one stacked bar per variant."""
+    """Draw the times of the parts of training as a stacked bar for each variant."""
     bars = {VARIANTS[variant].label: parts for variant, parts in seconds.items()}
     figure = stacked_bars(bars, "wall time per 1,000 environment steps [s]", height=0.4 * len(bars) + 1.2)
     figure.axes[0].invert_yaxis()

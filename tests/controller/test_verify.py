@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
-from tests.conftest import random_network, strangers_driver
+from tests.conftest import random_network, unrun_driver
 from tests.controller.test_file import ABOUT, residual, written
 from tests.controller.test_sample import perceived
 from unjam.controller import controller_bytes, load_controller
@@ -89,7 +89,7 @@ def test_what_a_recipe_leaves_out_is_said_to_be_a_default(tmp_path: Path) -> Non
 def test_code_of_a_folder_runs_only_where_it_is_trusted(tmp_path: Path) -> None:
     code, ran = tmp_path / "code.py", tmp_path / "ran"
     code.write_text("def gentle(state):\n    return 0.1 * (state.leader_speed - state.speed)\n")
-    held = residual(strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n"))
+    held = residual(unrun_driver(code, f"open({str(ran)!r}, 'w').close()\n"))
     (tmp_path / "controller.unjam").write_bytes(controller_bytes(held, ABOUT))
     alone = refusal_message(tmp_path / "controller.unjam")
     assert alone.endswith("Python code (code.py), which a file by itself may not run; use the run folder")

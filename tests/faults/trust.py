@@ -14,7 +14,7 @@ import numpy as np
 import psutil
 import pytest
 
-from tests.conftest import strangers_driver
+from tests.conftest import unrun_driver
 from tests.controller.test_file import residual
 from tests.faults.outcome import Outcome, one_line
 from tests.system.test_untrusted_code import COMMANDS
@@ -241,7 +241,7 @@ def codes(count: int, folder: Path, generator: np.random.Generator) -> Outcome:
         (run / "best.toml").write_text((run / "config.toml").read_text())
         straight(place, CARS)
         code.write_text(f"{GENTLE}seen = gentle\n")
-        user_driver = strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n")
+        user_driver = unrun_driver(code, f"open({str(ran)!r}, 'w').close()\n")
         driver, where = _nest_driver(user_driver, generator)
         (run / "controller.unjam").write_bytes(controller_bytes(driver, {}))
         before = sorted(place.rglob("*"))

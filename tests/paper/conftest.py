@@ -28,8 +28,6 @@ SMALL: dict[str, Any] = {
     "model.members": 2,
 }
 SMALL_STUDY = comparison_study("two variants on a small ring", ("plain", "with-model"), "small")
-
-
 REFERENCES = {"human": "human", "PI": "pi", "ACC": "acc"}
 TUNED = {"tuned PI": "pi:window=20"}
 SMALL_VARIANTS = {
@@ -58,7 +56,7 @@ def add_small_study(patch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def reproduced(tmp_path_factory: pytest.TempPathFactory, small_study: pytest.MonkeyPatch) -> tuple[Path, list[str]]:
-    """The folder of a study, with trainings in this process and without reports, and the messages."""
+    """Return the folder of the reproduced study `small`, with trainings in this process, and the messages."""
     small_study.setattr(reproduction, "run_all", run_here)
     small_study.setattr("unjam.training.train.write_report_page", lambda folders, path: path.touch())
     folder, messages = tmp_path_factory.mktemp("studies"), []

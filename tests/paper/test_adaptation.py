@@ -28,18 +28,18 @@ from unjam_paper.adaptation import (
 )
 
 RING = Ring(horizon=120, cavs=2)
-AT = 40
+CHANGE = 40
 
 
 @pytest.fixture
 def early_change(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(adaptation, "CHANGE_STEP", AT)
+    monkeypatch.setattr(adaptation, "CHANGE_STEP", CHANGE)
 
 
 def speeds_on(world: type[RingBatch], ring: Ring = RING, driver: str = "pi") -> Floats:
-    """Speeds of all vehicles, shape (control steps + 1, vehicles)."""
-    made = start_batch_drive(world([ring], [(1,)]), driver_from_name(driver, ring.control_step))
-    return finish_drive(made)[0].speeds
+    """Return the speeds of all vehicles, shape (control steps + 1, vehicles)."""
+    drive = start_batch_drive(world([ring], [(1,)]), driver_from_name(driver, ring.control_step))
+    return finish_drive(drive)[0].speeds
 
 
 @pytest.mark.usefixtures("early_change")
@@ -47,16 +47,15 @@ def speeds_on(world: type[RingBatch], ring: Ring = RING, driver: str = "pi") -> 
 def test_speeds_differ_only_after_the_change(world: type[ChangingRings]) -> None:
     ring = replace(RING, cavs=1) if world is WaveArrives else RING
     unchanged, changed = speeds_on(RingBatch, ring), speeds_on(world, ring)
-    np.testing.assert_array_equal(changed[: AT + 1], unchanged[: AT + 1])
-    assert not np.array_equal(changed[AT + 10 :], unchanged[AT + 10 :])
+    np.testing.assert_array_equal(changed[: CHANGE + 1], unchanged[: CHANGE + 1])
+    assert not np.array_equal(changed[CHANGE + 10 :], unchanged[CHANGE + 10 :])
 
 
 @pytest.mark.usefixtures("early_change")
 def test_a_human_driven_vehicle_brakes_to_a_low_speed() -> None:
     ring = replace(RING, cavs=1, warmup=400)
-    before, after = speeds_on(WaveArrives, ring)[[AT, AT + 60]]
-    slow = np.flatnonzero((after <= 0.5 + 0.3) & (before > 1.5))
-    assert len(slow), "noise is added to the commanded speed"
+    speeds_before, speeds_after = speeds_on(WaveArrives, ring)[[CHANGE, CHANGE + 60]]
+    assert ((speeds_after <= 0.5 + 0.3) & (speeds_before > 1.5)).any(), "noise is added to the commanded speed"
 
 
 @pytest.mark.usefixtures("early_change")
@@ -70,21 +69,13 @@ def test_human_drivers_that_follow_closer_are_faster_in_the_end() -> None:
 
 @pytest.mark.usefixtures("early_change")
 def test_only_the_last_cav_switches_off() -> None:
-    lone = replace(RING, noise=0.0, actuator=INSTANT_ACTUATOR)
-    indices = [index for index, name in enumerate(_names(lone)) if name in _cavs(lone)]
-    unchanged, changed = speeds_on(RingBatch, lone), speeds_on(CAVSwitchesOff, lone)
-    first, last = indices
-    difference = np.abs(changed - unchanged)[AT + 1]
+    ring = replace(RING, noise=0.0, actuator=INSTANT_ACTUATOR)
+    road = RingBatch([ring], [(1,)]).roads[0]
+    first, last = (index for index, vehicle_id in enumerate(road.vehicle_ids) if vehicle_id in road.cav_ids)
+    unchanged, changed = speeds_on(RingBatch, ring), speeds_on(CAVSwitchesOff, ring)
+    difference = np.abs(changed - unchanged)[CHANGE + 1]
     assert difference[last] > 0.0
     assert difference[first] == 0.0
-
-
-def _names(ring: Ring) -> tuple[str, ...]:
-    return RingBatch([ring], [(1,)]).roads[0].vehicle_ids
-
-
-def _cavs(ring: Ring) -> tuple[str, ...]:
-    return RingBatch([ring], [(1,)]).roads[0].cav_ids
 
 
 def test_a_driver_has_settled_when_it_stays_near_the_limit_for_the_last_minute() -> None:

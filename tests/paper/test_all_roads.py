@@ -46,8 +46,8 @@ def test_each_driver_has_mean_gains_and_the_difference_to_the_first() -> None:
             assert table.loc[label, heading] == by_road.loc["mean", label]
             assert table.loc[label, f"worst, {heading}"] == by_road.loc["worst", label]
         mean = table[heading].str.split().str[0].astype(float)
-        more = table[f"unjam:best, difference to it, {heading}"].iloc[1:].str.split().str[0].astype(float)
-        assert list(mean.iloc[0] - mean.iloc[1:]) == pytest.approx(list(more), abs=0.011)
+        differences = table[f"unjam:best, difference to it, {heading}"].iloc[1:].str.split().str[0].astype(float)
+        assert list(mean.iloc[0] - mean.iloc[1:]) == pytest.approx(list(differences), abs=0.011)
     assert table.iloc[0]["unjam:best, difference to it, training"] == ""
 
 
@@ -55,17 +55,17 @@ def test_the_combination_of_two_controllers_has_the_gain_of_each_on_its_road_typ
     table, roads = all_drivers_table(RESULTS).set_index(""), road_gains(RESULTS)
     gains = {name: road["by_seed"] for name, road in roads.items() if road["part"] == "training"}
     mean = sum(
-        own["jam-ahead, tuned on all roads" if name.startswith("on-ramp") else "PI, tuned on all roads"].mean()
-        for name, own in gains.items()
+        seeds["jam-ahead, tuned on all roads" if name.startswith("on-ramp") else "PI, tuned on all roads"].mean()
+        for name, seeds in gains.items()
     ) / len(gains)
     assert float(table.loc[TWO_FORMULAS_LABEL, "training"].split()[0]) == pytest.approx(mean, abs=0.005)
 
 
 def test_the_gain_of_the_best_expert_is_one() -> None:
     for road in road_gains(RESULTS).values():
-        assert all(MIN_GAIN <= found.mean <= MAX_GAIN for found in road["gains"].values())
-        one = road["gains"].get(road["best"])
-        assert one is None or one.mean in (0.0, pytest.approx(1.0)), "no potential gain, or the reference"
+        assert all(MIN_GAIN <= gain.mean <= MAX_GAIN for gain in road["gains"].values())
+        best_gain = road["gains"].get(road["best"])
+        assert best_gain is None or best_gain.mean in (0.0, pytest.approx(1.0)), "no potential gain, or the reference"
 
 
 def test_the_best_driver_is_feasible_in_every_episode() -> None:

@@ -42,17 +42,17 @@ def test_a_road_is_assessed_once_and_its_results_have_all_drivers(
     monkeypatch.setattr(assess_examples, "MAX_EPISODES", 15)
     monkeypatch.setattr(open_test_roads, "EPISODE_SECONDS", 60.0)
     ASSESS_EXAMPLES.run(StudyFolder(tmp_path), 1, out, 2)
-    found: dict[str, Any] = read_part(out, EXAMPLES_PART)["first"]
-    human, acc, controller = found["drivers"]
+    results: dict[str, Any] = read_part(out, EXAMPLES_PART)["first"]
+    human, acc, controller = results["drivers"]
     assert (human["driver"], acc["driver"]) == ("human", "cruise")
-    assert controller["driver"] in found["rejection_reasons"]
-    assert controller["difference"]["count"] == found["test_seeds"] == 3
+    assert controller["driver"] in results["rejection_reasons"]
+    assert controller["difference"]["count"] == results["test_seeds"] == 3
     assert controller["verdict"].startswith("3 test seeds, where 10 are needed")
     assert acc["travel_time"] == pytest.approx(human["travel_time"] + acc["difference"]["mean"])
-    assert len(found["sentences"]) == 2
+    assert len(results["sentences"]) == 2
     assert list(examples_table(out)["driver"]) == ["human", "cruise", controller["driver"]]
     short["second"] = (write, 0.3)
     ASSESS_EXAMPLES.run(StudyFolder(tmp_path), 1, out, 2)
     assert len(written) == 2
     assert list(read_part(out, EXAMPLES_PART)) == ["first", "second"]
-    assert read_part(out, EXAMPLES_PART)["first"] == found
+    assert read_part(out, EXAMPLES_PART)["first"] == results

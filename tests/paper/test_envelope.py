@@ -19,8 +19,8 @@ def test_rings_have_the_documented_range() -> None:
     assert {ring.vehicles for ring in rings} == {5, 11, 22, 44}
     assert {ring.cavs for ring in rings} == {1, 2, 3}
     assert {ring.warmup > 0 for ring in rings} == {True, False}
-    of_22 = [ring.length for ring in rings if ring.vehicles == 22]
-    assert min(low for low, _ in of_22) < 220 < 270 < max(high for _, high in of_22)
+    lengths_of_22 = [ring.length for ring in rings if ring.vehicles == 22]
+    assert min(low for low, _ in lengths_of_22) < 220 < 270 < max(high for _, high in lengths_of_22)
 
 
 def test_without_the_safety_checks_of_sumo_the_safety_filter_is_active() -> None:
@@ -33,11 +33,11 @@ def test_without_the_safety_checks_of_sumo_the_safety_filter_is_active() -> None
 
 @pytest.mark.slow
 def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = "unjam:ring-gap-tuned"
+    controller = "unjam:ring-gap-tuned"
     for name in ("CONTROLLER_ROADS", "USUAL_CAR_ROADS"):
-        monkeypatch.setattr(envelope, name, {one: "ring"})
+        monkeypatch.setattr(envelope, name, {controller: "ring"})
     for name in ("IMPAIRED_DRIVERS", "RING_CONTROLLERS", "USUAL_CAR_CONTROLLERS", "USUAL_CAR_PACERS"):
-        monkeypatch.setattr(envelope, name, (one,))
+        monkeypatch.setattr(envelope, name, (controller,))
     for name in ("ENVELOPE_SEEDS", "RAW_ACTUATION_SEEDS", "IMPAIRED_SEEDS"):
         monkeypatch.setattr(envelope, name, 1)
     short = Ring(length=(60, 60), vehicles=5, horizon=60)
@@ -56,4 +56,4 @@ def test_all_tables_can_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert tables["rings"].loc[0, "feasible on"] == "1 of 1 roads"
     assert tables["rings-raw-usual-car"].loc[0, ["control steps", "in contact"]].tolist() == ["60", 0]
     assert tables["lanes-raw"]["control steps"].tolist() == ["180", "1,800"], "on three lanes for 60 s"
-    assert tables["impaired"].columns.tolist() == ["impairment", "human", one]
+    assert tables["impaired"].columns.tolist() == ["impairment", "human", controller]

@@ -27,7 +27,7 @@ from unjam_paper.study import StudyFolder
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     settings = {
-        name: FourRegimesSettings(samples=6000, driver=one.driver) for name, one in figure_6.DATA_SETTINGS.items()
+        name: FourRegimesSettings(samples=6000, driver=data.driver) for name, data in figure_6.DATA_SETTINGS.items()
     }
     monkeypatch.setattr(figure_6, "DATA_SETTINGS", settings)
     monkeypatch.setattr(figure_6, "NetworkSettings", lambda: NetworkSettings(hidden=(4,), epochs=2))
@@ -37,10 +37,10 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def test_every_size_is_repeated_five_times_with_both_networks() -> None:
-    main = [
+    main_fits = [
         fit for fit in four_regime_fits() if (fit.driver, fit.split, fit.is_long) == ("other", "trajectories", False)
     ]
-    counts = Counter((fit.size, fit.network) for fit in main if fit.network != NEAREST_ROW)
+    counts = Counter((fit.size, fit.network) for fit in main_fits if fit.network != NEAREST_ROW)
     assert counts == {(size, network): 5 for size in TRAINING_SIZES for network in ("knowledge", "vanilla")}
     assert len({fit.name for fit in four_regime_fits()}) == len(four_regime_fits())
 
@@ -81,9 +81,9 @@ def test_with_the_true_model_as_base_the_error_is_smaller(small: None) -> None:
 
 
 def test_the_study_writes_results_and_a_figure(small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen = [FourRegimeFit("other", name, size, 0) for name in ("knowledge", "vanilla") for size in (0.3, 1.0)]
+    main_fits = [FourRegimeFit("other", name, size, 0) for name in ("knowledge", "vanilla") for size in (0.3, 1.0)]
     long_fits = [FourRegimeFit("other", name, 0.01, 0, is_long=True) for name in ("knowledge", "vanilla")]
-    monkeypatch.setattr(figure_6, "four_regime_fits", lambda: [*chosen, *long_fits])
+    monkeypatch.setattr(figure_6, "four_regime_fits", lambda: [*main_fits, *long_fits])
     figure_6.FIGURE_6.run(StudyFolder(tmp_path), 1, tmp_path, 1)
     rows = json.loads((tmp_path / "figure-6.json").read_text())["rows"]
     assert len(rows) == 6

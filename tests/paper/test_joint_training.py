@@ -29,15 +29,14 @@ ALL_ROADS = Path(__file__).parents[2] / "results/all-roads.json"
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Three rings with three trainings each, which have the rows of known drivers."""
+    """Return the results of three rings with three trainings each, which have the rows of known drivers."""
     for number, name in enumerate(("ring-22-grown", "ring-44-grown", "ring-22-dense")):
-        at = list(FAMILY).index(name)
-        found = read_part(ALL_ROADS, f"{at:02d}")
-        rows = found["rows"]
+        results = read_part(ALL_ROADS, f"{list(FAMILY).index(name):02d}")
+        rows = results["rows"]
         careful, slow = rows["unjam:best"], rows["jam-ahead"]
-        found["rows"] |= dict.fromkeys(RING_BASELINES, careful) | {found["best"]: careful}
-        found["rows"] |= {"residual 0": careful, "residual 1": careful, "residual 2": slow}
-        (tmp_path / f"{number:02d}.json").write_text(json.dumps(found))
+        results["rows"] |= dict.fromkeys(RING_BASELINES, careful) | {results["best"]: careful}
+        results["rows"] |= {"residual 0": careful, "residual 1": careful, "residual 2": slow}
+        (tmp_path / f"{number:02d}.json").write_text(json.dumps(results))
     return tmp_path
 
 
@@ -61,8 +60,8 @@ def test_a_table_has_only_the_roads_of_its_parts(folder: Path) -> None:
 
 def test_shared_rings_are_evaluated_on_fresh_seeds_and_unseen_rings() -> None:
     assert not set(FRESH_TEST_SEEDS) & set(FAMILY_TEST_SEEDS)
-    new = [name for name in SHARED_RING_ROADS if name not in FAMILY]
-    assert len(new) == 8
+    additional = [name for name in SHARED_RING_ROADS if name not in FAMILY]
+    assert len(additional) == 8
     for name, road in SHARED_RING_ROADS.items():
         assert road.part == (FAMILY[name].part if name in FAMILY else "axis")
         assert road.options["cavs"] >= MIN_SHARED_PENETRATION_RATE * road.options["vehicles"]
@@ -98,9 +97,9 @@ def test_all_drivers_of_a_ring_have_the_same_seeds(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("unjam_paper.all_roads.best_feasible_driver", lambda rows: "pi")
     drivers = RING_BASELINES | {"residual 0": "runs/0"}
     name, experts = "ring-22-grown", FAMILY_EXPERTS["rings"]
-    found = measure_road(name, FAMILY[name], experts, drivers, FAMILY_TEST_SEEDS, in_batches=True, workers=1)
+    results = measure_road(name, FAMILY[name], experts, drivers, FAMILY_TEST_SEEDS, in_batches=True, workers=1)
     (candidates, tuning), (evaluated, testing) = runs
     assert {"human", "pi", RINGS_EXPERT} <= evaluated
     assert "runs/0" in evaluated - candidates
     assert not set(tuning) & set(testing)
-    assert (found["best"], found["part"]) == ("pi", "training")
+    assert (results["best"], results["part"]) == ("pi", "training")

@@ -48,15 +48,15 @@ from unjam_paper.study import StudyFolder
 
 
 def human_rows(delay: float = 100.0) -> list[dict[str, Any]]:
-    """Return human traffic that breaks down on even settings only."""
+    """Return episodes of human traffic that breaks down on settings with even numbers only."""
     return [
         {
-            "setting": each.number,
+            "setting": setting.number,
             "seed": seed,
-            "travel_time": each.free_flow_time + delay,
-            "breakdown_time": None if each.number % 2 else 600.0,
+            "travel_time": setting.free_flow_time + delay,
+            "breakdown_time": None if setting.number % 2 else 600.0,
         }
-        for each in SETTINGS[:SETTINGS_PER_HALF]
+        for setting in SETTINGS[:SETTINGS_PER_HALF]
         for seed in range(HUMAN_SEEDS)
     ]
 
@@ -147,10 +147,10 @@ def compared_rows(driver: str, number: int, delay: float, rate: float = 0.05) ->
     common = {"driver": driver, "setting": number, "penetration_rate": rate, "status": "completed", "collisions": 0}
     limits = {"min_time_gap": 1.2, "cav_min_ttc": 9.0, "cav_max_braking": 1.0, "override_share": 0.0, "has_lanes": True}
     braking = {"human_braking_beyond_4_5": 10.0, "share_short_time_gap": 0.0, "cut_in_max_braking": 0.0}
-    values = {"outflow_veh_per_h": 3000.0, "waiting_at_entrances": 0.0, "required_time_gap": 1.0}
+    flows = {"outflow_veh_per_h": 3000.0, "waiting_at_entrances": 0.0, "required_time_gap": 1.0}
     return [
         {
-            **{**common, **limits, **braking, **values},
+            **{**common, **limits, **braking, **flows},
             **{"seed": seed, "travel_time": SETTINGS[number].free_flow_time + delay + seed},
         }
         for seed in range(3)
@@ -200,7 +200,7 @@ def test_each_changed_assumption_is_a_scenario_and_has_its_row(tmp_path: Path) -
     assert sensitivity_table(tmp_path)["changed"].tolist() == [*CHANGES]
 
 
-def test_the_packaged_law_is_compared_by_source_and_penetration_rate(tmp_path: Path) -> None:
+def test_the_packaged_controller_is_compared_by_source_and_penetration_rate(tmp_path: Path) -> None:
     write_part(tmp_path, HUMAN_PART, compared_rows("human", 3, 99.0, 0.0))
     rows = [*compared_rows("cavs", 3, 109.0), *compared_rows("cavs", 3, 99.0, 0.1), *compared_rows("vehicles", 3, 49.0)]
     write_part(tmp_path, PACKAGED_PART, rows)

@@ -25,7 +25,7 @@ from unjam_paper.information_ahead import (
     roads_with_vehicles_between,
 )
 from unjam_paper.parameter_search import SearchBudget, measure_candidates
-from unjam_paper.recorded_gaps import FIXED_BY_LAW, LIMITED, RECORDED_GAPS, gap_limits, search_space
+from unjam_paper.recorded_gaps import FIXED_BY_FORMULA, LIMITED, RECORDED_GAPS, gap_limits, search_space
 from unjam_paper.recorded_residuals import MODEL_RATIOS, planned_residuals
 from unjam_paper.recorded_roads import (
     DRIVE_SETTINGS,
@@ -52,7 +52,7 @@ STEP = 0.1
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder of studies with three drives, one of them a test drive, and a network with three inputs."""
+    """Return a folder of studies with three drives, one of them a test drive, and networks with three inputs."""
     drives = tmp_path / RECORDINGS_FOLDER
     drives.mkdir(parents=True)
     times = STEP * np.arange(400)
@@ -99,8 +99,8 @@ def test_candidates_that_drive_at_once_equal_those_that_drive_alone(folder: Path
     for number in range(3):
         values = {name: float(each[number]) for name, each in parameters.items()}
         alone = measure_candidates(scenarios, make_driver(tuned_name([{"parameters": values}], method), STEP))
-        for many, one in zip(together, alone, strict=True):
-            np.testing.assert_allclose(many[number], one[0], rtol=1e-9)
+        for all_values, values in zip(together, alone, strict=True):
+            np.testing.assert_allclose(all_values[number], values[0], rtol=1e-9)
 
 
 def test_a_plan_saves_fuel_within_its_limits() -> None:
@@ -129,20 +129,20 @@ def test_the_study_tunes_trains_and_then_compares_all_drivers(folder: Path, monk
     monkeypatch.setitem(recorded_residuals.TASK_OPTIONS, "window", 30.0)
     for name, value in {"evaluation.validation_episodes": 2, "evaluation.validation_interval": 1}.items():
         monkeypatch.setitem(recorded_residuals.TRAINING_CHANGES, name, value)
-    others = {"other": {"recordings": f"{RECORDINGS_FOLDER}/2021-03-01_a.csv", "window": 20.0}}
-    monkeypatch.setattr(recorded_residuals, "OTHER_RECORDINGS", others)
+    other_recordings = {"other": {"recordings": f"{RECORDINGS_FOLDER}/2021-03-01_a.csv", "window": 20.0}}
+    monkeypatch.setattr(recorded_residuals, "OTHER_RECORDINGS", other_recordings)
     study = folder / "recorded-roads"
     RECORDED_ROADS.run(StudyFolder(folder), 1, study, 1)
-    laws = ["human", "follower-stopper", "published", "smooth-acc, tuned", "acc, tuned"]
+    formulas = ["human", "follower-stopper", "published", "smooth-acc, tuned", "acc, tuned"]
     trained = [f"smooth-acc and residual {name}" for name in MODEL_RATIOS]
     for table, part, drives in (("drivers", TRAINING_DRIVES_PART, 2), ("test", TEST_DRIVES_PART, 1)):
         frame = pd.read_csv(study / f"{table}.csv")
-        assert list(frame["driver"]) == [*laws, RING_DRIVER, PLAN_LABEL, *trained]
+        assert list(frame["driver"]) == [*formulas, RING_DRIVER, PLAN_LABEL, *trained]
         assert frame["fuel of the platoon [%]"].tolist()[0] == "–"
         assert len(read_part(study, part)) == 10 * drives
     assert list(pd.read_csv(study / "search.csv")["method"]) == ["smooth-acc", "acc"]
     settings = pd.read_csv(study / "assumptions.csv")
-    assert list(settings.columns[1:]) == laws[1:]
+    assert list(settings.columns[1:]) == formulas[1:]
     assert len(settings) == 3  # two settings, and fuel in SUMO
     assert list(pd.read_csv(study / "residuals.csv")["trainings"]) == [1, 1, 1]
     assert len(pd.read_csv(study / "waves.csv")) == 10
@@ -171,10 +171,10 @@ def test_several_trainings_are_one_driver_with_paired_drives() -> None:
 
 def test_received_speeds_are_those_of_the_first_vehicle_after_the_latency(folder: Path) -> None:
     scenarios = roads_with_vehicles_between(folder, 3)
-    now, late = received_speeds(scenarios, 0.0), received_speeds(scenarios, 2.0)
-    np.testing.assert_array_equal(late[20:], now)
-    np.testing.assert_array_equal(late[:20], np.tile(now[0], (20, 1)))
-    assert now[:, 0] == pytest.approx(15.0 + 4.0 * np.sin(STEP * np.arange(400) / 6.0))
+    current, delayed = received_speeds(scenarios, 0.0), received_speeds(scenarios, 2.0)
+    np.testing.assert_array_equal(delayed[20:], current)
+    np.testing.assert_array_equal(delayed[:20], np.tile(current[0], (20, 1)))
+    assert current[:, 0] == pytest.approx(15.0 + 4.0 * np.sin(STEP * np.arange(400) / 6.0))
 
 
 def test_each_candidate_receives_the_speeds_of_its_own_road(folder: Path) -> None:
@@ -187,8 +187,8 @@ def test_each_candidate_receives_the_speeds_of_its_own_road(folder: Path) -> Non
     )
     np.testing.assert_allclose(together.fuel[0], without.fuel[0], rtol=1e-9)
     for number, scenario in enumerate(scenarios):
-        own = InformedACC(**FIXED_PARAMETERS, ahead_weight=0.7, received_speeds=received_speeds([scenario], 1.0))
-        alone = measure_candidates([scenario], own)
+        informed = InformedACC(**FIXED_PARAMETERS, ahead_weight=0.7, received_speeds=received_speeds([scenario], 1.0))
+        alone = measure_candidates([scenario], informed)
         np.testing.assert_allclose(together.fuel[1, number], alone.fuel[0, 0], rtol=1e-9)
     assert abs(together.fuel[1] / together.fuel[0] - 1.0).max() > 1e-4
 
@@ -216,7 +216,7 @@ def test_laws_are_tuned_for_each_gap_with_the_same_limits(folder: Path, monkeypa
     study = folder / "recorded-gaps"
     RECORDED_GAPS.run(StudyFolder(folder), 1, study, 1)
     names = {law: set(row["parameters"]) for row in read_part(study, "search") if (law := row["law"])}
-    assert names["smooth-acc"] - names[LIMITED] == {"averaging_time", "leader_weight"} == set(FIXED_BY_LAW[LIMITED])
+    assert names["smooth-acc"] - names[LIMITED] == {"averaging_time", "leader_weight"} == set(FIXED_BY_FORMULA[LIMITED])
     table = pd.read_csv(study / "gaps.csv", keep_default_na=False)
     assert table["law"].tolist() == [*PUBLISHED_FILES, "smooth-acc", "smooth-acc", LIMITED, LIMITED]
     assert table["tuned for a mean gap of"].tolist()[2:] == ["60 m", "40 m"] * 2
@@ -245,8 +245,10 @@ def test_a_plan_behind_human_drivers_starts_with_their_speeds_and_gaps(
     plan = plan_behind_humans(scenarios)
     planned = run_batches([EpisodeTask(each, plan, (0,)) for each in scenarios])
     human = run_batches([EpisodeTask(each, make_driver("human", STEP), (0,)) for each in scenarios])
-    for mine, other in zip(planned, human, strict=True):
-        ahead = mine.cav_columns[0] + 1
-        np.testing.assert_array_equal(mine.speeds[:, ahead:], other.speeds[:, ahead:])
-        assert np.diff(mine.positions[:, ahead - 1 : ahead + 1]).min() > 5.0  # vehicles have a length of 5 m
-        assert np.std(mine.speeds[:, ahead - 1]) < np.std(other.speeds[:, ahead - 1])
+    for planned_episode, human_episode in zip(planned, human, strict=True):
+        leader = planned_episode.cav_columns[0] + 1
+        np.testing.assert_array_equal(planned_episode.speeds[:, leader:], human_episode.speeds[:, leader:])
+        assert (
+            np.diff(planned_episode.positions[:, leader - 1 : leader + 1]).min() > 5.0
+        )  # vehicles have a length of 5 m
+        assert np.std(planned_episode.speeds[:, leader - 1]) < np.std(human_episode.speeds[:, leader - 1])

@@ -39,7 +39,8 @@ from unjam_paper.study import (
 )
 from unjam_paper.variants import TUNED_REFERENCES, VARIANTS
 
-Made = tuple[Path, list[str]]
+Reproduction = tuple[Path, list[str]]
+"""folder of studies, and messages"""
 
 
 @pytest.mark.parametrize("name", STUDIES)
@@ -75,9 +76,9 @@ def test_an_unknown_study_is_refused_with_the_known_names(tmp_path: Path) -> Non
 
 def test_a_training_of_two_studies_is_planned_once(tmp_path: Path) -> None:
     both = make_plan(["table-1", "table-2"], 2, StudyFolder(tmp_path))
-    alone = [make_plan([name], 2, StudyFolder(tmp_path)) for name in ("table-1", "table-2")]
-    assert len(set(both.runs)) == len(both.runs) < sum(len(part.runs) for part in alone)
-    assert both.seconds(2) < sum(part.seconds(2) for part in alone)
+    single_plans = [make_plan([name], 2, StudyFolder(tmp_path)) for name in ("table-1", "table-2")]
+    assert len(set(both.runs)) == len(both.runs) < sum(len(plan.runs) for plan in single_plans)
+    assert both.seconds(2) < sum(plan.seconds(2) for plan in single_plans)
     assert both.seconds(4) < both.seconds(2)
 
 
@@ -111,7 +112,7 @@ def test_the_estimated_time_is_proportional_to_the_steps() -> None:
 
 
 @pytest.mark.slow
-def test_a_study_writes_trainings_results_figure_and_manifest(reproduced: Made) -> None:
+def test_a_study_writes_trainings_results_figure_and_manifest(reproduced: Reproduction) -> None:
     folder, messages = reproduced
     for variant in ("plain", "with-model"):
         for seed in (0, 1):
@@ -128,8 +129,8 @@ def test_a_study_writes_trainings_results_figure_and_manifest(reproduced: Made) 
     assert (folder / "small-curves.png").read_bytes() == (folder / "small/curves.png").read_bytes()
     with ZipFile(folder / "small-controllers.zip") as archive:
         assert {*archive.namelist()} == {path.name for path in (folder / "small/controllers").iterdir()}
-    kept, made = folder / "small/controllers/with-model-1.unjam", folder / "runs/small/with-model/1"
-    assert kept.read_bytes() == (made / "controller.unjam").read_bytes()
+    copied, run_folder = folder / "small/controllers/with-model-1.unjam", folder / "runs/small/with-model/1"
+    assert copied.read_bytes() == (run_folder / "controller.unjam").read_bytes()
     assert sum("failed" in line for line in messages) == 0
     manifest = json.loads((folder / "small" / "manifest.json").read_text())
     assert manifest["seeds"] == 2
@@ -137,14 +138,14 @@ def test_a_study_writes_trainings_results_figure_and_manifest(reproduced: Made) 
 
 
 @pytest.mark.slow
-def test_finished_trainings_are_not_repeated(reproduced: Made) -> None:
+def test_finished_trainings_are_not_repeated(reproduced: Reproduction) -> None:
     folder, _ = reproduced
-    before = {path: path.stat().st_mtime_ns for path in (folder / "runs").rglob("controller.unjam")}
-    plan_now = make_plan(["small"], 2, StudyFolder(folder))
-    assert (plan_now.runs, plan_now.finished_count, plan_now.roads) == ([], 4, [])
+    modified = {path: path.stat().st_mtime_ns for path in (folder / "runs").rglob("controller.unjam")}
+    plan = make_plan(["small"], 2, StudyFolder(folder))
+    assert (plan.runs, plan.finished_count, plan.roads) == ([], 4, [])
     messages: list[str] = []
-    run_plan(plan_now, 2, on_message=messages.append)
-    assert {path: path.stat().st_mtime_ns for path in before} == before
+    run_plan(plan, 2, on_message=messages.append)
+    assert {path: path.stat().st_mtime_ns for path in modified} == modified
     assert len(messages) == 1
 
 
@@ -173,7 +174,7 @@ def test_reference_drivers_are_evaluated_again_after_a_change(
     assert missing_roads() == ["small"]
 
 
-def test_the_table_has_the_means_of_the_trainings(reproduced: Made) -> None:
+def test_the_table_has_the_means_of_the_trainings(reproduced: Reproduction) -> None:
     folder, _ = reproduced
     table = {row["name"]: row for row in json.loads((folder / "small" / "table.json").read_text())}
     assert list(table) == ["human", "PI", "ACC", "tuned PI", "plain", "with a model"]
@@ -223,16 +224,16 @@ def test_the_checkpoint_table_has_the_best_and_the_last_checkpoint(tmp_path: Pat
     assert row["kept the untrained network"] == "2 of 3"
 
 
-def test_a_training_with_other_settings_is_refused(reproduced: Made) -> None:
+def test_a_training_with_other_settings_is_refused(reproduced: Reproduction) -> None:
     folder, _ = reproduced
     config = folder / "runs/small/plain/0/config.toml"
-    before = config.read_text()
+    text = config.read_text()
     try:
-        atomic_write(config, before.replace("stratified = true", "stratified = false"))
+        atomic_write(config, text.replace("stratified = true", "stratified = false"))
         with pytest.raises(InputError, match="was trained with other settings; allowed: a new folder"):
             make_plan(["small"], 2, StudyFolder(folder))
     finally:
-        atomic_write(config, before)
+        atomic_write(config, text)
 
 
 CHANGES: dict[str, Callable[[bytes], bytes]] = {
@@ -293,7 +294,7 @@ def test_a_study_of_fewer_trainings_has_only_their_controllers(reproduced: Made,
 
 
 @pytest.mark.long
-def test_a_stopped_training_is_continued(reproduced: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stopped_training_is_continued(reproduced: Reproduction, monkeypatch: pytest.MonkeyPatch) -> None:
     """A stopped training has no evaluation and fewer steps than planned."""
     folder, _ = reproduced
     run = PlannedRun("small", "plain", 1)

@@ -63,9 +63,9 @@ def test_a_part_is_read_from_the_working_folder_or_from_the_file(tmp_path: Path)
     assert read_parts(path) == read_parts(folder) == PARTS
     assert read_part(path, "nested") == read_part(folder, "nested") == PARTS["nested"]
     archive = tmp_path / "study-controllers.zip"
-    before = archive.read_bytes()
+    content = archive.read_bytes()
     collect_results(folder)
-    assert archive.read_bytes() == before, "the same controllers give the same archive"
+    assert archive.read_bytes() == content, "the same controllers give the same archive"
     for source in (path, folder):
         with pytest.raises((KeyError, FileNotFoundError)):
             read_part(source, "other")

@@ -9,10 +9,10 @@ from unjam_paper.comparison import compared_variants, road_model_study
 def test_returns_are_compared_after_multiples_of_the_steps(tmp_path: Path) -> None:
     steps, ends = [12_000.0, 756_000.0], [[2000.0], [2000.0], [2000.0]]
     few = {"steps": steps, "return_validation": [[*end, 2063.0] for end in ends]}
-    modelled = {"steps": steps, "return_validation": [[*end, 2126.0] for end in ends]}
+    road_model = {"steps": steps, "return_validation": [[*end, 2126.0] for end in ends]}
     many = {"steps": [96_000.0, 6_000_000.0], "return_validation": [[1000.0, value] for value in (2e3, 2e3, 2e3)]}
     double = {"steps": [24_000.0, 1_512_000.0], "return_validation": [[*end, 2100.0] for end in ends]}
-    curves = dict(zip(compared_variants("best"), (modelled, few, double, many), strict=True))
+    curves = dict(zip(compared_variants("best"), (road_model, few, double, many), strict=True))
     (tmp_path / "curves.json").write_text(json.dumps({"ring": curves}))
     table = road_model_study("ring", "best").tables["efficiency"](tmp_path).set_index("")
     assert table.loc["unjam residual, few steps and road model", "750,000"] == "2125"

@@ -20,9 +20,9 @@ def test_experts_are_tuned_within_their_limits_and_compared_with_human_drivers(
     roads = ("ring", "ring-jammed")
 
     def short_road(name: str) -> Scenario:
-        made = make_scenario(name)
-        assert isinstance(made, Ring)
-        return replace(made, horizon=40, warmup=200, vehicles=8, length=(80, 90))
+        ring = make_scenario(name)
+        assert isinstance(ring, Ring)
+        return replace(ring, horizon=40, warmup=200, vehicles=8, length=(80, 90))
 
     monkeypatch.setattr(study, "make_scenario", short_road)
     monkeypatch.setattr(study, "STRING_SEEDS", 2)

@@ -64,8 +64,10 @@ def test_entries_of_a_part_are_joined(tmp_path: Path) -> None:
         **{f"squares/of {number}": (square, (number,)) for number in (1, 2)},
         **{f"rows/{number}": (numbers_below, (number,)) for number in (2, 3)},
     }
-    found = measure_parts(tmp_path, entries, 1)
-    assert found == {"squares": {"of 1": {"square": 1}, "of 2": {"square": 4}}, "rows": [0, 1, 0, 1, 2]}
+    assert measure_parts(tmp_path, entries, 1) == {
+        "squares": {"of 1": {"square": 1}, "of 2": {"square": 4}},
+        "rows": [0, 1, 0, 1, 2],
+    }
 
 
 PROGRAM = """
@@ -105,17 +107,17 @@ def test_a_part_is_measured_again_only_if_its_arguments_changed(tmp_path: Path) 
 
 
 def test_a_part_is_measured_again_if_a_controller_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given: dict[str, StudyPart] = {
+    entries: dict[str, StudyPart] = {
         "packaged": (named, ({"ours": "unjam:ring-tuned"},)),
         "other": (named, ({"ours": "pi"},)),
     }
     for _ in range(2):
-        measure_parts(tmp_path, given, 1)
+        measure_parts(tmp_path, entries, 1)
     assert MEASURED == ["unjam:ring-tuned", "pi"]
     monkeypatch.setattr(
         results_file, "controller_hash", lambda driver: "another" if driver.startswith("unjam:") else None
     )
-    measure_parts(tmp_path, given, 1)
+    measure_parts(tmp_path, entries, 1)
     assert MEASURED == ["unjam:ring-tuned", "pi", "unjam:ring-tuned"]
 
 
@@ -138,9 +140,9 @@ def test_a_study_keeps_its_first_manifest_and_lists_resumptions(tmp_path: Path) 
     (tmp_path / "manifest.json").write_text(json.dumps({**first, "started": "long ago"}))
     for _ in range(2):
         write_manifest(tmp_path, seeds=3)
-    found = json.loads((tmp_path / "manifest.json").read_text())
-    assert (found["started"], found["seeds"]) == ("long ago", 3)
-    assert [one["commit"] for one in found["resumptions"]] == [first["commit"]] * 2
+    last = json.loads((tmp_path / "manifest.json").read_text())
+    assert (last["started"], last["seeds"]) == ("long ago", 3)
+    assert [resumption["commit"] for resumption in last["resumptions"]] == [first["commit"]] * 2
 
 
 def test_a_published_manifest_names_no_folder_of_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +154,7 @@ def test_a_published_manifest_names_no_folder_of_the_machine(tmp_path: Path, mon
 
 def test_a_failed_episode_raises_instead_of_being_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     failed = {"status": "failed", "error": "EpisodeError", "reason": "SUMO cannot start", "seed": [1, 0]}
-    monkeypatch.setattr(study, "evaluate", lambda *given: Evaluation({"pi": [failed]}, {}))
+    monkeypatch.setattr(study, "evaluate", lambda *arguments: Evaluation({"pi": [failed]}, {}))
     with pytest.raises(EpisodeError, match=r"SUMO cannot start \(seed \[1, 0\]\)"):
         evaluate_metrics(Ring(), {}, 1, (), 1)
 
@@ -160,18 +162,18 @@ def test_a_failed_episode_raises_instead_of_being_left_out(monkeypatch: pytest.M
 def test_batches_have_the_metrics_of_sumo_except_fuel() -> None:
     road = Ring(vehicles=8, length=(85, 85), warmup=100, horizon=200)
     metrics = ("seed", "return", "mean_speed", "outflow_veh_per_h", "min_time_gap", "cav_max_braking", "steps")
-    given = road, {"human": "human", "pi": "pi", "gap PI": "unjam:ring-gap-tuned"}, 2, metrics, 1
-    in_batches, in_sumo = evaluate_in_batches(*given), evaluate_metrics(*given)
+    arguments = road, {"human": "human", "pi": "pi", "gap PI": "unjam:ring-gap-tuned"}, 2, metrics, 1
+    in_batches, in_sumo = evaluate_in_batches(*arguments), evaluate_metrics(*arguments)
     assert in_batches.keys() == in_sumo.keys()
     for label, measured in in_sumo.items():
         assert in_batches[label]["feasibility"] == measured["feasibility"]
-        for found, expected in zip(in_batches[label]["episodes"], measured["episodes"], strict=True):
-            assert found.pop("seed") == expected.pop("seed")
-            assert found == pytest.approx(expected, rel=1e-6, nan_ok=True)
+        for row, expected in zip(in_batches[label]["episodes"], measured["episodes"], strict=True):
+            assert row.pop("seed") == expected.pop("seed")
+            assert row == pytest.approx(expected, rel=1e-6, nan_ok=True)
 
 
-@pytest.mark.parametrize("kept", [[], [1, 2], [1, 3], [2, 3]])
-def test_a_finished_training_with_cut_progress_is_refused(kept: list[int], tmp_path: Path) -> None:
+@pytest.mark.parametrize("iterations", [[], [1, 2], [1, 3], [2, 3]])
+def test_a_finished_training_with_cut_progress_is_refused(iterations: list[int], tmp_path: Path) -> None:
     studies, run = StudyFolder(tmp_path), PlannedRun("ring", "trpo", 0)
     folder = studies.run_folder(run)
     create_run_folder(folder, run.config)
@@ -182,7 +184,7 @@ def test_a_finished_training_with_cut_progress_is_refused(kept: list[int], tmp_p
     (folder / "progress.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows.values()))
     assert studies.is_finished(run)
     assert studies.trained_runs("ring", ["trpo"], 1)["trpo"][0].final_training_mean("return_mean") == 3.0
-    (folder / "progress.jsonl").write_text("".join(f"{json.dumps(rows[number])}\n" for number in kept))
+    (folder / "progress.jsonl").write_text("".join(f"{json.dumps(rows[number])}\n" for number in iterations))
     for read in (lambda: studies.is_finished(run), lambda: studies.trained_runs("ring", ["trpo"], 1)):
         with pytest.raises(InputError, match=r"progress\.jsonl: rows? .* missing; allowed: all rows up to 3"):
             read()

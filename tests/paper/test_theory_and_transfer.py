@@ -16,7 +16,8 @@ from unjam_paper.comparison import comparison_rows, training_curves
 from unjam_paper.study import PlannedRun, StudyFolder
 from unjam_paper.variants import VARIANTS
 
-Made = tuple[Path, list[str]]
+Reproduction = tuple[Path, list[str]]
+"""folder of studies, and messages"""
 SMALL_VARIANTS = ("plain", "with-model")
 
 
@@ -27,19 +28,19 @@ def test_training_time_is_measured_for_all_variants_in_turn(
     monkeypatch.setattr(theory, "TIMED_ROAD", "small")
     monkeypatch.setattr(theory, "TIMED_VARIANTS", SMALL_VARIANTS)
     results = theory.measure_training_time(320, 2, workers=1)
-    found = results["rounds"]
-    assert [len(found[variant]) for variant in SMALL_VARIANTS] == [2, 2]
+    rounds = results["rounds"]
+    assert [len(rounds[variant]) for variant in SMALL_VARIANTS] == [2, 2]
     assert results["relative_to_trpo"]["plain"] == 1.0
-    plain, model = (found[variant][0] for variant in SMALL_VARIANTS)
+    plain, model = (rounds[variant][0] for variant in SMALL_VARIANTS)
     assert set(model) - set(plain) == {"fit", "roll_out"}
     assert min(plain["collect"], plain["update"], model["fit"], model["roll_out"]) > 0
-    axes = theory.training_time_bars({variant: found[variant][0] for variant in SMALL_VARIANTS}).axes[0]
+    axes = theory.training_time_bars({variant: rounds[variant][0] for variant in SMALL_VARIANTS}).axes[0]
     longest = max(sum(plain.values()), sum(model.values()))
     assert longest < axes.get_xlim()[1] < 1.2 * longest
 
 
 @pytest.mark.slow
-def test_controllers_are_evaluated_in_other_traffic(monkeypatch: pytest.MonkeyPatch, reproduced: Made) -> None:
+def test_controllers_are_evaluated_in_other_traffic(monkeypatch: pytest.MonkeyPatch, reproduced: Reproduction) -> None:
     folder, _ = reproduced
     road = {
         "scenario": "ring",
@@ -58,7 +59,7 @@ def test_controllers_are_evaluated_in_other_traffic(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.slow
-def test_controllers_and_experts_are_evaluated_under_other_conditions(reproduced: Made) -> None:
+def test_controllers_and_experts_are_evaluated_under_other_conditions(reproduced: Reproduction) -> None:
     folder, _ = reproduced
     run = folder / "runs" / "small" / "plain" / "0"
     conditions = {"as in training": {}, "noise": {"noise": 0.4}, "delay": {"impairments": {"delay": 0.3}}}
@@ -81,7 +82,9 @@ def test_controllers_and_experts_are_evaluated_under_other_conditions(reproduced
 
 
 @pytest.mark.long
-def test_all_episodes_of_figure_5_have_the_same_traffic(monkeypatch: pytest.MonkeyPatch, reproduced: Made) -> None:
+def test_all_episodes_of_figure_5_have_the_same_traffic(
+    monkeypatch: pytest.MonkeyPatch, reproduced: Reproduction
+) -> None:
     folder, _ = reproduced
     monkeypatch.setattr(comparison, "FIGURE_5_VARIANTS", SMALL_VARIANTS)
     episodes = comparison.figure_5_episodes(StudyFolder(folder), "small")
@@ -94,20 +97,20 @@ def test_all_episodes_of_figure_5_have_the_same_traffic(monkeypatch: pytest.Monk
 
 
 def test_a_variant_with_another_reward_is_compared_by_that_return(
-    monkeypatch: pytest.MonkeyPatch, reproduced: Made
+    monkeypatch: pytest.MonkeyPatch, reproduced: Reproduction
 ) -> None:
     folder, _ = reproduced
-    before = comparison_rows(StudyFolder(folder), "small", SMALL_VARIANTS, 2)[-1]
-    assert (before["gain_reference"]["metric"], math.isnan(before["return"]["mean"])) == ("return", False)
+    plain_row = comparison_rows(StudyFolder(folder), "small", SMALL_VARIANTS, 2)[-1]
+    assert (plain_row["gain_reference"]["metric"], math.isnan(plain_row["return"]["mean"])) == ("return", False)
     variant = VARIANTS["with-model"]
     other = replace(variant, changes={**variant.changes, "reward": "eq16"})
     monkeypatch.setitem(VARIANTS, "with-model", other)
     row = comparison_rows(StudyFolder(folder), "small", SMALL_VARIANTS, 2)[-1]
     assert (row["gain_reference"]["metric"], math.isnan(row["return"]["mean"])) == ("return_eq16", True)
     expert = np.mean(
-        [one["return_eq16"] for one in StudyFolder(folder).reference_rows("small")[row["gain_reference"]["expert"]]]
+        [row["return_eq16"] for row in StudyFolder(folder).reference_rows("small")[row["gain_reference"]["expert"]]]
     )
-    mean = np.mean([one["return_eq16"] for run in range(2) for one in rows_of_run(folder, run)])
+    mean = np.mean([row["return_eq16"] for seed in range(2) for row in read_run_rows(folder, seed)])
     assert row["gain_over_best_expert"]["mean"] == pytest.approx(mean - expert)
     curves = training_curves(StudyFolder(folder), "small", SMALL_VARIANTS, 2)
     assert "return_mean" in curves["plain"]
@@ -115,7 +118,7 @@ def test_a_variant_with_another_reward_is_compared_by_that_return(
     assert "cav_mean_speed" in curves["with-model"]
 
 
-def rows_of_run(folder: Path, seed: int) -> list[dict[str, Any]]:
+def read_run_rows(folder: Path, seed: int) -> list[dict[str, Any]]:
     return read_rows(folder / "runs" / "small" / "with-model" / str(seed))["trained"]
 
 
@@ -140,7 +143,7 @@ def test_a_random_network_is_initialized_as_in_torch() -> None:
 
 
 def test_convergence_is_counted_against_the_best_known_return(
-    monkeypatch: pytest.MonkeyPatch, reproduced: Made
+    monkeypatch: pytest.MonkeyPatch, reproduced: Reproduction
 ) -> None:
     folder, _ = reproduced
     monkeypatch.setattr(theory, "CONVERGENCE_VARIANTS", SMALL_VARIANTS)
@@ -156,14 +159,14 @@ def test_convergence_is_counted_against_the_best_known_return(
     assert all(0 <= row["converged_at_end"] <= row["trainings"] == 2 for row in rows)
 
 
-def test_model_errors_are_recorded_over_training(monkeypatch: pytest.MonkeyPatch, reproduced: Made) -> None:
+def test_model_errors_are_recorded_over_training(monkeypatch: pytest.MonkeyPatch, reproduced: Reproduction) -> None:
     folder, _ = reproduced
     monkeypatch.setattr(theory, "MODEL_VARIANTS", ("with-model",))
-    found = theory.model_error_history(StudyFolder(folder), "small", 2)
+    history = theory.model_error_history(StudyFolder(folder), "small", 2)
     run = PlannedRun("small", "with-model", 1)
     rows = (folder / "runs" / run.name / "progress.jsonl").read_text().splitlines()
     last = json.loads(rows[-1])
-    assert found["with-model"][1][-1]["eps_m"] == last["eps_m"]
-    assert found["with-model"][1][-1]["bound"] == last["model"]["bound"]
-    lines = theory.model_error_figure(found).axes[0].lines
+    assert history["with-model"][1][-1]["eps_m"] == last["eps_m"]
+    assert history["with-model"][1][-1]["bound"] == last["model"]["bound"]
+    lines = theory.model_error_figure(history).axes[0].lines
     assert [len(line.get_xdata()) for line in lines] == [len(rows), len(rows)]  # pyright: ignore[reportArgumentType]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import strangers_driver
+from tests.conftest import unrun_driver
 from tests.controller.test_file import residual
 from tests.system.conftest import Run
 from tests.system.test_invalid_inputs import one_line
@@ -52,7 +52,7 @@ def ran(tmp_path: Path) -> Path:
     (run / "agent.toml").write_text(to_toml(small_config(agent=f"{code}:Agent")))
     (run / "indirect.toml").write_text(to_toml(small_config(expert=f"{run / 'none' / '..' / 'code.py'}:gentle")))
     code.write_text(DRIVER)
-    driver = residual(strangers_driver(code, f"open({str(ran)!r}, 'w').close()\n"))
+    driver = residual(unrun_driver(code, f"open({str(ran)!r}, 'w').close()\n"))
     (run / "controller.unjam").write_bytes(controller_bytes(driver, {}))
     return ran
 
