@@ -286,8 +286,8 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
     """
 
     name: ClassVar[str] = "adaptive-acc"
-    own_requirements: ClassVar = Requirements(used_fields=frozenset({"allowed_speed", "distance_to_merge"}))
-    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
+    class_requirements: ClassVar = Requirements(used_fields=frozenset({"allowed_speed", "distance_to_merge"}))
+    class_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
         ScaledInput("mean own speed", SPEED_SCALE, "m/s"),
         ScaledInput("leaves a jam", 1.0, ""),
     )

@@ -51,9 +51,9 @@ class Driver(Subclassable):
 
     name: ClassVar[str] = ""
     """name for `--driver`; empty for drivers without one"""
-    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True, needs_numpy=True)
+    class_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True, needs_numpy=True)
     """requirements of the class, without those of drivers that an object contains"""
-    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = ()
+    class_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = ()
     """description of its own `memory_features`, in order"""
     portable_form: ClassVar[str] = "path.py:name, your class in a file"
     """form of such a driver that other processes can build, for messages, if it is not among the registered ones"""
@@ -111,7 +111,7 @@ class Driver(Subclassable):
     @property
     def memory_inputs(self) -> tuple[ScaledInput, ...]:
         """Description of `memory_features`, in order."""
-        return self.own_memory_inputs
+        return self.class_memory_inputs
 
     @property
     def network_inputs(self) -> tuple[ScaledInput, ...] | None:
@@ -121,7 +121,7 @@ class Driver(Subclassable):
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
         """Return what it and its inner drivers need, on `road` only those that drive there; with its `time_step`."""
         step = getattr(self, "time_step", None)
-        requirements = self.own_requirements._replace(time_steps=frozenset(() if step is None else (step,)))
+        requirements = self.class_requirements._replace(time_steps=frozenset(() if step is None else (step,)))
         return merge_requirements(requirements, *(driver.requirements(road) for driver in self.active_drivers(road)))
 
     def active_drivers(self, road: RoadInterface | None) -> Iterable["Driver"]:
@@ -140,7 +140,7 @@ class Driver(Subclassable):
 class FormulaDriver(Driver):
     """A driver with one formula for arrays, tensors and plain numbers (see `unjam.physics.arrays`)."""
 
-    own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
+    class_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
 
 def check_memory(memory: Any, rows: int, context: str) -> Memory:

@@ -24,7 +24,7 @@ class PISaturation(FormulaDriver):
     """
 
     name: ClassVar[str] = "pi"
-    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
+    class_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
         ScaledInput("mean own speed", SPEED_SCALE, "m/s"),
         ScaledInput("commanded speed", SPEED_SCALE, "m/s"),
     )

@@ -171,4 +171,4 @@ class PolicyDriver(ExpertWrapper):
 class TensorPolicyDriver(PolicyDriver):
     """A policy that also takes torch tensors, through which gradients flow from the state to the acceleration."""
 
-    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)
+    class_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)

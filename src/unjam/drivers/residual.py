@@ -95,7 +95,7 @@ class ExpertWrapper(DriverWrapper):
 class ResidualDriver(ExpertWrapper):
     """Adds the output of a network to any driver, the expert, within the action limit: Eq. 8 of the paper."""
 
-    own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
+    class_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
     expert: Driver
     network: InstanceOf[Network]

@@ -29,7 +29,7 @@ class SmoothACC(FormulaDriver):
     """
 
     name: ClassVar[str] = "smooth-acc"
-    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("mean leader speed", SPEED_SCALE, "m/s"),)
+    class_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("mean leader speed", SPEED_SCALE, "m/s"),)
 
     averaging_time: NonNegative = 8.0
     """time constant of the exponential mean of the leader's speed [s]"""
