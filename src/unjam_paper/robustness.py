@@ -97,7 +97,7 @@ def condition_rows(
 
 def _impaired_driver(name: str, impairments: Mapping[str, float], scenario: Scenario) -> Driver:
     driver, step = make_driver(name, scenario.control_step), scenario.control_step
-    is_exact = driver.is_native or not impairments
+    is_exact = driver.is_driven_by_simulator or not impairments
     return driver if is_exact else ImpairedDriver(driver, **impairments, time_step=step)
 
 

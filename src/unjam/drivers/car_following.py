@@ -41,7 +41,7 @@ class Human(FormulaDriver):
     """The human baseline: the simulator drives the vehicle as one of its human drivers, with their noise."""
 
     name: ClassVar[str] = "human"
-    is_native: ClassVar[bool] = True
+    is_driven_by_simulator: ClassVar[bool] = True
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration of the paper's IDM; the simulator does not use it."""

@@ -57,7 +57,7 @@ class Driver(Subclassable):
     """description of its own `memory_features`, in order"""
     portable_form: ClassVar[str] = "path.py:name, your class in a file"
     """form of such a driver that other processes can build, for messages, if it is not among the registered ones"""
-    is_native: ClassVar[bool] = False
+    is_driven_by_simulator: ClassVar[bool] = False
     """whether the simulator itself drives (a human driver): `act` is then not called"""
     action_repeat: int = 1
     """control steps for which one residual is repeated"""

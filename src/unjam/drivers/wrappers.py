@@ -86,7 +86,7 @@ class MixedDriver(CompositeDriver):
     drivers: tuple[Driver, ...]
 
     def __post_init__(self) -> None:
-        if any(driver.is_native for driver in self.drivers):
+        if any(driver.is_driven_by_simulator for driver in self.drivers):
             raise InputError("driver: 'human' is not allowed among several; 'idm' drives like a human driver")
 
     @cached_property
