@@ -43,7 +43,7 @@ PROXIMITY_DISTANCES = (0.0, 250.0, 500.0, 1000.0, 2000.0)
 """distances to the merge at which one component of the feature `merge_proximity` is one [m]"""
 
 
-class FeatureInputs(NamedTuple):
+class FeatureArguments(NamedTuple):
     """The arguments of a feature; n rows."""
 
     state: LocalState
@@ -58,7 +58,7 @@ class FeatureInputs(NamedTuple):
 class Feature:
     """Some inputs of a network."""
 
-    compute: Callable[[FeatureInputs], Array | None]
+    compute: Callable[[FeatureArguments], Array | None]
     """returns them, about unit size, shape (n, m); a tuple of m for plain numbers; None if there are none"""
     inputs: tuple[ScaledInput, ...] | None
     """descriptions of the columns, in order; None: `Driver.memory_inputs` of the expert describes them"""
@@ -175,7 +175,7 @@ class PolicyInput:
         factor, is_relative = unit_factor(self.unit, STATE_UNITS[name]), self.quantity in RELATIVE_SPEEDS
         is_converted = factor != 1.0 or self.offset
 
-        def compute(inputs: FeatureInputs) -> Array:
+        def compute(inputs: FeatureArguments) -> Array:
             value = getattr(inputs.state, name)
             value = value - inputs.state.speed if is_relative else value
             value = (value * factor - self.offset if is_converted else value) / self.scale
@@ -296,7 +296,7 @@ def _user_feature(function: UserFunction) -> Feature:
     random = probe_state()
     check_row_independence(lambda rows: _feature_columns(function, random.select(rows), size), function.label)
 
-    def compute(inputs: FeatureInputs) -> Array:
+    def compute(inputs: FeatureArguments) -> Array:
         like, state = inputs.state.speed, inputs.state
         is_numpy = isinstance(like, np.ndarray)
         if not is_numpy:  # tensors: users' functions take NumPy arrays only
@@ -323,7 +323,7 @@ def _feature_columns(function: UserFunction, state: LocalState, size: int | None
     return columns
 
 
-def compute_observation(names: Sequence[NetworkInput], inputs: FeatureInputs) -> Array:
+def compute_observation(names: Sequence[NetworkInput], inputs: FeatureArguments) -> Array:
     """Return the input of a network: the features concatenated, shape (n, inputs), no unit."""
     return join_columns([block for name in names if (block := feature(name).compute(inputs)) is not None])
 

@@ -13,7 +13,7 @@ from unjam.drivers.local_state import LocalState, ScaledInput
 from unjam.drivers.network import Network
 from unjam.drivers.observation import (
     FEATURES,
-    FeatureInputs,
+    FeatureArguments,
     FeatureName,
     NetworkInput,
     compute_observation,
@@ -73,7 +73,9 @@ class ExpertWrapper(DriverWrapper):
         if is_due is False:  # only for plain numbers: the residual is not computed
             observation, residual = (), memory[RESIDUAL_KEY]
         else:
-            observation = compute_observation(self.features, FeatureInputs(state, expert, self.expert, expert_memory))
+            observation = compute_observation(
+                self.features, FeatureArguments(state, expert, self.expert, expert_memory)
+            )
             residual, new_memory = self.residual(observation, state, memory, noise)
             if is_due is not True:
                 residual = namespace(residual).where(is_due, residual, memory[RESIDUAL_KEY])
@@ -140,7 +142,7 @@ class ResidualDriver(ExpertWrapper):
     def observation(self, state: LocalState, memory: Memory) -> Array:
         """Return the current input of the network, also while its residual is repeated."""
         acceleration, new_memory = self.expert.act(state, memory[EXPERT_KEY])
-        inputs = FeatureInputs(state, self.limits.clip(acceleration), self.expert, new_memory)
+        inputs = FeatureArguments(state, self.limits.clip(acceleration), self.expert, new_memory)
         return compute_observation(self.features, inputs)
 
     def describe(self) -> str:
