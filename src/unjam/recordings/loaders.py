@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from unjam.errors import InputError, unknown_name
 from unjam.physics.arrays import Floats
 from unjam.recordings.tables import check_unique, read_table
-from unjam.recordings.trajectories import FollowingTrajectory, even_times
+from unjam.recordings.trajectories import FollowingTrajectory, regular_times
 from unjam.text import format_count, shorten_list
 
 TABLE_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
@@ -328,7 +328,7 @@ def split_trajectories(
             part = rows.iloc[first:last]
             short_count -= len(part)
             pair = str(part["pair"].iloc[0])
-            speed, leader_speed, gap = _at_even_times(part, step)
+            speed, leader_speed, gap = _resample_at_regular_times(part, step)
             known = {name: part[name].head(1).dropna() for name in OPTIONAL_COLUMNS if name in part}
             driver, kind, split = ("".join(map(str, known.get(name, ()))) for name in OPTIONAL_COLUMNS)
             part_counts[pair] += 1
@@ -401,7 +401,7 @@ def _common_time_steps(steps: Sequence[float], seconds: Sequence[float]) -> list
     return common.tolist()
 
 
-def _at_even_times(rows: pd.DataFrame, step: float) -> list[Floats]:
+def _resample_at_regular_times(rows: pd.DataFrame, step: float) -> list[Floats]:
     """Return speed, leader speed and gap of rows at equal intervals, interpolated unless only times are rounded."""
     times, *values = (rows[name].to_numpy(np.float64) for name in TABLE_COLUMNS[1:])
     times = times - times[0]
@@ -413,7 +413,7 @@ def _at_even_times(rows: pd.DataFrame, step: float) -> list[Floats]:
     resolution = next((each for each in decimals if np.all(np.abs(times / each - np.round(times / each)) < 0.01)), 0.0)
     if deviation <= 0.75 * resolution:  # half of it, except for the error of the fitted line
         return values
-    return [np.interp(even_times(times[-1], step), times, each) for each in values]
+    return [np.interp(regular_times(times[-1], step), times, each) for each in values]
 
 
 def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:
