@@ -99,7 +99,7 @@ def condition_rows(
 def _impaired_driver(name: str, impairments: Mapping[str, float], scenario: Scenario) -> Driver:
     """Return a driver with impairments; human drivers have none."""
     driver = make_driver(name, scenario.control_step)
-    if driver.is_native or not impairments:
+    if driver.is_driven_by_simulator or not impairments:
         return driver
     return ImpairedDriver(driver, **impairments, time_step=scenario.control_step)
 

@@ -11,7 +11,7 @@ from unjam import check_driver
 from unjam.controller import make_driver
 from unjam.drivers.check import random_state
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.observation import FeatureInputs, as_features, compute_observation
+from unjam.drivers.observation import FeatureArguments, as_features, compute_observation
 from unjam.drivers.pi_saturation import PISaturation
 from unjam.drivers.registry import driver_from_recipe, driver_recipe, user_code_recipes
 from unjam.drivers.residual import ResidualDriver
@@ -193,7 +193,7 @@ OUTCOME = Outcome(np.ones((3, 2)), np.ones((3, 1)), np.ones((3, 1)), np.zeros(3,
 
 def number_of_feature(file: str) -> Any:
     (made,) = as_features((f"{file}:number",))
-    return compute_observation((made,), FeatureInputs(STATE, STATE.speed, PISaturation(), {}))[0, 0]
+    return compute_observation((made,), FeatureArguments(STATE, STATE.speed, PISaturation(), {}))[0, 0]
 
 
 def number_of_policy(file: str) -> Any:

@@ -55,7 +55,7 @@ def cases() -> list[tuple[str, str]]:
         (road, driver)
         for road in (*closed, "merge", "user-network")
         for driver, kind in DRIVERS.items()
-        if driver not in ON_MOTORWAYS and (road in closed or not kind.own_requirements.needs_loop)
+        if driver not in ON_MOTORWAYS and (road in closed or not kind.class_requirements.needs_loop)
     ]
     return [*found, *(("on-ramp", driver) for driver in ("human", "follower-stopper", *ON_MOTORWAYS))]
 

@@ -246,7 +246,7 @@ CHANGES: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_a_training_without_its_own_evaluation_is_evaluated_again(reproduced: Made, change: str) -> None:
+def test_a_training_without_its_own_evaluation_is_evaluated_again(reproduced: Reproduction, change: str) -> None:
     folder, _ = reproduced
     run = PlannedRun("small", "plain", 1)
     file = folder / "runs" / run.name / "evaluation.json"
@@ -261,7 +261,7 @@ def test_a_training_without_its_own_evaluation_is_evaluated_again(reproduced: Ma
     assert make_plan(["small"], 2, StudyFolder(folder)).runs == []
 
 
-def test_a_foreign_controller_in_a_training_is_refused(reproduced: Made) -> None:
+def test_a_foreign_controller_in_a_training_is_refused(reproduced: Reproduction) -> None:
     folder, _ = reproduced
     file, other = (folder / "runs/small" / variant / "0/controller.unjam" for variant in ("plain", "with-model"))
     before = file.read_bytes()
@@ -274,7 +274,7 @@ def test_a_foreign_controller_in_a_training_is_refused(reproduced: Made) -> None
 
 
 @pytest.mark.parametrize("name", ["runs/small/plain/0/manifest.json", "small/manifest.json"])
-def test_a_damaged_manifest_is_named(reproduced: Made, name: str) -> None:
+def test_a_damaged_manifest_is_named(reproduced: Reproduction, name: str) -> None:
     folder, _ = reproduced
     before = (folder / name).read_bytes()
     try:
@@ -285,7 +285,7 @@ def test_a_damaged_manifest_is_named(reproduced: Made, name: str) -> None:
         atomic_write(folder / name, before)
 
 
-def test_a_study_of_fewer_trainings_has_only_their_controllers(reproduced: Made, tmp_path: Path) -> None:
+def test_a_study_of_fewer_trainings_has_only_their_controllers(reproduced: Reproduction, tmp_path: Path) -> None:
     folder, _ = reproduced
     for seeds in (2, 1):
         StudyFolder(folder).copy_controllers([PlannedRun("small", "plain", seed) for seed in range(seeds)], tmp_path)

@@ -60,7 +60,7 @@ def test_request_has_all_penetration_rates_controllers_and_two_baselines(file: s
     assert usual.penetration_rates == (0.1, 0.2)
     assert len(usual.options) == 2 * len(DEFAULT_CONTROLLERS)
     road, driver = usual.make_setup(HUMAN_BASELINE)
-    assert (road, driver.is_native) == (usual.network, True)
+    assert (road, driver.is_driven_by_simulator) == (usual.network, True)
     assert set(make_request(file, [0.1], 400, 0.02, None, ["cruise", "pi"]).drivers) == {"pi"}
     road, driver = usual.make_setup(Option(0.2, "pi"))
     assert road.penetration_rate == 0.2  # pyright: ignore[reportAttributeAccessIssue]

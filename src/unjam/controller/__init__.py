@@ -65,7 +65,7 @@ def make_driver(name: str, time_step: float) -> Driver:
 def make_expert(name: str | DriverLike, time_step: float) -> Driver:
     """Return a driver to which a residual can be added; raise `InputError` as `make_driver`, and for `human`."""
     driver = make_driver(name, time_step) if isinstance(name, str) else as_driver(name, time_step)
-    if driver.is_native:
+    if driver.is_driven_by_simulator:
         raise invalid_value("expert", name, "drivers outside of the simulator; 'idm' drives like a human driver")
     return driver
 

@@ -67,7 +67,7 @@ def onnx_graph(driver: Driver, action_limit: float) -> bytes:
     and `next.NAME`. The first axis of each is the row of the CAV. Raise `InputError` if the driver does not consist of
     formulas for torch, `MissingPartError` if onnxscript is not installed.
     """
-    if driver.requirements().needs_numpy or driver.is_native:
+    if driver.requirements().needs_numpy or driver.is_driven_by_simulator:
         raise InputError(f"onnx: {driver.describe()} is not allowed; allowed: drivers that run on tensors")
     exact = {torch.ops.aten.scalar_tensor.default: _float64_constant()}
     inputs, outputs = graph_names(driver)

@@ -16,9 +16,9 @@ from unjam.physics.arrays import Array, clamp_min, clip, namespace, stack_column
 from unjam.physics.idm import IDMArrays, IDMParameters, idm_acceleration
 
 MIN_IDM_GAP = 0.01
-"""smallest gap in the Intelligent Driver Model, which divides by it [m]"""
+"""smallest gap for the Intelligent Driver Model, which divides by the gap [m]"""
 NO_LEADER_GAP = 1e6
-"""gap without any effect [m]"""
+"""gap that stands for a road without a leader in the Intelligent Driver Model [m]"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -41,7 +41,7 @@ class Human(FormulaDriver):
     """The human baseline: the simulator drives the vehicle as one of its human drivers, with their noise."""
 
     name: ClassVar[str] = "human"
-    is_native: ClassVar[bool] = True
+    is_driven_by_simulator: ClassVar[bool] = True
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration of the paper's IDM; the simulator does not use it."""
@@ -50,7 +50,7 @@ class Human(FormulaDriver):
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class OVM(FormulaDriver):
-    """Relaxes to an optimal speed that depends on the gap, and to the leader's speed.
+    """Accelerates towards an optimal speed, which depends on the gap, and towards the leader's speed.
 
     Source: Bando et al. 1995, Phys. Rev. E 51:1035, with relative speed; defaults as Flow's `OVMController`.
     """
@@ -58,15 +58,15 @@ class OVM(FormulaDriver):
     name: ClassVar[str] = "ovm"
 
     gap_gain: NonNegative = 1.0
-    """alpha [1/s]"""
+    """alpha: acceleration per m/s below the optimal speed [1/s]"""
     speed_gain: NonNegative = 1.0
-    """beta [1/s]"""
+    """beta: acceleration per m/s of relative speed of the leader [1/s]"""
     stop_gap: NonNegative = 2.0
     """h_st: gap below which the optimal speed is zero [m]"""
     go_gap: Positive = 15.0
     """h_go: gap above which the optimal speed is `max_speed` [m]"""
     max_speed: Positive = 30.0
-    """v_max [m/s]"""
+    """v_max: highest optimal speed [m/s]"""
 
     @model_validator(mode="after")
     def _check_gap_order(self) -> "OVM":
@@ -76,44 +76,44 @@ class OVM(FormulaDriver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration towards the optimal speed."""
-        share = clip((state.leader_gap - self.stop_gap) / (self.go_gap - self.stop_gap), 0.0, 1.0)
-        optimal = self.max_speed / 2.0 * (1.0 - namespace(share).cos(pi * share))
-        acceleration = self.gap_gain * (optimal - state.speed)
+        gap_share = clip((state.leader_gap - self.stop_gap) / (self.go_gap - self.stop_gap), 0.0, 1.0)
+        optimal_speed = self.max_speed / 2.0 * (1.0 - namespace(gap_share).cos(pi * gap_share))
+        acceleration = self.gap_gain * (optimal_speed - state.speed)
         return acceleration + self.speed_gain * (state.leader_speed - state.speed), memory
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class BCM(FormulaDriver):
-    """Controls towards equal gaps and equal relative speeds ahead and behind, and towards a desired speed.
+    """Accelerates towards equal gaps and equal relative speeds ahead and behind, and towards a desired speed.
 
-    If all vehicles use it, waves cannot grow; this does not hold for one CAV among human drivers.
+    Waves cannot grow if all vehicles use this model; they can if one CAV drives among human drivers.
     Source: Horn and Wang 2017, IEEE Trans. Intell. Transp. Syst. 19(10); defaults as Flow's `BCMController`.
     """
 
     name: ClassVar[str] = "bcm"
 
     gap_gain: NonNegative = 1.0
-    """k_d [1/s2]"""
+    """k_d: acceleration per meter by which the gap ahead exceeds the gap behind [1/s2]"""
     speed_gain: NonNegative = 1.0
-    """k_v [1/s]"""
+    """k_v: acceleration per m/s by which the gap ahead grows faster than the gap behind [1/s]"""
     desired_speed_gain: NonNegative = 1.0
-    """k_c [1/s]"""
+    """k_c: acceleration per m/s below the desired speed [1/s]"""
     desired_speed: NonNegative = 8.0
     """speed on a free road [m/s]"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the bilateral acceleration."""
-        gaps = state.leader_gap - state.follower_gap
-        speeds = (state.leader_speed - state.speed) - (state.speed - state.follower_speed)
+        gap_difference = state.leader_gap - state.follower_gap
+        speed_difference = (state.leader_speed - state.speed) - (state.speed - state.follower_speed)
         free = self.desired_speed_gain * (self.desired_speed - state.speed)
-        return self.gap_gain * gaps + self.speed_gain * speeds + free, memory
+        return self.gap_gain * gap_difference + self.speed_gain * speed_difference + free, memory
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class ACC(FormulaDriver):
     """Keeps a constant time gap to the leader, and never drives faster than its set speed.
 
-    The defaults were fitted to production cars. Source: Milanés and Shladover 2014, Transp. Res. C 48:285-300,
+    The defaults are a fit to production cars. Source: Milanés and Shladover 2014, Transp. Res. C 48:285-300,
     Eq. 4 and 5.
     """
 
@@ -137,9 +137,9 @@ class ACC(FormulaDriver):
         return self.acceleration(state, self.set_speed), memory
 
     def acceleration(self, state: LocalState, set_speed: Array) -> Array:
-        """Return the acceleration of `act` with another set speed, also one for each row [m/s]."""
-        excess = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
-        following = self.gap_gain * excess + self.speed_gain * (state.leader_speed - state.speed)
+        """Return the acceleration of `act` with the given set speed [m/s], one for all rows or for each row."""
+        excess_gap = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
+        following = self.gap_gain * excess_gap + self.speed_gain * (state.leader_speed - state.speed)
         free = self.set_speed_gain * (set_speed - state.speed)
         return namespace(state.speed).minimum(following, free)
 
@@ -155,11 +155,11 @@ class LACC(FormulaDriver):
     name: ClassVar[str] = "lacc"
 
     gap_gain: NonNegative = 0.3
-    """k_1 [1/s2]"""
+    """k_1: acceleration per meter of excess gap [1/s2]"""
     speed_gain: NonNegative = 0.4
-    """k_2 [1/s]"""
+    """k_2: acceleration per m/s of relative speed of the leader [1/s]"""
     time_gap: NonNegative = 1.0
-    """h [s]"""
+    """h: desired time gap [s]"""
     standstill_gap: NonNegative = 5.0
     """desired gap at standstill [m]"""
     lag: Positive = 0.1
@@ -173,10 +173,10 @@ class LACC(FormulaDriver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the lagged acceleration, which is also the memory."""
-        excess = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
-        command = self.gap_gain * excess + self.speed_gain * (state.leader_speed - state.speed)
-        share = min(1.0, self.time_step / self.lag)  # a step longer than the lag reaches the command
-        acceleration = memory["acceleration"] + share * (command - memory["acceleration"])
+        excess_gap = state.leader_gap - self.standstill_gap - self.time_gap * state.speed
+        command = self.gap_gain * excess_gap + self.speed_gain * (state.leader_speed - state.speed)
+        response = min(1.0, self.time_step / self.lag)  # a step longer than the lag reaches the command
+        acceleration = memory["acceleration"] + response * (command - memory["acceleration"])
         return acceleration, {"acceleration": acceleration}
 
 
@@ -185,7 +185,7 @@ class FollowerStopper(FormulaDriver):
     """Drives at the desired speed while the gap allows it, and below it in three regions of the gap.
 
     In the field experiment the desired speed was an external estimate of the speed of traffic. By default it is the
-    mean speed of the leader over the last `window` seconds: with the own mean, a stopped vehicle would never start.
+    mean speed of the leader over the last `window` seconds. With its own mean speed, a stopped CAV would never start.
     Source: Stern et al. 2018, Transp. Res. C 89:205-221, section 3.1; with time gaps: Lichtlé et al. 2022, ICRA.
     """
 
@@ -198,10 +198,10 @@ class FollowerStopper(FormulaDriver):
     gaps: tuple[Positive, Positive, Positive] = (4.5, 5.25, 6.0)
     """boundaries of the three regions at equal speeds [m]"""
     decelerations: tuple[Positive, Positive, Positive] = (1.5, 1.0, 0.5)
-    """decelerations by which the boundaries grow with the closing speed [m/s2]"""
+    """decelerations from the closing speed to zero; each boundary is larger by the distance that this takes [m/s2]"""
     boundary_time_gaps: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
-    """time gaps of the boundaries, where these are farther than `gaps` [s]; 0.4, 0.6 and 0.8 in the version for
-    motorways, which follows the leader's speed (a `window` of one step)"""
+    """time gaps of the boundaries at equal speeds, if these are larger than `gaps` [s]; the version for motorways has
+    0.4, 0.6 and 0.8, and follows the leader's speed (a `window` of one step)"""
     time_constant: NonNegative = 0.0
     """time constant of the approach to the command [s]; 0: one time step"""
     time_step: Positive = 0.1
@@ -228,27 +228,27 @@ class FollowerStopper(FormulaDriver):
         """Return the acceleration towards the commanded speed, and the new memory."""
         window = slide_window(memory, state.leader_speed)
         mean = window_mean_speed(window)
-        desired = mean if self.desired_speed is None else mean * 0.0 + self.desired_speed
-        return self.acceleration(state, desired), window
+        desired_speed = mean if self.desired_speed is None else mean * 0.0 + self.desired_speed
+        return self.acceleration(state, desired_speed), window
 
-    def acceleration(self, state: LocalState, desired: Array) -> Array:
-        """Return the acceleration of `act` towards a desired speed of each row [m/s]."""
+    def acceleration(self, state: LocalState, desired_speed: Array) -> Array:
+        """Return the acceleration of `act` with the given desired speeds [m/s], shape (n,)."""
         xp = namespace(state.speed)
-        closing = xp.minimum(state.leader_speed - state.speed, state.speed * 0.0)
+        closing_speed = xp.minimum(state.leader_speed - state.speed, state.speed * 0.0)
         stop, follow, free = (
-            clamp_min(state.speed * time_gap, gap) + closing**2 / (2.0 * deceleration)
+            clamp_min(state.speed * time_gap, gap) + closing_speed**2 / (2.0 * deceleration)
             for gap, time_gap, deceleration in zip(self.gaps, self.boundary_time_gaps, self.decelerations, strict=True)
         )
         gap = state.leader_gap
-        leading = xp.minimum(state.leader_speed, desired)
-        slowing = leading * clip((gap - stop) / (follow - stop), 0.0, 1.0)
-        command = slowing + (desired - leading) * clip((gap - follow) / (free - follow), 0.0, 1.0)
+        follow_speed = xp.minimum(state.leader_speed, desired_speed)
+        command = follow_speed * clip((gap - stop) / (follow - stop), 0.0, 1.0)
+        command = command + (desired_speed - follow_speed) * clip((gap - follow) / (free - follow), 0.0, 1.0)
         return (command - state.speed) / max(self.time_constant, self.time_step)
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class Constant(FormulaDriver):
-    """Commands the same acceleration in every step; only the safety filter prevents a collision, or without it SUMO."""
+    """Commands the same acceleration in every step; only the safety filter or SUMO prevents a collision."""
 
     name: ClassVar[str] = "constant"
 
@@ -256,7 +256,7 @@ class Constant(FormulaDriver):
     """commanded acceleration [m/s2]"""
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the constant."""
+        """Return the constant acceleration."""
         return state.speed * 0.0 + self.acceleration, memory
 
 
@@ -269,25 +269,25 @@ class DrivingStrategy(NamedTuple):
 
 
 FREE_ROAD_STRATEGY, BOTTLENECK_STRATEGY = DrivingStrategy(1.0, 1.0, 1.0), DrivingStrategy(0.7, 1.5, 1.0)
-"""strategies on a free road and in a jam, and near a merge"""
+"""strategies on a free road or within a jam, and near a merge"""
 JAM_TAIL_STRATEGY, JAM_HEAD_STRATEGY = DrivingStrategy(1.0, 1.0, 0.7), DrivingStrategy(0.5, 2.0, 1.0)
-"""strategies at the upstream end of a jam, where CAVs brake early, and at the downstream end, with a larger outflow"""
+"""strategies at the upstream end of a jam, for early braking, and at the downstream end, for a larger outflow"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class AdaptiveACC(IDMParameters, FormulaDriver):
-    """Follows by the Intelligent Driver Model with parameters that depend on the traffic state.
+    """Follows its leader by the Intelligent Driver Model with parameters that depend on the traffic state.
 
-    It brakes early at the upstream end of a jam, accelerates briskly at the downstream end, and keeps smaller gaps
+    The CAV brakes early at the upstream end of a jam, accelerates briskly at the downstream end, and keeps smaller gaps
     there and near a merge. It detects the traffic state from the difference between its speed and its mean speed, and
     from the map. It never drives more slowly than others on purpose. The vehicle's own ACC and the safety filter still
-    limit it: if they keep 1.1 s, it leaves a jam with 1.1 s.
+    limit the CAV: if these keep a time gap of 1.1 s, the CAV leaves a jam with this time gap.
     Source: Kesting, Treiber, Schönhof, Helbing 2008, Transp. Res. C 16:668-683, tables 1 and 2.
     """
 
     name: ClassVar[str] = "adaptive-acc"
-    own_requirements: ClassVar = Requirements(used_fields=frozenset({"allowed_speed", "distance_to_merge"}))
-    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
+    class_requirements: ClassVar = Requirements(used_fields=frozenset({"allowed_speed", "distance_to_merge"}))
+    class_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (
         ScaledInput("mean own speed", SPEED_SCALE, "m/s"),
         ScaledInput("leaves a jam", 1.0, ""),
     )
@@ -321,16 +321,20 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
         """Return the acceleration of the model with the parameters for the traffic state, and the new memory."""
         xp, speed = namespace(state.speed), state.speed
         mean = update_mean(memory["mean_speed"], speed, self.averaging_time, self.time_step)
-        approaches, faster = speed - mean < -self.jam_front_speed_change, speed - mean > self.jam_front_speed_change
-        ends = approaches | (mean > self.free_speed) | (mean < self.jam_speed)
-        leaves = xp.where(faster, speed * 0.0 + 1.0, xp.where(ends, speed * 0.0, memory["leaves_jam"]))
-        distance, near = state.distance_to_merge, speed < 0.0
+        at_tail, at_head = speed - mean < -self.jam_front_speed_change, speed - mean > self.jam_front_speed_change
+        has_left = at_tail | (mean > self.free_speed) | (mean < self.jam_speed)
+        leaves_jam = xp.where(at_head, speed * 0.0 + 1.0, xp.where(has_left, speed * 0.0, memory["leaves_jam"]))
+        distance, at_merge = state.distance_to_merge, speed < 0.0
         if distance is not None:
-            near = (distance < self.upstream_distance) & (distance > -self.downstream_distance)
+            at_merge = (distance < self.upstream_distance) & (distance > -self.downstream_distance)
         factors = [speed * 0.0 + factor for factor in FREE_ROAD_STRATEGY]
-        strategies = (approaches, JAM_TAIL_STRATEGY), (near, BOTTLENECK_STRATEGY), (leaves > 0.0, JAM_HEAD_STRATEGY)
-        for holds, strategy in strategies:
-            factors = [xp.where(holds, speed * 0.0 + new, old) for new, old in zip(strategy, factors, strict=True)]
+        for is_active, strategy in (  # a later strategy replaces an earlier one
+            (at_tail, JAM_TAIL_STRATEGY),
+            (at_merge, BOTTLENECK_STRATEGY),
+            (leaves_jam > 0.0, JAM_HEAD_STRATEGY),
+        ):
+            pairs = zip(strategy, factors, strict=True)
+            factors = [xp.where(is_active, speed * 0.0 + factor, previous) for factor, previous in pairs]
         parameters = IDMArrays(
             desired_speed=speed * 0.0 + self.desired_speed if state.allowed_speed is None else state.allowed_speed,
             time_headway=self.time_headway * factors[0],
@@ -342,8 +346,9 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
         gap = clamp_min(state.leader_gap, MIN_IDM_GAP)
         gap = xp.where(gap < MAX_OBSERVED_GAP, gap, gap * 0.0 + NO_LEADER_GAP)
         acceleration = idm_acceleration(speed, state.leader_speed, gap, parameters)
-        return acceleration, {"mean_speed": mean, "leaves_jam": leaves}
+        return acceleration, {"mean_speed": mean, "leaves_jam": leaves_jam}
 
     def memory_features(self, memory: Memory) -> Array:
-        """Return the mean own speed, scaled, and whether it leaves a jam, shape (n, 2)."""
+        """Return the scaled mean own speed, and whether the CAV leaves a jam, shape (n, 2)."""
+
         return stack_columns((memory["mean_speed"] / SPEED_SCALE, memory["leaves_jam"]))

@@ -15,7 +15,7 @@ from unjam.tree import leaves, map_leaves
 MAX_ROW_DIFFERENCE, MAX_SINGLE_PRECISION_DIFFERENCE = 1e-12, 1e-5
 """largest differences between the accelerations of n rows at once and of n single rows [m/s2]"""
 PROBE_ROWS, MAX_PROBE_DIFFERENCE = 4, 1e-4
-"""rows of `check_row_independence`, and the allowed difference, relative to the largest number"""
+"""number of rows in `check_row_independence`, and allowed difference of their results, relative to the largest one"""
 
 
 def check_driver(
@@ -23,15 +23,15 @@ def check_driver(
 ) -> None:
     """Check that a driver fulfills the contract of `unjam.Driver`; an `InputError` names the violation and its step.
 
-    It drives `rows` vehicles for `steps` random steps, drawn from `seed`. Accelerations must be finite and of shape
-    (rows,), n rows at once must equal n single calls to 1e-12 (to 1e-5 in single precision), the same call must give
-    the same answer, and neither state nor memory may be changed. With `optional_fields` the state has those of
-    motorways, too.
+    The driver is called for `rows` vehicles in `steps` random states, drawn from `seed`. Accelerations must be finite
+    and of shape (rows,), n rows at once must equal n single calls to 1e-12 (to 1e-5 in single precision), the same call
+    must give the same answer, and neither state nor memory may be changed. With `optional_fields` the states also have
+    the fields of motorways.
     """
     driver = as_driver(driver)
     reads_optional_fields = set(driver.requirements().input_fields) > set(COMMON_FIELDS)
     generator, optional_fields = np.random.default_rng(seed), optional_fields or reads_optional_fields
-    memory, *single = (driver.initial_memory(count) for count in (rows, *[1] * rows))
+    memory, *row_memories = (driver.initial_memory(count) for count in (rows, *[1] * rows))
     check_memory(memory, rows, f"driver: initial_memory({rows})")
     for step in range(steps):
         state = random_state(generator, rows, optional_fields)
@@ -45,20 +45,24 @@ def check_driver(
         if not np.array_equal(acceleration, repeated):
             raise InputError(f"driver: step {step}: the same state and memory gave another acceleration")
         decision = driver.decide(state, memory)
-        parts = decision.command.acceleration, decision.residual
-        is_single = any(str(getattr(part, "dtype", "")).endswith("float32") for part in parts)
-        tolerance = MAX_SINGLE_PRECISION_DIFFERENCE if is_single else MAX_ROW_DIFFERENCE
+        components = decision.command.acceleration, decision.residual
+        has_single_precision = any(str(getattr(array, "dtype", "")).endswith("float32") for array in components)
+        tolerance = MAX_SINGLE_PRECISION_DIFFERENCE if has_single_precision else MAX_ROW_DIFFERENCE
         for row in range(rows):
-            answer, single[row] = _call_act(driver, state.select(slice(row, row + 1)), single[row], step)
-            alone, among = float(np.asarray(answer)[0]), float(acceleration[row])
-            if not abs(alone - among) <= tolerance:
-                difference = f"row {row} gave {alone!r} alone and {among!r} among {rows} rows"
+            row_state = state.select(slice(row, row + 1))
+            row_acceleration, row_memories[row] = _call_act(driver, row_state, row_memories[row], step)
+            alone, together = float(np.asarray(row_acceleration)[0]), float(acceleration[row])
+            if not abs(alone - together) <= tolerance:
+                difference = f"row {row} gave {alone!r} alone and {together!r} among {rows} rows"
                 raise InputError(f"driver: step {step}: {difference}")
         memory = new_memory
 
 
 def check_row_independence(compute: Callable[[slice], Any], label: str, unit: str = "CAVs") -> None:
-    """Raise `InputError` if the first axis of what `compute` returns is not the rows by themselves."""
+    """Raise `InputError` if rows influence each other: if `compute` returns other rows for a slice than for each row.
+
+    `label` names the function in the message, and `unit` its rows.
+    """
     together = np.asarray(compute(slice(PROBE_ROWS)))
     alone = np.concatenate([compute(slice(row, row + 1)) for row in range(PROBE_ROWS)])
     tolerance = MAX_PROBE_DIFFERENCE * max(1.0, float(np.abs(np.nan_to_num(alone)).max(initial=0.0)))
@@ -67,11 +71,11 @@ def check_row_independence(compute: Callable[[slice], Any], label: str, unit: st
 
 
 def probe_state(fields: Collection[str] = LocalState._fields) -> LocalState:
-    """Return random rows for `check_row_independence`, with the given optional fields."""
+    """Return a random state for `check_row_independence`, with the given optional fields; some of them are ones."""
     state = random_state(np.random.default_rng(0), PROBE_ROWS, optional_fields=True)
-    filled = {name: values for name, values in state._asdict().items() if values is not None}
+    random_fields = {name: values for name, values in state._asdict().items() if values is not None}
     unused_fields = {name: None for name in LocalState._fields if name not in (*COMMON_FIELDS, *fields)}
-    return state_of_ones(LocalState._fields, np.ones, PROBE_ROWS)._replace(**filled | unused_fields)
+    return state_of_ones(LocalState._fields, np.ones, PROBE_ROWS)._replace(**random_fields | unused_fields)
 
 
 def _call_act(driver: Driver, state: LocalState, memory: Memory, step: int) -> tuple[Any, Memory]:
@@ -79,7 +83,7 @@ def _call_act(driver: Driver, state: LocalState, memory: Memory, step: int) -> t
         return driver.act(state, memory)
     except InputError as error:
         raise InputError(f"driver: step {step}: {error}") from error
-    except Exception as error:  # any error of the user's code is the user's to fix
+    except Exception as error:  # the user's code may raise any error
         raise InputError(f"driver: step {step}: {type(error).__name__}: {error}") from error
 
 
@@ -92,27 +96,22 @@ def check_acceleration(acceleration: Any, rows: int, context: str) -> np.ndarray
 
 
 def random_state(generator: np.random.Generator, rows: int, optional_fields: bool = False) -> LocalState:
-    """Return random surroundings, with stopped and close vehicles; `optional_fields` adds those of motorways."""
+    """Return a random state with stopped and close vehicles; `optional_fields` adds the fields of motorways."""
     speeds = generator.uniform(0.0, 12.0, (3, rows)) * (generator.random((3, rows)) > 0.2)
     gaps = generator.uniform(0.5, 60.0, (2, rows))
     position = generator.uniform(0.0, 230.0, rows)
-    near = LocalState(speeds[0], speeds[1], gaps[0], speeds[2], gaps[1], position, np.full(rows, 230.0))
+    state = LocalState(speeds[0], speeds[1], gaps[0], speeds[2], gaps[1], position, np.full(rows, 230.0))
     if not optional_fields:
-        return near
+        return state
     ranges = {"lane_speeds": (0.0, 30.0), "road_speeds": (0.0, 30.0), "allowed_speed": (20.0, 30.0)}
     ranges |= {"distance_to_merge": (-500.0, 2000.0), "adjacent_gaps": (-5.0, 60.0), "adjacent_speeds": (0.0, 30.0)}
     fields = dict[str, np.ndarray]()
-    for name, ends in {**ranges, "penetration_rate": (0.0, 0.3)}.items():
-        fields[name] = generator.uniform(*ends, (rows, FIELD_SIZES[name]) if name in FIELD_SIZES else rows)
-    return near._replace(**fields, congestion=(generator.random((rows, SECTIONS_AHEAD)) < 0.3).astype(float))
+    for name, (low, high) in {**ranges, "penetration_rate": (0.0, 0.3)}.items():
+        fields[name] = generator.uniform(low, high, (rows, FIELD_SIZES[name]) if name in FIELD_SIZES else rows)
+    return state._replace(**fields, congestion=(generator.random((rows, SECTIONS_AHEAD)) < 0.3).astype(float))
 
 
-def _is_same_tree(tree: Any, other: Any) -> bool:
-    current_leaves, previous_leaves = (
-        {path: values for path, values in leaves(state) if values is not None} for state in (tree, other)
-    )
-    is_same = (
-        np.array_equal(np.asarray(current_leaves[path]), previous_leaves[path], equal_nan=True)
-        for path in current_leaves
-    )
-    return current_leaves.keys() == previous_leaves.keys() and all(is_same)
+def _is_same_tree(tree: Any, copy: Any) -> bool:
+    arrays, copies = ({path: array for path, array in leaves(part) if array is not None} for part in (tree, copy))
+    are_equal = (np.array_equal(np.asarray(arrays[path]), copies[path], equal_nan=True) for path in arrays)
+    return arrays.keys() == copies.keys() and all(are_equal)

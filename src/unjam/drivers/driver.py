@@ -1,4 +1,4 @@
-"""The interface of drivers, which decide for their vehicles from observation and memory."""
+"""The interface of drivers, which compute commands of vehicles from their observations and memories."""
 
 from array import array
 from collections.abc import Callable, Iterable
@@ -16,16 +16,16 @@ from unjam.physics.arrays import Array, replace_entries
 from unjam.tree import leaves, map_leaves, named_parts
 
 Memory = dict[str, Any]
-"""State of a driver between control steps: arrays by name, whose first axis is the row of the CAV. A driver that
-contains another driver keeps the memory of that driver within its own."""
+"""state of a driver between control steps: arrays by name, with one row for each CAV; a driver that contains another
+driver also stores the memory of that driver, as a dict"""
 Recipe = dict[str, Any]
-"""Specification of a driver as JSON, with its class as `kind`; the weights of its networks are separate arrays."""
+"""specification of a driver as JSON, with its class as `kind`; the weights of its networks are separate arrays"""
 NoiseSampler = Callable[[], Array]
-"""returns standard normal noise for one evaluation of a network, one number for each row"""
+"""function that returns standard normal noise for one evaluation of a network, one number for each row"""
 
 
 class Decision(NamedTuple):
-    """One decision and its components; arrays have a row per CAV, plain numbers have none."""
+    """A decision of a driver and its components: arrays with a row for each CAV, or plain numbers for a single CAV."""
 
     command: Command
     expert: Array
@@ -33,7 +33,7 @@ class Decision(NamedTuple):
     residual: Array
     """acceleration of the network with exploration noise, without limits [m/s2], shape (n,); zero without a network"""
     observation: Array | None
-    """network input, shape (n, inputs); empty for a single CAV with a repeated residual; None without a network"""
+    """network input, shape (n, inputs); an empty tuple while a single CAV repeats a residual; None without a network"""
     memory: Memory
     """memory of the driver after the decision"""
 
@@ -41,24 +41,24 @@ class Decision(NamedTuple):
 class Driver(Subclassable):
     """Drives any number of CAVs: `(local state, memory) -> (acceleration, memory)`.
 
-    A driver holds parameters only. Everything that changes while driving is in `memory`. Therefore the same
+    A driver contains only parameters; `memory` contains everything that changes while it drives. Therefore the same
     driver drives n vehicles at once, in the simulator and in a learned model, and can be restarted from any
     step. Rows do not influence each other: n rows at once equal n single calls.
 
-    Your own driver does not need to inherit from this class: `act` and `initial_memory` are enough, and a plain
-    function `state -> acceleration` if it needs no memory. `unjam.check_driver` tests it.
+    Your own driver does not need to inherit from this class: an object with `act` and `initial_memory` is enough, or,
+    without a memory, a function `state -> acceleration`. `unjam.check_driver` tests it.
     """
 
     name: ClassVar[str] = ""
     """name for `--driver`; empty for drivers without one"""
-    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True, needs_numpy=True)
+    class_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True, needs_numpy=True)
     """requirements of the class, without those of drivers that an object contains"""
-    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = ()
-    """description of its own `memory_features`, in order"""
+    class_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = ()
+    """descriptions of the columns of `memory_features`, in order, without those of inner drivers"""
     portable_form: ClassVar[str] = "path.py:name, your class in a file"
-    """form of such a driver that other processes can build, for messages, if it is not among the registered ones"""
-    is_native: ClassVar[bool] = False
-    """whether the simulator itself drives (a human driver): `act` is then not called"""
+    """what messages recommend in place of a driver of this class that other processes cannot build"""
+    is_driven_by_simulator: ClassVar[bool] = False
+    """whether the simulator drives the vehicle, as a human driver, and does not call `act`"""
     action_repeat: int = 1
     """control steps for which one residual is repeated"""
 
@@ -75,7 +75,7 @@ class Driver(Subclassable):
         raise NotImplementedError
 
     def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
-        """Return the decision with its components; with `noise`, learned parts explore."""
+        """Return the decision with its components; networks explore with `noise`."""
         acceleration, new_memory = self.act(state, memory)
         return Decision(Command(acceleration, self.time_gaps(state, memory)), acceleration, 0.0, None, new_memory)
 
@@ -88,63 +88,63 @@ class Driver(Subclassable):
         return None
 
     def memory_features(self, memory: Memory) -> Array | None:
-        """Return the part of `memory` that a residual network may read, (n, m), about unit size; None: nothing."""
+        """Return what a residual network may read of `memory`, shape (n, m), about unit size; None: nothing."""
         return None
 
     # The description of a driver for the registry, workers and controller files.
 
     @cached_property
     def inner_drivers(self) -> dict[str, "Driver"]:
-        """The drivers that it contains, by the names of their memories, which prefix their networks' weights."""
+        """Drivers that this one contains, by the keys of their memories, which also prefix the names of weights."""
         return {}
 
     @cached_property
     def limits(self) -> Limits | None:
-        """Limits of its own acceleration [m/s2]; None: those of the road."""
+        """Limits of the driver's acceleration [m/s2]; None: those of the road."""
         return None
 
     @property
     def episode_noise_size(self) -> int:
-        """Count of exploration noise numbers that stay constant for an episode; 0: new noise in each control step."""
+        """Number of exploration noise values that are constant in an episode; 0: new noise in each control step."""
         return 0
 
     @property
     def memory_inputs(self) -> tuple[ScaledInput, ...]:
-        """Description of `memory_features`, in order."""
-        return self.own_memory_inputs
+        """Descriptions of the columns of `memory_features`, in order."""
+        return self.class_memory_inputs
 
     @property
     def network_inputs(self) -> tuple[ScaledInput, ...] | None:
-        """Inputs of its own network, in order; None without a network."""
+        """Descriptions of the inputs of the driver's network, in order; None without a network."""
         return None
 
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
-        """Return what it and its inner drivers need, on `road` only those that drive there; with its `time_step`."""
+        """Return the requirements of this driver, with its `time_step`, and of its active drivers on `road`."""
         step = getattr(self, "time_step", None)
-        requirements = self.own_requirements._replace(time_steps=frozenset(() if step is None else (step,)))
+        requirements = self.class_requirements._replace(time_steps=frozenset(() if step is None else (step,)))
         return merge_requirements(requirements, *(driver.requirements(road) for driver in self.active_drivers(road)))
 
     def active_drivers(self, road: RoadInterface | None) -> Iterable["Driver"]:
-        """Return the drivers that it contains and that drive on a road; None: on any."""
+        """Return the inner drivers that drive on `road`; on some road if `road` is None."""
         return self.inner_drivers.values()
 
     def describe(self) -> str:
-        """Return its name and the parameters that differ from the defaults."""
+        """Return the name of the driver, and its parameters that differ from the defaults."""
         if not self.name:
             return type(self).__name__
         parameters = (named_parts(self) or {}).items()
-        changed = {key: value for key, value in parameters if value != getattr(type(self), key) and key != "time_step"}
-        return label_with_parameters(self.name, changed)
+        changes = {key: value for key, value in parameters if value != getattr(type(self), key) and key != "time_step"}
+        return label_with_parameters(self.name, changes)
 
 
 class FormulaDriver(Driver):
-    """A driver with one formula for arrays, tensors and plain numbers (see `unjam.physics.arrays`)."""
+    """A driver with a formula that takes arrays, tensors and plain numbers (see `unjam.physics.arrays`)."""
 
-    own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
+    class_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
 
 def check_memory(memory: Any, rows: int, context: str) -> Memory:
-    """Return the memory of `rows` CAVs that a driver returned; raise `InputError` if it is none."""
+    """Return `memory`; raise `InputError` unless it is a dict of arrays with one row for each of `rows` CAVs."""
     if not isinstance(memory, dict):
         raise InputError(f"{context} returns the memory {memory!r:.60}; allowed: a dict of arrays")
     for name, values in leaves(memory):
@@ -156,29 +156,31 @@ def check_memory(memory: Any, rows: int, context: str) -> Memory:
 
 
 def label_with_parameters(name: str, parameters: dict[str, Any]) -> str:
-    """Return `name:key=value,key=value`; the name alone without parameters."""
+    """Return `name:key=value,key=value`, or `name` without parameters."""
     values = ",".join(f"{key}={value}" for key, value in parameters.items())
     return f"{name}:{values}" if values else name
 
 
 def scalar_memory(memory: Memory) -> Memory:
-    """Return the memory of one CAV as plain numbers: floats, and Python's own arrays of floats."""
+    """Return the memory of one CAV as floats, and as `array.array` where it has several numbers."""
     return map_leaves(lambda rows: rows[0].item() if rows.ndim == 1 else array("d", rows[0]), memory)
 
 
 def replace_memory_rows(memory: Memory, rows: Any, source: Memory, source_rows: Any) -> Memory:
-    """Return `memory` with rows of `source`, a memory of the same driver, in place of some of its own."""
+    """Return `memory` with `source_rows` of `source`, a memory of the same driver, in place of its `rows`."""
 
-    def replace_rows(values: Any, other: Any) -> Any:
-        if hasattr(values, "replace_rows"):  # a window of speeds
-            return values.replace_rows(rows, other, source_rows)
-        return replace_entries(values, rows, other, source_rows)
+    def replace_rows(target_array: Any, source_array: Any) -> Any:
+        if hasattr(target_array, "replace_rows"):  # a window of speeds
+            return target_array.replace_rows(rows, source_array, source_rows)
+        return replace_entries(target_array, rows, source_array, source_rows)
 
     return map_leaves(replace_rows, memory, source)
 
 
-def carry_over_memory(memory: Memory, kept_rows: Any, new_memory: Memory, new_count: int) -> Memory:
-    """Return the rows `kept_rows` of `memory`, followed by the last `new_count` rows of `new_memory`."""
+def carry_over_memory(memory: Memory, remaining_rows: Any, new_memory: Memory, new_count: int) -> Memory:
+    """Return the rows `remaining_rows` of `memory`, followed by the last `new_count` rows of `new_memory`."""
     if not new_count:
-        return map_leaves(lambda rows: rows[kept_rows], memory)
-    return map_leaves(lambda rows, fresh: np.concatenate([rows[kept_rows], fresh[-new_count:]]), memory, new_memory)
+        return map_leaves(lambda rows: rows[remaining_rows], memory)
+    return map_leaves(
+        lambda rows, new_rows: np.concatenate([rows[remaining_rows], new_rows[-new_count:]]), memory, new_memory
+    )

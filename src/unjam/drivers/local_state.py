@@ -8,9 +8,9 @@ from unjam.physics.arrays import Array, namespace
 
 
 class LocalState(NamedTuple):
-    """The surroundings of n CAVs, one row each; NumPy arrays or torch tensors of shape (n,), SI units.
+    """The speeds and positions of n CAVs and their neighbors: NumPy arrays or torch tensors of shape (n,), SI units.
 
-    Drivers that do not need arrays may also be given floats, for a single CAV. Without a vehicle ahead (or
+    Drivers that do not need arrays may also receive floats, for a single CAV. Without a vehicle ahead (or
     behind), the gap is `MAX_OBSERVED_GAP` and the speed of the leader (follower) is that of the CAV.
     """
 
@@ -27,7 +27,7 @@ class LocalState(NamedTuple):
     route_position: Array
     """own front bumper along the route [m]; NaN on roads without a coordinate"""
     loop_length: Array
-    """length of the closed road [m]; NaN on an open one"""
+    """length of the closed road [m]; NaN on an open road"""
 
     # Fields that only some roads provide; None elsewhere.
 
@@ -36,47 +36,47 @@ class LocalState(NamedTuple):
     allowed_speed: Array = None
     """speed limit at the current position times the speed factor of the vehicle [m/s]"""
     distance_to_merge: Array = None
-    """distance to the point where the lane of a ramp begins to run next to the road [m]; negative behind it"""
+    """distance to the point where the lane of a ramp begins to run next to the road [m]; negative after this point"""
     lane_speeds: Array = None
-    """last received mean speeds of the road sections ahead in the own lane, beginning with the own section:
-    (n, SECTIONS_AHEAD) [m/s]; empty sections have the allowed speed"""
+    """last received mean speeds of the sections of the own lane, from the own section on: shape (n, SECTIONS_AHEAD)
+    [m/s]; the allowed speed for sections without vehicles"""
     road_speeds: Array = None
     """mean speeds of the same sections, over all lanes of the main road [m/s]"""
     adjacent_gaps: Array = None
-    """gaps to vehicles on adjacent lanes, ordered as `ADJACENT_POSITIONS`: (n, 4) [m]; negative for vehicles alongside,
-    `MAX_OBSERVED_GAP` without a vehicle or lane. Before a merge, the ramp counts as the lane that it becomes"""
+    """gaps to vehicles on adjacent lanes in the order of `ADJACENT_POSITIONS`, shape (n, 4) [m]: negative to vehicles
+    alongside, `MAX_OBSERVED_GAP` without a vehicle or lane; before a merge, the ramp counts as the lane next to it"""
     adjacent_speeds: Array = None
-    """speeds of these vehicles [m/s]; the own speed where there is none"""
+    """speeds of these vehicles [m/s]; the own speed without a vehicle"""
     penetration_rate: Array = None
     """share of CAVs among all vehicles that have entered so far, as counted by a roadside service"""
     congestion: Array = None
-    """1 where a roadside service reports a section of `lane_speeds` as congested, else 0: (n, SECTIONS_AHEAD); values
-    between these where messages are smoothed"""
+    """1 for sections of `lane_speeds` that a roadside service reports as congested, else 0, shape (n, SECTIONS_AHEAD);
+    in between if messages are smoothed"""
 
-    def map(self, function: Callable[..., Any], *others: "LocalState") -> "LocalState":
-        """Return `function` applied to each field, together with the same field of the other states."""
-        return LocalState(
-            *(None if values[0] is None else function(*values) for values in zip(self, *others, strict=True))
-        )
+    def map(self, function: Callable[..., Any], *other_states: "LocalState") -> "LocalState":
+        """Return a state with `function` of each field and the same field of the other states; None stays None."""
+        field_values = zip(self, *other_states, strict=True)
+        return LocalState(*(None if values[0] is None else function(*values) for values in field_values))
 
     def select(self, index: Any) -> "LocalState":
         """Return the state of some rows or steps; `index` is any array index."""
-        return self.map(lambda values: values[index])
+        return self.map(lambda array: array[index])
 
     def as_read_only(self) -> "LocalState":
         """Return a copy with write-protected arrays."""
-        copy = self.map(lambda values: values.copy())
-        for values in copy:
-            if values is not None:
-                values.flags.writeable = False
+        copy = self.map(lambda array: array.copy())
+        for array in copy:
+            if array is not None:
+                array.flags.writeable = False
         return copy
 
 
 MAX_OBSERVED_GAP = 100.0
-"""the largest observed gap, which also stands for "no vehicle" [m]"""
+"""largest observed gap, also reported without a vehicle [m]"""
 ROAD_SECTION_LENGTH = 100.0
 """length of the road sections with measured mean speeds [m]"""
 SECTIONS_AHEAD = 11
+"""number of these sections that a CAV receives"""
 SPEED_SCALE = 10.0
 """divisor of speeds in network inputs [m/s]"""
 
@@ -86,27 +86,31 @@ STATE_UNITS = dict(zip(LocalState._fields, _FIELD_UNITS, strict=True))
 COMMON_FIELDS = tuple(name for name in LocalState._fields if name not in LocalState._field_defaults)
 """fields that every road provides"""
 ADJACENT_POSITIONS = ("ahead on the left", "behind on the left", "ahead on the right", "behind on the right")
+"""positions of neighbors on adjacent lanes"""
 FIELD_SIZES = {
     **dict.fromkeys(("lane_speeds", "road_speeds", "congestion"), SECTIONS_AHEAD),
     **dict.fromkeys(("adjacent_gaps", "adjacent_speeds"), len(ADJACENT_POSITIONS)),
 }
-"""numbers per CAV of the fields that have several"""
+"""count of numbers per CAV, for fields with several numbers"""
 
 
 def state_of_ones(names: Sequence[str], make_ones: Callable[..., Any], rows: int = 1) -> LocalState:
-    """Return a state in which the fields `names` are ones, as an example input for drivers."""
+    """Return an example state for drivers: `names` are fields of ones, and the other fields have their defaults.
+
+    `make_ones` makes an array of a shape, as `numpy.ones` does.
+    """
     shapes = {name: (rows, FIELD_SIZES[name]) if name in FIELD_SIZES else (rows,) for name in names}
     return LocalState(**{name: make_ones(shape) for name, shape in shapes.items()})
 
 
 def observe_neighbor(is_present: Array, gap: Array, speed: Array, own_speed: Array) -> tuple[Array, Array]:
-    """Return speed and gap of neighbors as CAVs observe them; those beyond `MAX_OBSERVED_GAP` count as missing."""
+    """Return speed and gap of neighbors as CAVs observe them; neighbors beyond `MAX_OBSERVED_GAP` count as missing."""
     xp, is_near = namespace(gap), is_present & (gap < MAX_OBSERVED_GAP)
     return xp.where(is_near, speed, own_speed), xp.where(is_near, gap, MAX_OBSERVED_GAP)
 
 
 class ScaledInput(NamedTuple):
-    """One input of a network: a quantity divided by a fixed scale."""
+    """The description of one input of a network: a quantity divided by a fixed scale."""
 
     name: str
     scale: float
@@ -117,5 +121,6 @@ class ScaledInput(NamedTuple):
 
 
 def lap_angle(state: LocalState) -> Array:
-    """Return the position on a closed road as an angle, 0 to 2 pi from its start, shape (n,)."""
+    """Return the position on a closed road as an angle, from 0 at its start to 2 pi, shape (n,)."""
+
     return 2.0 * pi * state.route_position / state.loop_length

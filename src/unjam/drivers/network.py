@@ -1,4 +1,4 @@
-"""The small policy network, as it drives in workers and in exported controllers: on NumPy alone."""
+"""The small policy network of workers and exported controllers, which needs only NumPy."""
 
 import math
 from collections.abc import Sequence
@@ -11,20 +11,20 @@ from unjam.errors import InputError, invalid_value
 from unjam.physics.arrays import Array, Floats, namespace
 
 LOG_STD_RANGE = (-20.0, 2.0)
-"""bounds of a log standard deviation that is an output of the network: those of Stable-Baselines3's SAC"""
+"""bounds of a log standard deviation that is an output of the network, as in Stable-Baselines3's SAC"""
 
 
 @dataclass(frozen=True, eq=False)
 class Network:
     """A perceptron with ReLU layers and a bounded output: `authority * tanh(last layer)`.
 
-    Exploration adds noise with standard deviation `exploration_std`. A second output of the last layer is the log of
-    the standard deviation of noise before the tanh (soft actor-critic). Weights are float64, so that n rows at once
-    equal n single rows to 1e-12.
+    Exploration adds noise with standard deviation `exploration_std`. If the last layer has a second output, this is
+    the log of the standard deviation of noise that is added before the tanh (soft actor-critic). Weights are float64,
+    so that n rows at once equal n single rows to 1e-12.
     """
 
     layers: tuple[tuple[Floats, Floats], ...] = field(repr=False)
-    """(weight of shape (inputs, outputs), bias of shape (outputs,)) of each layer; the last has one output or two"""
+    """weight, shape (inputs, outputs), and bias, shape (outputs,), of each layer; the last has one output or two"""
     authority: float
     """largest residual acceleration [m/s2]"""
     exploration_std: float = 0.0
@@ -38,21 +38,25 @@ class Network:
     _residual_weights: Floats = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "layers", _checked_layers(self.layers))
+        object.__setattr__(self, "layers", _check_layers(self.layers))
         if not 0.0 < self.authority < math.inf:
             raise invalid_value("network: authority", self.authority, "> 0")
         if not 0.0 <= self.exploration_std < math.inf:
             raise invalid_value("network: exploration_std", self.exploration_std, ">= 0")
-        # Biases as weights of an additional unit that is always 1 save a NumPy call a layer.
-        folded = (np.vstack([weight, bias]) for weight, bias in self.layers)
-        *hidden, last = (np.hstack([weights, np.eye(len(weights))[:, -1:]]) for weights in folded)
+        # Each layer has an additional unit that is always 1, and its weights are the biases of the next layer: this
+        # saves one NumPy call in each layer.
+        weights_and_biases = (np.vstack([weight, bias]) for weight, bias in self.layers)
+        *hidden, last = (np.hstack([weights, np.eye(len(weights))[:, -1:]]) for weights in weights_and_biases)
         object.__setattr__(self, "squashes_noise", self.layers[-1][1].shape == (2,))
         object.__setattr__(self, "_hidden_weights", tuple(hidden))
         object.__setattr__(self, "_last_weights", last)
         object.__setattr__(self, "_residual_weights", np.ascontiguousarray(last[:, 0]))
 
     def __call__(self, observation: Any) -> Any:
-        """Return the residual acceleration [m/s2]: shape (n,) for (n, inputs), array or tensor; a float for a tuple."""
+        """Return the residual acceleration [m/s2], shape (n,); a float for a tuple.
+
+        `observation` is an array or a tensor of shape (n, inputs), or the inputs of a single CAV as a tuple.
+        """
         if not isinstance(observation, (tuple, np.ndarray)):
             return self.authority * self._outputs_on_tensors(observation)[:, 0].tanh()
         tanh = math.tanh if isinstance(observation, tuple) else np.tanh
@@ -61,8 +65,8 @@ class Network:
     def explore(self, observation: Any, noise: Any) -> Any:
         """Return the residual with exploration; `noise` is standard normal and has the shape of the residual.
 
-        With `episode_noise` it has a number for each unit of the last hidden layer and the bias, shape (n, units + 1).
-        Source: generalized state-dependent exploration, Raffin et al. 2022, CoRL, which leaves the bias out.
+        With `episode_noise`, `noise` has a number for each unit of the last hidden layer and for the bias, shape
+        (n, units + 1). Source: generalized state-dependent exploration, Raffin et al. 2022, CoRL, without the bias.
         """
         if self.episode_noise:
             if isinstance(observation, (tuple, np.ndarray)):
@@ -78,8 +82,8 @@ class Network:
         else:
             mean, log_std = self._outputs_on_tensors(observation).T
         xp = np if isinstance(observation, tuple) else namespace(observation)
-        action = self.authority * xp.tanh(mean + xp.exp(log_std.clip(*LOG_STD_RANGE)) * noise)
-        return float(action) if isinstance(observation, tuple) else action
+        residual = self.authority * xp.tanh(mean + xp.exp(log_std.clip(*LOG_STD_RANGE)) * noise)
+        return float(residual) if isinstance(observation, tuple) else residual
 
     def _outputs_on_tensors(self, observation: Array) -> Array:
         hidden = self._hidden_units_of_tensors(observation)
@@ -111,7 +115,7 @@ class Network:
 
     @property
     def episode_noise_size(self) -> int:
-        """Count of exploration noise numbers that stay constant for an episode; 0: new noise in each control step."""
+        """Number of exploration noise values that are constant in an episode; 0: new noise in each control step."""
         return self.layers[-1][0].shape[0] + 1 if self.episode_noise else 0
 
 
@@ -121,7 +125,7 @@ def append_ones(units: Array) -> Array:
 
 
 def _as_tensors_like(tensor: Any, layer: tuple[Floats, Floats]) -> Any:
-    return (namespace(tensor).as_tensor(part, dtype=tensor.dtype, device=tensor.device) for part in layer)
+    return (namespace(tensor).as_tensor(weights, dtype=tensor.dtype, device=tensor.device) for weights in layer)
 
 
 def network_weights(network: Network) -> dict[str, Floats]:
@@ -130,20 +134,20 @@ def network_weights(network: Network) -> dict[str, Floats]:
     return weights | {f"{index}.bias": bias for index, (_, bias) in enumerate(network.layers)}
 
 
-def _checked_layers(layers: Sequence[tuple[Floats, Floats]]) -> tuple[tuple[Floats, Floats], ...]:
-    """Return layers in double precision; raise `InputError` if they do not fit together, or are not finite."""
-    outputs = None
+def _check_layers(layers: Sequence[tuple[Floats, Floats]]) -> tuple[tuple[Floats, Floats], ...]:
+    """Return layers in double precision; raise `InputError` if shapes do not match, or weights are not finite."""
+    previous_outputs = None
     for index, (weight, bias) in enumerate(layers):
         if weight.ndim != 2 or bias.shape != weight.shape[1:]:
             raise InputError(f"network layer {index}: weight and bias do not fit together")
-        if outputs not in (None, weight.shape[0]):
-            allowed = f"{outputs}, the outputs of the previous layer"
+        if previous_outputs not in (None, weight.shape[0]):
+            allowed = f"{previous_outputs}, the outputs of the previous layer"
             raise InputError(f"network layer {index}: {weight.shape[0]} inputs are not allowed; allowed: {allowed}")
         if not (np.issubdtype(weight.dtype, np.floating) and np.issubdtype(bias.dtype, np.floating)):
             raise InputError(f"network layer {index}: weights are {weight.dtype}, {bias.dtype}; allowed: floats")
         if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             raise InputError(f"network layer {index}: a weight is not finite")
-        outputs = weight.shape[1]
-    if outputs not in (1, 2):
+        previous_outputs = weight.shape[1]
+    if previous_outputs not in (1, 2):
         raise InputError("network: the last layer must have one output, or two with the log std of its noise")
     return tuple((np.asarray(weight, np.float64), np.asarray(bias, np.float64)) for weight, bias in layers)

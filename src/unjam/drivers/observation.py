@@ -38,28 +38,30 @@ from unjam.text import format_count
 
 RELATIVE_SPEED_SCALE, GAP_SCALE, MERGE_DISTANCE_SCALE = 5.0, 20.0, 1000.0
 MAX_OBSERVATION = 50.0
-"""bound of the observations of environments; larger values are clipped"""
+"""largest magnitude of observations in environments, which clip larger values"""
 PROXIMITY_DISTANCES = (0.0, 250.0, 500.0, 1000.0, 2000.0)
-"""distances to the merge at which one component of the feature `merge_proximity` is one [m]"""
+"""distances to the merge [m]: at each of them one column of the feature `merge_proximity` is one"""
 
 
-class FeatureInputs(NamedTuple):
-    """The arguments of a feature; n rows."""
+class FeatureArguments(NamedTuple):
+    """The arguments of a feature, for n CAVs."""
 
     state: LocalState
     expert_acceleration: Array
-    """within the limits [m/s2], shape (n,)"""
+    """acceleration of the expert within the limits [m/s2], shape (n,)"""
     expert: Driver
     memory: Memory
-    """memory of the expert after its decision, which its next decision uses"""
+    """memory of the expert after its decision"""
 
 
 @dataclass(frozen=True)
 class Feature:
-    """Some inputs of a network."""
+    """A feature of the observation: one or more inputs of a network."""
 
-    compute: Callable[[FeatureInputs], Array | None]
-    """returns them, about unit size, shape (n, m); a tuple of m for plain numbers; None if there are none"""
+    compute: Callable[[FeatureArguments], Array | None]
+    """function that returns the inputs, about unit size: shape (n, m), a tuple of m floats for plain numbers, or None
+    without inputs"""
+
     inputs: tuple[ScaledInput, ...] | None
     """descriptions of the columns, in order; None: `Driver.memory_inputs` of the expert describes them"""
     requirements: Requirements = NO_REQUIREMENTS
@@ -69,11 +71,11 @@ class Feature:
 def local_observation(state: LocalState) -> Array:
     """Return the observation of the paper, divided by fixed scales: shape (n, 5), no unit; a tuple for plain numbers.
 
-    Own speed; relative speed (the other's minus the own) and gap to the leader, and to the follower.
+    The columns are own speed, relative speed of the leader, its gap, relative speed of the follower, and its gap.
     """
-    ahead = (state.leader_speed - state.speed) / RELATIVE_SPEED_SCALE, state.leader_gap / GAP_SCALE
-    behind = (state.follower_speed - state.speed) / RELATIVE_SPEED_SCALE, state.follower_gap / GAP_SCALE
-    return stack_columns((state.speed / SPEED_SCALE, *ahead, *behind))
+    leader = (state.leader_speed - state.speed) / RELATIVE_SPEED_SCALE, state.leader_gap / GAP_SCALE
+    follower = (state.follower_speed - state.speed) / RELATIVE_SPEED_SCALE, state.follower_gap / GAP_SCALE
+    return stack_columns((state.speed / SPEED_SCALE, *leader, *follower))
 
 
 def lap_position(state: LocalState) -> Array:
@@ -85,7 +87,7 @@ def lap_position(state: LocalState) -> Array:
 def _section_speed_feature(field: str, location: str) -> Feature:
     distances = (f"{ROAD_SECTION_LENGTH * number:g} m" for number in range(SECTIONS_AHEAD))
     return Feature(
-        lambda inputs: (getattr(inputs.state, field) - inputs.state.speed[..., None]) / SPEED_SCALE,
+        lambda arguments: (getattr(arguments.state, field) - arguments.state.speed[..., None]) / SPEED_SCALE,
         tuple(
             ScaledInput(f"mean speed {location} {distance} ahead - own speed", SPEED_SCALE, "m/s")
             for distance in distances
@@ -95,9 +97,10 @@ def _section_speed_feature(field: str, location: str) -> Feature:
 
 
 def merge_proximity(state: LocalState) -> Array:
-    """Return the proximity to each point of `PROXIMITY_DISTANCES`: piecewise linear with sum one; zero after the merge.
+    """Return how near each distance of `PROXIMITY_DISTANCES` is, shape (n, 5), no unit; zero after the merge.
 
-    Therefore learning on one section before the merge changes nothing on the others.
+    The columns are piecewise linear functions of the distance to the merge, with sum one. Therefore a network that
+    learns on one section before the merge hardly changes on other sections.
     """
     distance = clip(state.distance_to_merge, PROXIMITY_DISTANCES[0], PROXIMITY_DISTANCES[-1])
     xp, columns = namespace(distance), [distance * 0.0 + 1.0]
@@ -113,15 +116,15 @@ def _adjacent_lane_features(state: LocalState) -> Array:
 
 
 RELATIVE_SPEEDS = {"leader_relative_speed": "leader_speed", "follower_relative_speed": "follower_speed"}
-"""quantities that are the difference of a field of `LocalState` and the own speed"""
+"""quantities that are a field of `LocalState` minus the own speed, with this field"""
 OPTIONAL_QUANTITIES = ("loop_length", "route_position")
-"""quantities that are NaN on roads that do not have them"""
+"""quantities that are NaN on some roads"""
 UNIT_FACTORS = {"m/s": {"m/s": 1.0, "km/h": 3.6}}
-"""allowed units by SI unit, each with its number in one SI unit; for others, only the SI unit is allowed"""
+"""allowed units of an SI unit, with their number in one SI unit; for other SI units only this unit is allowed"""
 
 
 def unit_factor(unit: str, si_unit: str) -> float:
-    """Return the number of units in one SI unit, an empty `unit`; raise `InputError` if it is not allowed."""
+    """Return how many of `unit`, or if it is empty of `si_unit`, are one `si_unit`; `InputError` if not allowed."""
     factors = UNIT_FACTORS.get(si_unit, {si_unit: 1.0})
     if (unit or si_unit) not in factors:
         raise unknown_name("unit", unit, factors)
@@ -139,20 +142,21 @@ Scale = Annotated[Number, AfterValidator(_check_scale)]
 
 @parameter_dataclass(frozen=True, config=STRICT, repr=False)
 class PolicyInput:
-    """A quantity among the inputs of a network, which is given `(value in unit - offset) / scale`."""
+    """A quantity as an input of a network: the network receives `(value - offset) / scale`, with `value` in `unit`."""
 
     quantity: str
-    """a field of `LocalState`, or the speed of another vehicle minus the own: `leader_relative_speed` or
+    """a field of `LocalState`, or the relative speed of a neighbor: `leader_relative_speed` or
     `follower_relative_speed`"""
     unit: str = ""
     """km/h instead of m/s; empty: the SI unit"""
     scale: Scale = 1.0
     offset: Number = 0.0
-    """value that is added, in the unit"""
+    """value that is subtracted, in `unit`"""
     optional: bool = False
-    """whether roads without it are allowed, where it is NaN: only for `loop_length` and `route_position`"""
+    """whether the quantity may be NaN on roads without it: only for `loop_length` and `route_position`"""
     tensor: str = ""
-    """input of an ONNX graph, of which this is the next column; empty: that with this name, or the only one"""
+    """name of the ONNX input that has this quantity as its next column; empty: the input with the name of the quantity,
+    or the only input"""
 
     def __post_init__(self) -> None:
         if self._field not in STATE_UNITS:
@@ -170,14 +174,14 @@ class PolicyInput:
 
     @cached_property
     def feature(self) -> Feature:
-        """The feature with these numbers."""
+        """The feature that computes this quantity."""
         name, unit = self._field, self.unit or STATE_UNITS[self._field]
         factor, is_relative = unit_factor(self.unit, STATE_UNITS[name]), self.quantity in RELATIVE_SPEEDS
         is_converted = factor != 1.0 or self.offset
 
-        def compute(inputs: FeatureInputs) -> Array:
-            value = getattr(inputs.state, name)
-            value = value - inputs.state.speed if is_relative else value
+        def compute(arguments: FeatureArguments) -> Array:
+            value = getattr(arguments.state, name)
+            value = value - arguments.state.speed if is_relative else value
             value = (value * factor - self.offset if is_converted else value) / self.scale
             return value if name in FIELD_SIZES else as_column(value)
 
@@ -193,7 +197,7 @@ class PolicyInput:
 
 FEATURES: dict[str, Feature] = {
     "local": Feature(
-        lambda inputs: local_observation(inputs.state),
+        lambda arguments: local_observation(arguments.state),
         (
             ScaledInput("own speed", SPEED_SCALE, "m/s"),
             ScaledInput("leader speed - own speed", RELATIVE_SPEED_SCALE, "m/s"),
@@ -203,28 +207,28 @@ FEATURES: dict[str, Feature] = {
         ),
     ),
     "expert_acceleration": Feature(
-        lambda inputs: as_column(inputs.expert_acceleration), (ScaledInput("expert acceleration", 1.0, "m/s2"),)
+        lambda arguments: as_column(arguments.expert_acceleration), (ScaledInput("expert acceleration", 1.0, "m/s2"),)
     ),
-    "expert_memory": Feature(lambda inputs: inputs.expert.memory_features(inputs.memory), None),
+    "expert_memory": Feature(lambda arguments: arguments.expert.memory_features(arguments.memory), None),
     "loop_length": PolicyInput("loop_length", scale=250.0).feature,
     "lap_position": Feature(
-        lambda inputs: lap_position(inputs.state),
+        lambda arguments: lap_position(arguments.state),
         (ScaledInput("cosine of lap position", 1.0, ""), ScaledInput("sine of lap position", 1.0, "")),
         Requirements(needs_loop=True),
     ),
     "route_position": PolicyInput("route_position", scale=100.0).feature,
     "allowed_speed": Feature(
-        lambda inputs: as_column((inputs.state.allowed_speed - inputs.state.speed) / SPEED_SCALE),
+        lambda arguments: as_column((arguments.state.allowed_speed - arguments.state.speed) / SPEED_SCALE),
         (ScaledInput("allowed speed - own speed", SPEED_SCALE, "m/s"),),
         Requirements(frozenset({"allowed_speed"})),
     ),
     "distance_to_merge": Feature(
-        lambda inputs: as_column(clip(inputs.state.distance_to_merge / MERGE_DISTANCE_SCALE, -1.0, 2.0)),
+        lambda arguments: as_column(clip(arguments.state.distance_to_merge / MERGE_DISTANCE_SCALE, -1.0, 2.0)),
         (ScaledInput("distance to merge", MERGE_DISTANCE_SCALE, "m"),),
         Requirements(frozenset({"distance_to_merge"})),
     ),
     "merge_proximity": Feature(
-        lambda inputs: merge_proximity(inputs.state),
+        lambda arguments: merge_proximity(arguments.state),
         tuple(
             ScaledInput(f"proximity to {distance:g} m before the merge", 1.0, "") for distance in PROXIMITY_DISTANCES
         ),
@@ -234,7 +238,7 @@ FEATURES: dict[str, Feature] = {
     "road_speeds": _section_speed_feature("road_speeds", "on all lanes"),
     "penetration_rate": PolicyInput("penetration_rate").feature,
     "adjacent_lanes": Feature(
-        lambda inputs: _adjacent_lane_features(inputs.state),
+        lambda arguments: _adjacent_lane_features(arguments.state),
         (
             *(
                 ScaledInput(f"speed {position} - own speed", RELATIVE_SPEED_SCALE, "m/s")
@@ -245,7 +249,7 @@ FEATURES: dict[str, Feature] = {
         Requirements(frozenset({"adjacent_gaps", "adjacent_speeds"}), needs_arrays=True),
     ),
 }
-"""all features of networks; `local` has the five numbers of the paper"""
+"""all features by name; `local` is the observation of the paper"""
 
 
 def _check_feature_name(name: str) -> str:
@@ -258,11 +262,11 @@ FeatureName = Annotated[str, AfterValidator(_check_feature_name)]
 """a key of FEATURES, or `path.py:name`"""
 NetworkInput = str | PolicyInput | Feature
 FeatureLike = FeatureName | PolicyInput | Feature | Callable[[LocalState], Any]
-"""the name of a feature, a quantity, or a function of this process"""
+"""the name of a feature, a quantity, a feature, or a function of a `LocalState`"""
 
 
 def as_features(features: Sequence[FeatureLike]) -> tuple[NetworkInput, ...]:
-    """Return features, functions among them as `Feature`; raise `InputError` if it is no list, or one is invalid."""
+    """Return network inputs for a list of features; raise `InputError` if it is not a list, or a feature is invalid."""
     if isinstance(features, str) or not isinstance(features, Sequence) or not features:
         raise invalid_value("features", features, "a list of features, like ('local', 'expert_acceleration')")
     return tuple(map(_as_network_input, features))
@@ -271,49 +275,56 @@ def as_features(features: Sequence[FeatureLike]) -> tuple[NetworkInput, ...]:
 def _as_network_input(candidate: FeatureLike) -> NetworkInput:
     if isinstance(candidate, str) and is_file_reference(candidate):
         return feature(candidate)
-    is_known = isinstance(candidate, NetworkInput)
-    return candidate if is_known else _user_feature(UserFunction.from_object(candidate, "a LocalState"))
+    if isinstance(candidate, NetworkInput):
+        return candidate
+    return _user_feature(UserFunction.from_object(candidate, "a LocalState"))
 
 
-def feature(name: NetworkInput) -> Feature:
-    """Return a feature by name; raise `InputError` if there is none, or a user's file has no such function."""
-    if not isinstance(name, str):
-        return name if isinstance(name, Feature) else name.feature
-    if name not in FEATURES and not is_file_reference(name):
-        raise unknown_name("features", name, [*FEATURES, "path.py:name"])
-    return FEATURES[name] if name in FEATURES else load_feature(FileReference.parse(name))[0]
+def feature(network_input: NetworkInput) -> Feature:
+    """Return the feature of a network input; raise `InputError` if no feature has the name, or no user's function."""
+    if not isinstance(network_input, str):
+        return network_input if isinstance(network_input, Feature) else network_input.feature
+    if network_input in FEATURES:
+        return FEATURES[network_input]
+    if not is_file_reference(network_input):
+        raise unknown_name("features", network_input, [*FEATURES, "path.py:name"])
+    return load_feature(FileReference.parse(network_input))[0]
 
 
 def load_feature(file: FileReference) -> tuple[Feature, FileReference]:
-    """Return a user's feature, and its reference with the hash of the code; `InputError` as `load_object_once`."""
-    loaded, file = file.load_object_once()
-    return _user_feature(UserFunction.from_object(loaded, "a LocalState", file)), file
+    """Return the feature in a user's file, and the reference with the hash of the code.
+
+    Raise `InputError` as `FileReference.load_object_once` does, or if the object is not a valid feature.
+    """
+    function, file = file.load_object_once()
+    return _user_feature(UserFunction.from_object(function, "a LocalState", file)), file
 
 
 def _user_feature(function: UserFunction) -> Feature:
     example = state_of_ones(LocalState._fields, np.ones, rows=2)
     size = _feature_columns(function, example).shape[1]
-    random = probe_state()
-    check_row_independence(lambda rows: _feature_columns(function, random.select(rows), size), function.label)
+    random_state = probe_state()
+    check_row_independence(lambda rows: _feature_columns(function, random_state.select(rows), size), function.label)
 
-    def compute(inputs: FeatureInputs) -> Array:
-        like, state = inputs.state.speed, inputs.state
-        is_numpy = isinstance(like, np.ndarray)
-        if not is_numpy:  # tensors: users' functions take NumPy arrays only
-            if any(values is not None and values.requires_grad for values in state):
+    def compute(arguments: FeatureArguments) -> Array:
+        state, speed = arguments.state, arguments.state.speed
+        is_numpy = isinstance(speed, np.ndarray)
+        if not is_numpy:  # users' functions take NumPy arrays, not tensors
+            if any(tensor is not None and tensor.requires_grad for tensor in state):
                 raise InputError(f"{function.label}: feature has no gradient; allowed: within torch.no_grad()")
-            state = state.map(lambda values: values.double().cpu().numpy())
-        found = _feature_columns(function, state, size)
-        if not (is_finite := np.isfinite(found)).all():
+            state = state.map(lambda tensor: tensor.double().cpu().numpy())
+        columns = _feature_columns(function, state, size)
+        if not (is_finite := np.isfinite(columns)).all():
             row, column = np.argwhere(~is_finite)[0]
-            raise RowError(f"{function.label}: column {column} is {found[row, column]}; allowed: finite", row)
-        return found if is_numpy else namespace(like).as_tensor(found, dtype=like.dtype, device=like.device)
+            raise RowError(f"{function.label}: column {column} is {columns[row, column]}; allowed: finite", row)
+        return columns if is_numpy else namespace(speed).as_tensor(columns, dtype=speed.dtype, device=speed.device)
 
-    entries = (ScaledInput(f"{function.label} {number}", 1.0, "") for number in range(size))
-    return Feature(compute, tuple(entries), Requirements(reads_any_field=True, needs_arrays=True))
+    inputs = tuple(ScaledInput(f"{function.label} {column}", 1.0, "") for column in range(size))
+    return Feature(compute, inputs, Requirements(reads_any_field=True, needs_arrays=True))
 
 
 def _feature_columns(function: UserFunction, state: LocalState, size: int | None = None) -> Floats:
+    """Return what a user's feature computes, shape (n, size); raise `InputError` if it has another shape."""
     rows, values = len(state.speed), as_numbers(function(state), f"{function.label}: feature")
     columns = values[:, None] if values.ndim == 1 else values
     if columns.ndim != 2 or columns.shape != (rows, columns.shape[1] if size is None else size):
@@ -323,35 +334,38 @@ def _feature_columns(function: UserFunction, state: LocalState, size: int | None
     return columns
 
 
-def compute_observation(names: Sequence[NetworkInput], inputs: FeatureInputs) -> Array:
-    """Return the input of a network: the features concatenated, shape (n, inputs), no unit."""
-    return join_columns([block for name in names if (block := feature(name).compute(inputs)) is not None])
+def compute_observation(network_inputs: Sequence[NetworkInput], arguments: FeatureArguments) -> Array:
+    """Return the observation of a network: the columns of its features, shape (n, inputs), no unit."""
+    blocks = (feature(network_input).compute(arguments) for network_input in network_inputs)
+    return join_columns([block for block in blocks if block is not None])
 
 
-def observation_inputs(names: Sequence[NetworkInput], expert: Driver) -> tuple[ScaledInput, ...]:
-    """Return the descriptions of a network's inputs with this expert, in the order of `compute_observation`."""
-    described = sum(len(feature(name).inputs or ()) for name in names)
-    remaining = range(observation_size(names, expert) - described)
+def observation_inputs(network_inputs: Sequence[NetworkInput], expert: Driver) -> tuple[ScaledInput, ...]:
+    """Return the descriptions of the columns of `compute_observation` with an expert, in order."""
+    features = [feature(network_input) for network_input in network_inputs]
+    described = sum(len(known.inputs or ()) for known in features)
+    undescribed = range(observation_size(network_inputs, expert) - described)
     expert_inputs = expert.memory_inputs or tuple(
-        ScaledInput(f"expert memory {number}", 1.0, "") for number in remaining
+        ScaledInput(f"expert memory {number}", 1.0, "") for number in undescribed
     )
-    return tuple(entry for name in names for entry in (feature(name).inputs or expert_inputs))
+    return tuple(entry for known in features for entry in (known.inputs or expert_inputs))
 
 
-def observation_size(names: Sequence[NetworkInput], expert: Driver) -> int:
-    """Return the number of a network's inputs with this expert."""
-    columns = memory_size(expert)  # of the features without a description
-    size = sum(columns if known.inputs is None else len(known.inputs) for known in map(feature, names))
+def observation_size(network_inputs: Sequence[NetworkInput], expert: Driver) -> int:
+    """Return the number of columns of `compute_observation` with an expert."""
+    memory_columns = memory_size(expert)
+    features = map(feature, network_inputs)
+    size = sum(memory_columns if known.inputs is None else len(known.inputs) for known in features)
     if not size:
         raise InputError("policy.inputs: expert_memory alone is not allowed: the expert has no memory features")
     return size
 
 
 def memory_size(expert: Driver) -> int:
-    """Return the number of an expert's memory features."""
+    """Return the number of columns of an expert's memory features."""
     state = state_of_ones(LocalState._fields, np.ones)
     acceleration, memory = expert.act(state, expert.initial_memory(1))
     if np.shape(acceleration) != (1,):
         raise InputError(f"driver: acceleration has shape {np.shape(acceleration)}; allowed: one for each CAV")
-    remembered = expert.memory_features(memory)
-    return 0 if remembered is None else remembered.shape[1]
+    features = expert.memory_features(memory)
+    return 0 if features is None else features.shape[1]

@@ -1,4 +1,4 @@
-"""Policies that others have trained: what their numbers mean, and the driver around them."""
+"""Policies of third parties: the description of their inputs and outputs, and the driver that contains them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,37 +21,39 @@ from unjam.physics.arrays import Array, namespace
 from unjam.text import format_count
 
 POLICY_KEY = "policy"
-"""name in the memory: that of the policy"""
+"""key of the policy's memory in the memory of a driver"""
 OUTPUT_UNITS = {"acceleration": "m/s2", "desired_speed": "m/s", "set_speed": "m/s"}
+"""quantities of a policy's output, with their SI units"""
 REPEAT_TOLERANCE = 1e-6
 """allowed deviation of a number of control steps from an integer"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class PolicyOutput:
-    """The output of a policy: `offset + scale * number` is a quantity in a unit."""
+    """The output of a policy: `offset + scale * number` is a quantity in `unit`."""
 
     quantity: Literal["acceleration", "desired_speed", "set_speed"] = "acceleration"
-    """`desired_speed` is reached within one control step; `set_speed` is that of an ACC, which also follows leaders"""
+    """`desired_speed` is reached within one control step; `set_speed` is the set speed of an ACC, which also keeps its
+    time gap to leaders"""
     unit: str = ""
     """km/h instead of m/s; empty: the SI unit"""
     scale: Scale = 1.0
     offset: Number = 0.0
-    """value that is added, in the unit"""
+    """value that is added, in `unit`"""
     limits: tuple[Number, Number] | None = None
-    """lowest and highest value in the unit; those of an acceleration also limit the expert's and the sum"""
+    """lowest and highest value in `unit`; limits of an acceleration also limit the expert and the sum"""
     tensor: str = ""
     """output of an ONNX graph; empty: the only one"""
 
     @model_validator(mode="after")
-    def _check(self) -> "PolicyOutput":
+    def _check_unit_and_limits(self) -> "PolicyOutput":
         unit_factor(self.unit, OUTPUT_UNITS[self.quantity])
         if self.limits is not None and not self.limits[0] < self.limits[1]:
             raise ValueError(f"limits: {list(self.limits)} is not allowed; allowed: a lower and a higher value")
         return self
 
     def acceleration(self, numbers: Array, state: LocalState, time_step: float) -> Array:
-        """Return accelerations [m/s2] for the numbers of a policy with this control step [s], shape (n,)."""
+        """Return accelerations [m/s2] for the numbers of a policy, shape (n,); `time_step` is the control step [s]."""
         value = numbers * self.scale + self.offset
         if self.limits is not None:
             value = value.clip(*self.limits)
@@ -63,15 +65,15 @@ class PolicyOutput:
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class PolicyMemory:
-    """Recurrent state of an ONNX graph: an input and an output; the first axis of both is the row of the CAV."""
+    """Recurrent state of an ONNX graph: names of an input and an output, which have one row for each CAV."""
 
     input: str
     output: str
     initial: Any = 0.0
-    """initial value of all numbers, or of each number of one CAV; None is NaN, as in JSON"""
+    """one initial value for all numbers, or an array of initial values for one CAV; None is NaN, as in JSON"""
 
 
-def _as_input(value: Any) -> NetworkInput:
+def _as_network_input(value: Any) -> NetworkInput:
     if isinstance(value, dict):
         return build_dataclass(PolicyInput, value, "inputs")
     if not isinstance(value, PolicyInput | Feature) and value not in FEATURES:
@@ -81,10 +83,10 @@ def _as_input(value: Any) -> NetworkInput:
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class PolicyDescription:
-    """What the inputs and outputs of a policy mean."""
+    """Meaning of the inputs and outputs of a policy."""
 
-    inputs: Annotated[tuple[Annotated[Any, BeforeValidator(_as_input)], ...], Field(min_length=1)]
-    """columns in order: quantities, and names of features as in `policy.inputs`"""
+    inputs: Annotated[tuple[Annotated[Any, BeforeValidator(_as_network_input)], ...], Field(min_length=1)]
+    """quantities, and names of features as in `policy.inputs`, in the order of the columns"""
     output: PolicyOutput = field(default_factory=PolicyOutput)
     time_step: Annotated[Number, Field(gt=0)] | None = None
     """control step of the policy, a multiple of that of the road [s]; None: that of the road"""
@@ -93,18 +95,18 @@ class PolicyDescription:
 
 @dataclass(frozen=True, eq=False)
 class PolicyDriver(ExpertWrapper):
-    """A policy that others have trained, alone or added to an expert; other processes cannot build it."""
+    """A policy of a third party, alone or added to an expert; other processes cannot build it."""
 
     portable_form: ClassVar[str] = "its .onnx file with a description, or, except in export, path.py:name that loads it"
 
     policy: Callable[[Any, Memory], tuple[Any, Memory]]
-    """returns numbers, shape (n,) or (n, 1), and its new memory, for observations, shape (n, inputs)"""
+    """function of observations, shape (n, inputs), and memory; returns numbers, shape (n,) or (n, 1), and new memory"""
     label: str
     """name of the policy in messages and tables"""
     description: PolicyDescription
     expert: Driver = field(default_factory=Constant)
     time_step: float | None = None
-    """control step of the road [s]; None: any, as neither the output nor the action repeat depends on it"""
+    """control step of the road [s]; None: any control step, because neither output nor action repeat depends on it"""
     features: tuple[NetworkInput, ...] = field(init=False)
     action_repeat: int = field(init=False)
 
@@ -122,7 +124,7 @@ class PolicyDriver(ExpertWrapper):
 
     @cached_property
     def limits(self) -> Limits | None:
-        """Limits of the expert and of the sum [m/s2]; None: those of the road."""
+        """Limits of the expert's acceleration, and of the sum with the policy's output [m/s2]; None: of the road."""
         output = self.description.output
         return Limits(*output.limits) if output.quantity == "acceleration" and output.limits is not None else None
 
@@ -131,14 +133,14 @@ class PolicyDriver(ExpertWrapper):
         return {}
 
     def initial_memory(self, n: int) -> Memory:
-        """Return those of expert and policy and, with an action repeat, the residual and its age."""
+        """Return the memories of expert and policy and, with an action repeat, the residual and its age."""
         return {**super().initial_memory(n), POLICY_KEY: self.policy_memory(n)}
 
     def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:
         """Return the decision with its components; raise `InputError` with `noise`, or for invalid numbers."""
         if noise is not None:
             raise InputError("explore: a policy of another library drives without exploration noise; allowed: 0")
-        if not len(state.speed):  # the policy may need a row
+        if not len(state.speed):  # the policy may fail without rows
             return Decision(Command(np.zeros(0)), np.zeros(0), np.zeros(0), None, memory)
         return super().decide(state, memory)._replace(observation=None)
 
@@ -151,7 +153,8 @@ class PolicyDriver(ExpertWrapper):
         return self.description.output.acceleration(numbers, state, step), {POLICY_KEY: new_memory}
 
     def evaluate(self, observation: Any, memory: Memory) -> tuple[Array, Memory]:
-        """Return the numbers of the policy, shape (n,), and its new memory; `InputError` unless they are finite."""
+        """Return the numbers of the policy, shape (n,), and its new memory; `InputError` unless numbers are finite."""
+
         rows, xp = len(observation), namespace(observation)
         answer, new_memory = self.policy(observation, memory)
         numbers = np.asarray(answer) if xp is np else xp.as_tensor(answer)
@@ -171,4 +174,4 @@ class PolicyDriver(ExpertWrapper):
 class TensorPolicyDriver(PolicyDriver):
     """A policy that also takes torch tensors, through which gradients flow from the state to the acceleration."""
 
-    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)
+    class_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)

@@ -1,4 +1,4 @@
-"""All drivers by name, and the construction of every driver from its recipe, so that other processes can build it."""
+"""All drivers by name, and the conversion of drivers to recipes and back, so that other processes can build them."""
 
 from collections.abc import Iterator
 from inspect import signature
@@ -26,7 +26,8 @@ _DRIVER_CLASSES = (
     *(Human, IDM, PISaturation, PIFromGap, FollowerStopper, ACC, SmoothACC, LACC, BCM, OVM),
     *(Pacer, JamAbsorber, Cruise, AdvisorySpeed, JamAhead, GapMaker, AdaptiveACC, Constant),
 )
-DRIVERS: dict[str, type[Driver]] = {kind.name: kind for kind in _DRIVER_CLASSES}
+DRIVERS: dict[str, type[Driver]] = {driver_class.name: driver_class for driver_class in _DRIVER_CLASSES}
+"""classes of drivers by their names for `--driver`"""
 DRIVER_CLASSES: dict[str, type[Driver]] = {
     **DRIVERS,
     "file": FileDriver,
@@ -39,11 +40,11 @@ DRIVER_CLASSES: dict[str, type[Driver]] = {
     "queue-fallback": wrappers.QueueFallback,
     "road-type-switch": wrappers.RoadTypeSwitch,
 }
-"""dataclasses of drivers by their names in recipes, which files and messages to workers contain"""
+"""classes of drivers by their names in recipes; files and messages to workers contain recipes"""
 
 
 def driver_names() -> str:
-    """Return what `--driver` allows, for messages."""
+    """Return the allowed values of `--driver`, for messages."""
     files = ["path.py:name", "a run folder", "a .unjam file", "an .onnx file", "unjam:ring-best"]
     return ", ".join([*DRIVERS, *files, "several joined by +"])
 
@@ -59,15 +60,15 @@ def driver_from_name(text: str, time_step: float) -> Driver:
         return FileDriver(reference.path, reference.name, parameters, time_step)
     if name not in DRIVERS:
         raise invalid_value("driver", name, f"{driver_names()}{spelling_hint(name, DRIVERS)}")
-    kind = DRIVERS[name]
-    if "time_step" in signature(kind).parameters:
+    driver_class = DRIVERS[name]
+    if "time_step" in signature(driver_class).parameters:
         parameters = {"time_step": time_step, **parameters}
-    return build_dataclass(kind, parameters, f"driver {name}")
+    return build_dataclass(driver_class, parameters, f"driver {name}")
 
 
 def driver_recipe(driver: Driver) -> tuple[Recipe, Arrays]:
-    """Return the recipe of a driver and its networks' weights; `InputError` if no other process could build it."""
-    for component in _all_drivers(driver):
+    """Return the recipe of a driver, and weights of networks; `InputError` if other processes cannot build it."""
+    for component in _iterate_drivers(driver):
         if not _is_portable(component):
             reason = "is not allowed here: it drives in its own process only"
             raise InputError(f"driver: {component.describe()!r} {reason}; allowed: {component.portable_form}")
@@ -77,19 +78,21 @@ def driver_recipe(driver: Driver) -> tuple[Recipe, Arrays]:
     return pack(driver, classes={Driver: DRIVER_CLASSES})
 
 
-def _all_drivers(driver: Driver) -> Iterator[Driver]:
+def _iterate_drivers(driver: Driver) -> Iterator[Driver]:
+    """Yield a driver and all drivers within it."""
     yield driver
-    for inner in driver.inner_drivers.values():
-        yield from _all_drivers(inner)
+    for inner_driver in driver.inner_drivers.values():
+        yield from _iterate_drivers(inner_driver)
 
 
 def is_serializable(driver: Driver) -> bool:
-    """Return whether another process can build a driver; drivers defined in a notebook drive in their own process."""
-    return all(map(_is_portable, _all_drivers(driver)))
+    """Return whether other processes can build a driver; they cannot build drivers that a notebook defines."""
+    return all(map(_is_portable, _iterate_drivers(driver)))
 
 
 def _is_portable(driver: Driver) -> bool:
-    """Return whether other processes have the class of a driver; what this process alone registers is unknown there."""
+    """Return whether other processes have the class of a driver: a registered class of unjam."""
+
     return type(driver) in DRIVER_CLASSES.values() and is_packaged(type(driver))
 
 
@@ -100,40 +103,45 @@ def driver_from_recipe(recipe: Recipe, weights: Arrays) -> Driver:
         driver = unpack(Driver, recipe, weights, {Driver: DRIVER_CLASSES})
     except ValueError as error:
         raise InputError(f"driver recipe: {error}") from None
-    for part in (part for part in _all_drivers(driver) if isinstance(part, ResidualDriver)):
-        if part.network.input_size != (size := observation_size(part.features, part.expert)):
-            raise InputError(f"network: {part.network.input_size} inputs are not allowed; allowed: {size}")
+    for component in _iterate_drivers(driver):
+        if isinstance(component, ResidualDriver):
+            input_size, size = component.network.input_size, observation_size(component.features, component.expert)
+            if input_size != size:
+                raise InputError(f"network: {input_size} inputs are not allowed; allowed: {size}")
     return driver
 
 
 def user_code_recipes(recipe: Any) -> list[Recipe]:
-    """Return the parts of `recipe` that refer to the user's own files, which are Python code.
+    """Return the parts of a driver's recipe that refer to Python files of the user.
 
-    Raise `InputError` if a feature's file is not listed with its hash, `LookupError` or `TypeError` if it is not valid.
+    Raise `InputError` if the recipe does not list the file of a feature with its hash, and `LookupError` or `TypeError`
+    if the recipe is not valid.
     """
-    parts = list(_iterate_recipes(recipe))
-    files = [part for part in parts if part["kind"] == "file"]
-    for residual in (part for part in parts if part["kind"] == "residual"):
-        listed = residual.get("files", [])
-        if not listed and (user_features := [name for name in residual.get("inputs", []) if name not in FEATURES]):
+    recipes = list(_iterate_recipes(recipe))
+    file_recipes = [part for part in recipes if part["kind"] == "file"]
+    for residual in (part for part in recipes if part["kind"] == "residual"):
+        listed_files = residual.get("files", [])
+        inputs = residual.get("inputs", [])
+        if not listed_files and (user_features := [name for name in inputs if name not in FEATURES]):
             allowed = "features whose files the recipe lists with their hashes"
             raise invalid_value("driver recipe: input", user_features[0], allowed)
-        files += listed
-    return files
+        file_recipes += listed_files
+    return file_recipes
 
 
-def _iterate_recipes(recipe: Any) -> Iterator[Recipe]:
-    if isinstance(recipe, dict):
-        if "kind" in recipe:
-            yield recipe
-        recipe = list(recipe.values())
-    if isinstance(recipe, list):
-        for part in recipe:
-            yield from _iterate_recipes(part)
+def _iterate_recipes(json_value: Any) -> Iterator[Recipe]:
+    """Yield each dict with a `kind` within JSON."""
+    if isinstance(json_value, dict):
+        if "kind" in json_value:
+            yield json_value
+        json_value = list(json_value.values())
+    if isinstance(json_value, list):
+        for item in json_value:
+            yield from _iterate_recipes(item)
 
 
 def unique_label(driver: Driver, drivers_by_label: dict[str, Driver]) -> str:
-    """Return the description of a driver, with a number if another driver already has it."""
+    """Return the description of a driver, followed by a number if a different driver already has this label."""
     label, number = driver.describe(), 1
     while label in drivers_by_label and not _is_same_driver(drivers_by_label[label], driver):
         number += 1
@@ -145,5 +153,5 @@ def _is_same_driver(driver: Driver, other: Driver) -> bool:
     if not (is_serializable(driver) and is_serializable(other)):
         return driver is other
     (recipe, arrays), (other_recipe, other_arrays) = driver_recipe(driver), driver_recipe(other)
-    is_equal = to_json(recipe) == to_json(other_recipe)  # in JSON, NaN is equal to itself
-    return is_equal and all(np.array_equal(array, other_arrays[name]) for name, array in arrays.items())
+    is_same_recipe = to_json(recipe) == to_json(other_recipe)  # in JSON, NaN is equal to itself
+    return is_same_recipe and all(np.array_equal(array, other_arrays[name]) for name, array in arrays.items())

@@ -50,8 +50,8 @@ class Pacer(FormulaDriver):
     """
 
     name: ClassVar[str] = "pacer"
-    own_requirements: ClassVar[Requirements] = Requirements(needs_loop=True)
-    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("queue has gathered", 1.0, ""),)
+    class_requirements: ClassVar[Requirements] = Requirements(needs_loop=True)
+    class_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("queue has gathered", 1.0, ""),)
 
     lap_time: Positive = 69.0
     """time for a lap [s]; the default gives 6.5 m/s at a radius of 32 m and 7.1 m/s at 35 m"""
@@ -134,7 +134,7 @@ class JamAbsorber(FormulaDriver):
     """
 
     name: ClassVar[str] = "jam-absorber"
-    own_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("waits for the jam to dissolve", 1.0, ""),)
+    class_memory_inputs: ClassVar[tuple[ScaledInput, ...]] = (ScaledInput("waits for the jam to dissolve", 1.0, ""),)
 
     jam_speed: NonNegative = 10.0
     """speed of the leader below which it counts as jammed [m/s]"""
@@ -206,7 +206,7 @@ class AdvisorySpeed(FormulaDriver):
     """
 
     name: ClassVar[str] = "advisory-speed"
-    own_requirements: ClassVar[Requirements] = Requirements(
+    class_requirements: ClassVar[Requirements] = Requirements(
         required_fields=frozenset({"allowed_speed"}), used_fields=frozenset({"allowed_speed", "distance_to_merge"})
     )
 
@@ -245,7 +245,7 @@ class JamAhead(FormulaDriver):
     """
 
     name: ClassVar[str] = "jam-ahead"
-    own_requirements: ClassVar[Requirements] = Requirements(
+    class_requirements: ClassVar[Requirements] = Requirements(
         used_fields=frozenset({"allowed_speed", "distance_to_merge", "lane_speeds", "road_speeds", "penetration_rate"}),
         needs_arrays=True,
     )
@@ -311,8 +311,8 @@ class GapMaker(JamAhead):
     """
 
     name: ClassVar[str] = "gap-maker"
-    own_requirements: ClassVar[Requirements] = JamAhead.own_requirements._replace(
-        used_fields=JamAhead.own_requirements.used_fields | {"adjacent_gaps"}
+    class_requirements: ClassVar[Requirements] = JamAhead.class_requirements._replace(
+        used_fields=JamAhead.class_requirements.used_fields | {"adjacent_gaps"}
     )
 
     merge_time_gap: Positive = 2.0

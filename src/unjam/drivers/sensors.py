@@ -1,4 +1,4 @@
-"""Sensors of a vehicle for its neighbors: bounded errors and missing readings."""
+"""Sensors of CAVs for gaps and speeds of neighbors, with bounded errors and missing readings."""
 
 from collections.abc import Sequence
 from typing import Annotated
@@ -12,19 +12,19 @@ from unjam.parameters import STRICT, NonNegative, Subclassable, parameter_datacl
 from unjam.physics.arrays import Array, Floats
 
 MIN_SENSED_GAP = 0.1
-"""smallest gap that a sensor reports, whatever its error [m]"""
+"""smallest gap that a sensor reports [m]"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class Sensors(Subclassable):
-    """Errors of the sensed gaps and speeds of neighbors; the own speed is exact."""
+    """Errors of the sensed gaps and speeds of neighbors, independent in each reading; the own speed is exact."""
 
     gap_error: NonNegative = 0.0
-    """largest error of a gap [m]; errors are independent for each reading, with a symmetric uniform distribution"""
+    """largest error of a gap [m]; errors have a symmetric uniform distribution"""
     speed_error: NonNegative = 0.0
     """largest error of the speed of a neighbor [m/s], with the same distribution"""
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """share of missing readings, independent for each reading"""
+    """probability that a reading is missing"""
 
     @property
     def is_exact(self) -> bool:
@@ -33,46 +33,51 @@ class Sensors(Subclassable):
 
 
 class SensorReadings:
-    """The sensor readings of CAVs by their names, over time."""
+    """Draws sensor readings of CAVs, and stores the last reading of each CAV for missing ones."""
 
     def __init__(self, sensors: Sensors, leader_braking: float, step: float, seed: np.random.SeedSequence) -> None:
-        """Take the settings of all CAVs: maximum braking of leaders [m/s2], and time between readings [s]."""
+        """Set the maximum braking of leaders [m/s2] and the time between two readings, `step` [s], for all CAVs."""
         self._sensors, self._leader_speed_drop, self._step = sensors, leader_braking * step, step
+
         self._filter_generator, self._driver_generator = (
             np.random.default_rng(child_seed) for child_seed in seed.spawn(2)
         )
-        self._bounds: dict[str, tuple[Array, Array]] = {}
-        self._last_readings: dict[str, Floats] = {}
+        self._filter_readings: dict[str, tuple[Array, Array]] = {}
+        self._driver_readings: dict[str, Floats] = {}
 
-    def read_for_filter(self, name: str, state: FollowingState) -> FollowingState:
-        """Return the readings for a safety filter, once per simulation step; `state` has numbers, or arrays.
+    def read_for_filter(self, cav_id: str, state: FollowingState) -> FollowingState:
+        """Return the readings of a CAV for its safety filter, once in each simulation step, from its true `state`.
 
-        If a reading is missing, it is assumed that the leader has braked at its maximum since the last one.
+        A missing reading assumes that the leader has braked with its maximum braking since the last reading. The state
+        contains numbers; with one id for several CAVs, it contains arrays.
         """
         sensors, generator, shape = self._sensors, self._filter_generator, np.shape(state.speed)
         leader = state.leader_speed + sensors.speed_error * generator.uniform(-1.0, 1.0, shape)
         gap = state.gap + sensors.gap_error * generator.uniform(-1.0, 1.0, shape)
-        if name in self._bounds:
+        if cav_id in self._filter_readings:
             is_missing = generator.random(shape) < sensors.dropout
-            last_leader, last_gap = self._bounds[name]
-            slowest = last_leader - self._leader_speed_drop
-            gap_change = self._step * (np.maximum(slowest - sensors.speed_error, 0.0) - state.speed)
-            leader = np.where(is_missing, slowest, leader)
+            last_leader, last_gap = self._filter_readings[cav_id]
+            slowest_leader = last_leader - self._leader_speed_drop
+            gap_change = self._step * (np.maximum(slowest_leader - sensors.speed_error, 0.0) - state.speed)
+            leader = np.where(is_missing, slowest_leader, leader)
             gap = np.where(is_missing, last_gap + gap_change, gap)
-        self._bounds[name] = leader, gap
+        self._filter_readings[cav_id] = leader, gap
         return FollowingState(state.speed, *((leader, gap) if shape else (float(leader), float(gap))))
 
-    def read_for_driver(self, names: Sequence[str], state: LocalState) -> LocalState:
-        """Return the true `state` of CAVs (numbers for one) as read; missing readings keep the last value."""
+    def read_for_driver(self, cav_ids: Sequence[str], state: LocalState) -> LocalState:
+        """Return the readings of CAVs for their drivers, from their true `state` (plain numbers for a single CAV).
+
+        A CAV with a missing reading uses its last reading.
+        """
         sensors, generator = self._sensors, self._driver_generator
-        true = np.array([state.leader_gap, state.follower_gap, state.leader_speed, state.follower_speed])
-        errors = np.repeat([sensors.gap_error, sensors.speed_error], 2)[:, None]
-        least = np.repeat([MIN_SENSED_GAP, 0.0], 2)[:, None]
-        true = true.reshape(4, len(names))
-        read = np.maximum(true + errors * generator.uniform(-1.0, 1.0, true.shape), least)
-        for column, is_missing in enumerate(generator.random(len(names)) < sensors.dropout):
+        true_values = np.array([state.leader_gap, state.follower_gap, state.leader_speed, state.follower_speed])
+        true_values = true_values.reshape(4, len(cav_ids))
+        largest_errors = np.repeat([sensors.gap_error, sensors.speed_error], 2)[:, None]
+        minima = np.repeat([MIN_SENSED_GAP, 0.0], 2)[:, None]
+        readings = np.maximum(true_values + largest_errors * generator.uniform(-1.0, 1.0, true_values.shape), minima)
+        for column, is_missing in enumerate(generator.random(len(cav_ids)) < sensors.dropout):
             if is_missing:
-                read[:, column] = self._last_readings.get(names[column], read[:, column])
-        self._last_readings = dict(zip(names, read.T, strict=True))
-        ahead, behind, leader, follower = read[:, 0].tolist() if isinstance(state.speed, float) else read
+                readings[:, column] = self._driver_readings.get(cav_ids[column], readings[:, column])
+        self._driver_readings = dict(zip(cav_ids, readings.T, strict=True))
+        ahead, behind, leader, follower = readings[:, 0].tolist() if isinstance(state.speed, float) else readings
         return state._replace(leader_gap=ahead, follower_gap=behind, leader_speed=leader, follower_speed=follower)

@@ -10,16 +10,17 @@ from unjam.errors import invalid_value
 from unjam.physics.arrays import Array, clip, namespace, replace_columns
 
 SpeedWindow = dict[str, Any]
+"""memory of a sliding window: `window`, `total` and `count` as `empty_window` describes them"""
 
 MIN_SPARE_STEPS = 64
 """minimum number of steps between two copies of a buffer"""
 MAX_WINDOW_STEPS = 1_000_000
-"""steps of a window: longer ones would make the memory of one vehicle too large"""
+"""largest number of steps of a window, which limits the memory of one vehicle"""
 
 
 @dataclass
 class _SpeedBuffer:
-    """Speeds of rows over time; consecutive memories share one buffer."""
+    """Speeds of n rows over time; consecutive windows share one buffer."""
 
     speeds: Array
     """speeds of the last steps [m/s], shape (steps, n)"""
@@ -28,13 +29,13 @@ class _SpeedBuffer:
 
 @dataclass(frozen=True)
 class BufferedWindow:
-    """A window of torch rows, oldest speed first: a part of a buffer, behind which a slide writes the newest speed.
+    """A window of torch rows, oldest speed first: a range of steps of a buffer, which `slide` extends by a newest step.
 
-    Nothing is copied, until the buffer is full or another memory that started from the same window has written there.
+    `slide` copies speeds only if the buffer is full, or if another window has already extended the buffer.
     """
 
     buffer: _SpeedBuffer
-    start: int
+    first_step: int
     steps: int
 
     @classmethod
@@ -47,28 +48,30 @@ class BufferedWindow:
 
     def slide(self, speed: Array) -> tuple["BufferedWindow", Array]:
         """Return the window one step later, and the speed that left it, shape (n,)."""
-        buffer, end = self.buffer, self.start + self.steps
+        buffer, end = self.buffer, self.first_step + self.steps
         if buffer.filled_steps != end or end == len(buffer.speeds):
-            return BufferedWindow.from_speeds(buffer.speeds[self.start : end]).slide(speed)
+            return BufferedWindow.from_speeds(self.speeds).slide(speed)
         buffer.speeds[end] = speed
         buffer.filled_steps += 1
-        return BufferedWindow(buffer, self.start + 1, self.steps), buffer.speeds[self.start]
+        return BufferedWindow(buffer, self.first_step + 1, self.steps), buffer.speeds[self.first_step]
+
+    @property
+    def speeds(self) -> Array:
+        """Speeds of the window [m/s], shape (steps, n)."""
+        return self.buffer.speeds[self.first_step : self.first_step + self.steps]
 
     def replace_rows(self, rows: Any, source: "BufferedWindow", source_rows: Any) -> "BufferedWindow":
-        """Return a window, in a new buffer, in which some rows are those of another window of as many steps."""
-        own, other = (
-            history.buffer.speeds[history.start : history.start + history.steps] for history in (self, source)
-        )
-        return BufferedWindow.from_speeds(replace_columns(own, rows, other, source_rows))
+        """Return a window in a new buffer, with `source_rows` of an equally long window in place of `rows`."""
+        return BufferedWindow.from_speeds(replace_columns(self.speeds, rows, source.speeds, source_rows))
 
     def detach(self) -> "BufferedWindow":
         """Return a copy without gradients."""
-        return BufferedWindow.from_speeds(self.buffer.speeds[self.start : self.start + self.steps].detach())
+        return BufferedWindow.from_speeds(self.speeds.detach())
 
 
 @dataclass(frozen=True)
 class CircularWindow:
-    """A window of torch rows in the order of `empty_window`: a pure function, as the graph of a controller requires."""
+    """A window of torch rows in the order of `empty_window`: `slide` is a pure function, as exported graphs require."""
 
     rows: Array
     """speeds of the last steps [m/s], shape (n, steps)"""
@@ -77,7 +80,7 @@ class CircularWindow:
 
     @property
     def steps(self) -> int:
-        """Steps of the window."""
+        """Number of steps of the window."""
         return self.rows.shape[1]
 
     def slide(self, speed: Array) -> tuple["CircularWindow", Array]:
@@ -96,9 +99,10 @@ def _buffered_window(window: Array, count: Array) -> BufferedWindow:
 def empty_window(n: int, window: float, time_step: float) -> SpeedWindow:
     """Return the memory of `n` vehicles before the first speed; raise `InputError` if the window has too many steps.
 
-    `window` (n, steps): the speeds of the last `window` seconds, the newest in place of the oldest, zeros before the
-    first; `total` (n,): their sum; `count` (n,): number of speeds since the start.
+    `window` (n, steps): speeds of the last `window` seconds, zeros before the first speed; a new speed replaces the
+    oldest one. `total` (n,): sum of these speeds. `count` (n,): number of speeds since the start.
     """
+
     if window / time_step > MAX_WINDOW_STEPS:
         raise invalid_value("window", window, f"at most {MAX_WINDOW_STEPS:,} steps of {time_step:g} s")
     steps = max(1, round(window / time_step))
@@ -106,7 +110,7 @@ def empty_window(n: int, window: float, time_step: float) -> SpeedWindow:
 
 
 def slide_window(memory: SpeedWindow, speed: Array) -> SpeedWindow:
-    """Return the window one step later, with `speed` [m/s] of shape (n,) as the newest; the old one is not changed."""
+    """Return a new window one step later, with `speed` [m/s] of shape (n,) as the newest speed."""
     window, count = memory["window"], memory["count"]
     if type(speed) is float:
         window = window[:]
@@ -125,7 +129,7 @@ def slide_window(memory: SpeedWindow, speed: Array) -> SpeedWindow:
 
 
 def window_mean_speed(memory: SpeedWindow) -> Array:
-    """Return the mean of the speeds so far [m/s], shape (n,); zero before the first."""
+    """Return the mean of the speeds in the window [m/s], shape (n,); zero before the first speed."""
     window = memory["window"]
     if isinstance(window, array):
         steps = len(window)
@@ -135,8 +139,8 @@ def window_mean_speed(memory: SpeedWindow) -> Array:
 
 
 def fill_window(memory: SpeedWindow, speeds: Array) -> SpeedWindow:
-    """Return an empty window after `speeds`, shape (n, any number of steps), oldest first."""
+    """Return the empty window `memory` after `speeds` [m/s], oldest first, shape (n, any number of steps)."""
     window = memory["window"].copy()
-    last = speeds[:, -window.shape[1] :]
-    window[:, : last.shape[1]] = last
-    return {"window": window, "total": window.sum(1), "count": memory["count"] + last.shape[1]}
+    last_speeds = speeds[:, -window.shape[1] :]
+    window[:, : last_speeds.shape[1]] = last_speeds
+    return {"window": window, "total": window.sum(1), "count": memory["count"] + last_speeds.shape[1]}

@@ -196,7 +196,7 @@ class UserDriver(Driver):
         else:
             declared_step = getattr(self.implementation, "time_step", None)
             steps = frozenset({float(declared_step)} if isinstance(declared_step, int | float) else ())
-        return self.own_requirements._replace(reads_any_field=True, time_steps=steps)
+        return self.class_requirements._replace(reads_any_field=True, time_steps=steps)
 
     def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return the result of the user's function."""

@@ -81,12 +81,12 @@ class DriverWrapper(CompositeDriver):
 class MixedDriver(CompositeDriver):
     """Assigns drivers to CAVs in turn, again from the first after the last; CAVs of open roads in order of entry."""
 
-    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)
+    class_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)
 
     drivers: tuple[Driver, ...]
 
     def __post_init__(self) -> None:
-        if any(driver.is_native for driver in self.drivers):
+        if any(driver.is_driven_by_simulator for driver in self.drivers):
             raise InputError("driver: 'human' is not allowed among several; 'idm' drives like a human driver")
 
     @cached_property
@@ -181,7 +181,7 @@ class FilteredDriver(DriverWrapper):
     control step, nothing changes.
     """
 
-    own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
+    class_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
     driver: Driver
     action_limit: Positive
@@ -237,7 +237,7 @@ class FilteredDriver(DriverWrapper):
 class HistoryDriver(DriverWrapper):
     """Drives as another driver does, and keeps means of its own speed, its square, and its gap for a network."""
 
-    own_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
+    class_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
     driver: Driver
     time_step: Positive
@@ -309,7 +309,7 @@ class QueueFallback(CompositeDriver):
     time_step: Positive
     """control step [s]"""
 
-    own_requirements: ClassVar[Requirements] = Requirements(needs_loop=True, needs_numpy=True)
+    class_requirements: ClassVar[Requirements] = Requirements(needs_loop=True, needs_numpy=True)
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memories of both, without elapsed time [s], queue and switch."""
@@ -351,7 +351,7 @@ class RoadTypeSwitch(CompositeDriver):
     All CAVs of an episode are on one road. The memories for other road types keep their initial values.
     """
 
-    own_requirements: ClassVar[Requirements] = Requirements(
+    class_requirements: ClassVar[Requirements] = Requirements(
         used_fields=frozenset({"distance_to_crossing", "penetration_rate"}), needs_numpy=True
     )
 

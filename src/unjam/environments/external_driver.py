@@ -7,7 +7,7 @@ import numpy as np
 from unjam.drivers.command import Command, Limits
 from unjam.drivers.driver import Decision, Driver, Memory, NoiseSampler, replace_memory_rows
 from unjam.drivers.local_state import LocalState
-from unjam.drivers.observation import FeatureInputs, NetworkInput, compute_observation, feature
+from unjam.drivers.observation import FeatureArguments, NetworkInput, compute_observation, feature
 from unjam.drivers.requirements import Requirements, RoadInterface, merge_requirements
 from unjam.drivers.wrappers import INNER_KEY
 from unjam.physics.arrays import replace_entries
@@ -38,7 +38,7 @@ class ExternalDriver(Driver):
         """Return the external observation as `compute_observation`, and store the expert's acceleration."""
         acceleration, new_memory = self.expert.act(state, memory[INNER_KEY])
         self._expert_acceleration, self._next_memory = self._limits.clip(acceleration), {INNER_KEY: new_memory}
-        inputs = FeatureInputs(state, self._expert_acceleration, self.expert, new_memory)
+        inputs = FeatureArguments(state, self._expert_acceleration, self.expert, new_memory)
         return compute_observation(self.features, inputs)
 
     def decide(self, state: LocalState, memory: Memory, noise: NoiseSampler | None = None) -> Decision:

@@ -71,7 +71,7 @@ def tensor_memory(driver: Driver, memory: Memory, device: torch.device | str) ->
 class NumPyDriverAdapter(Driver):
     """Calls a driver that does not take tensors with NumPy arrays; its memory stays in NumPy."""
 
-    own_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)
+    class_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)
     driver: Driver
     device: torch.device
 

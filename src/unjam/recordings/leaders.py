@@ -8,7 +8,7 @@ import numpy as np
 
 from unjam.errors import invalid_value
 from unjam.physics.arrays import Floats
-from unjam.recordings.trajectories import even_times
+from unjam.recordings.trajectories import regular_times
 from unjam.text import shorten_list
 
 FILE_SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".xml", ".gz")
@@ -32,7 +32,7 @@ class LeaderRecording:
 
     def speeds_at(self, start: float, seconds: float, step: float) -> Floats:
         """Return interpolated speeds [m/s] at times from `start` on, every `step` for at most `seconds` [s]."""
-        times = start + even_times(min(seconds, self.seconds - start), step)
+        times = start + regular_times(min(seconds, self.seconds - start), step)
         return np.interp(times, self.time_step * np.arange(len(self.speed)), self.speed)
 
 

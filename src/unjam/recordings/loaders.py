@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from unjam.errors import InputError, unknown_name
 from unjam.physics.arrays import Floats
 from unjam.recordings.tables import check_unique_columns, read_table
-from unjam.recordings.trajectories import FollowingTrajectory, even_times
+from unjam.recordings.trajectories import FollowingTrajectory, regular_times
 from unjam.text import format_count, shorten_list
 
 TABLE_COLUMNS = ("pair", "time", "speed", "leader_speed", "gap")
@@ -418,7 +418,7 @@ def _resample_rows(rows: pd.DataFrame, step: float) -> list[Floats]:
     resolution = next((unit for unit in units if np.all(np.abs(times / unit - np.round(times / unit)) < 0.01)), 0.0)
     if deviation <= 0.75 * resolution:  # an error of rounding is up to half of it; the fitted line has an error, too
         return columns
-    return [np.interp(even_times(times[-1], step), times, column) for column in columns]
+    return [np.interp(regular_times(times[-1], step), times, column) for column in columns]
 
 
 def _find_bad_rows(frame: pd.DataFrame) -> tuple[np.ndarray, dict[int, str]]:

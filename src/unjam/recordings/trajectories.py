@@ -70,12 +70,12 @@ class FollowingTrajectory:
 
     def resample(self, time_step: float) -> "FollowingTrajectory":
         """Return the trajectory with another time step [s], interpolated between the samples."""
-        times, old_times = even_times(self.seconds, time_step), self.time_step * np.arange(len(self.speed))
+        times, old_times = regular_times(self.seconds, time_step), self.time_step * np.arange(len(self.speed))
         columns = {name: np.interp(times, old_times, getattr(self, name)) for name in ("speed", "leader_speed", "gap")}
         return replace(self, time_step=time_step, **columns)
 
 
-def even_times(seconds: float, time_step: float) -> Floats:
+def regular_times(seconds: float, time_step: float) -> Floats:
     """Return the times from zero to at most `seconds` at equal intervals [s]."""
     return time_step * np.arange(int(seconds / time_step + 1e-3) + 1, dtype=np.float64)
 

@@ -114,7 +114,7 @@ def default_scenario(name: str) -> Scenario | type[Scenario]:
     return _base_scenario(name) if is_known else Scenario
 
 
-def without_toml_file(values: dict[str, Any]) -> dict[str, Any]:
+def inline_toml_file(values: dict[str, Any]) -> dict[str, Any]:
     """Return a configuration with the content of a scenario's TOML file, which may change, instead of its name."""
     name = values.get("scenario")
     if not isinstance(name, str) or not name.endswith(".toml"):

@@ -115,14 +115,14 @@ class CruiseControl(Subclassable):
         return xp.where(is_capped, capped, 0.0 * capped + inf)
 
 
-def whole_milliseconds(step: float) -> float:
+def check_milliseconds(step: float) -> float:
     """Return a step [s]; raise `ValueError` unless it is a whole number of milliseconds, SUMO's unit of time."""
     if abs(1000.0 * step - round(1000.0 * step)) > 1e-9:
         raise ValueError("a whole number of milliseconds, as SUMO counts")
     return step
 
 
-SimulationStep = Annotated[float, Field(ge=0.001, le=10), AfterValidator(whole_milliseconds)]
+SimulationStep = Annotated[float, Field(ge=0.001, le=10), AfterValidator(check_milliseconds)]
 """a time step of SUMO [s]"""
 Horizon = Annotated[PositiveInt, Field(le=MAX_HORIZON)]
 """control steps in an episode"""

@@ -121,7 +121,7 @@ def make_request(
     controllers = {name: make_driver(name, road.control_step) for name in drivers if name != ACC_DRIVER}
     for name, driver in controllers.items():
         check_controllers(name, "assess")
-        if driver.is_native:
+        if driver.is_driven_by_simulator:
             raise invalid_value("driver", name, "the human baseline is always included")
         check_can_drive(driver, road, f"driver {name}")
     request = AssessmentRequest(file, road, controllers, rates, episodes, minutes, precision)

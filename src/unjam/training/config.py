@@ -36,7 +36,7 @@ from unjam.parameters import (
     parameter_dataclass,
     read_toml,
 )
-from unjam.scenarios import default_scenario, make_scenario, without_toml_file
+from unjam.scenarios import default_scenario, inline_toml_file, make_scenario
 from unjam.scenarios.scenario import Scenario
 from unjam.seeds import TRAINING_SEED_LIMIT
 from unjam.training.presets import preset_values
@@ -258,7 +258,7 @@ def load_config(file: Path | str | None = None, preset: str = "", changes: dict[
     file_values = read_values(file) if file is not None else {}
     if file is not None and _is_in_run_folder(file):  # the code in other files is the user's own
         check_trusted_values(f"config file {file}", file_values)
-    user_values = without_toml_file(merge_changes(file_values, nest_keys(changes or {})))
+    user_values = inline_toml_file(merge_changes(file_values, nest_keys(changes or {})))
     if isinstance(tasks := user_values.get("tasks"), list):
         user_values["tasks"] = [_expand_toml_file_of_task(task) for task in tasks]
     scenario_name = str(user_values.get("scenario", RunConfig.scenario))
@@ -298,7 +298,7 @@ def _start_folder(run: Path) -> Path:
 
 def _expand_toml_file_of_task(values: Any) -> Any:
     """Return the values of a task with the content of its scenario's TOML file, if it has one, and the file's name."""
-    if not isinstance(values, dict) or (expanded := without_toml_file(values)) is values:
+    if not isinstance(values, dict) or (expanded := inline_toml_file(values)) is values:
         return values
     return {"name": re.sub(r"[^\w-]", "-", Path(values["scenario"]).stem), **expanded}
 

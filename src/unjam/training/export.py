@@ -156,7 +156,7 @@ def export_controller(
     read_origin = _read_run_origin if source.is_dir() else _read_driver_origin
     road, driver, metadata = read_origin(str(source), scenario, settings or {})
     code = user_code_recipes(driver_recipe(driver)[0])
-    if driver.is_native or code:
+    if driver.is_driven_by_simulator or code:
         reason = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
         raise InputError(f"export: {driver.describe()} is not allowed: {reason}; allowed: drivers without Python code")
     model = _residual_model(driver, metadata) if stable_baselines3 else None

@@ -92,7 +92,7 @@ def tunable_parameters(expert: str, time_step: float) -> dict[str, tuple[Any, An
             if type(value) is int and type_hint not in (int, "int"):  # without `int`, a default of 2 may mean 2.0
                 parameters[name] = float(value), type_hint
     else:
-        names = [name for name, driver_class in DRIVERS.items() if not driver_class.is_native]
+        names = [name for name, driver_class in DRIVERS.items() if not driver_class.is_driven_by_simulator]
         if expert not in names:
             raise unknown_name("expert", expert, names)
         values = named_parts(driver_from_name(expert, time_step)) or {}

@@ -33,7 +33,7 @@ class DriveLoop:
         draw = partial(world.noise, size) if size else world.noise
         scaled = draw if explore == 1.0 else lambda: explore * draw()
         self._draw_noise: NoiseSampler | None = scaled if explore else None
-        history = world.start(not driver.is_native, on_progress)
+        history = world.start(not driver.is_driven_by_simulator, on_progress)
         self.memory = driver.initial_memory(world.cav_count) if memory is None else memory
         if history is not None:
             self.memory = driver.recall(self.memory, history)
@@ -49,7 +49,7 @@ class DriveLoop:
         local_state, decide, advance = world.local_state, driver.decide, world.advance
         try:
             while not world.has_ended:
-                if driver.is_native:
+                if driver.is_driven_by_simulator:
                     decision = None
                     advance(None)
                 else:

@@ -186,7 +186,7 @@ def _check_requirements(requirements: Requirements, scenario: Scenario, label: s
 
 def check_has_cavs(episode: Episode, driver: Driver) -> None:
     """Raise `NoCavError` if a driver had no CAV."""
-    if not episode.cav_ids and not driver.is_native:
+    if not episode.cav_ids and not driver.is_driven_by_simulator:
         steps = format_count(episode.control_steps, "control step")
         raise NoCavError(f"no CAV was on the road in {steps}: make more vehicles CAVs")
 

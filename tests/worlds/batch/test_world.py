@@ -111,7 +111,7 @@ RINGS: dict[str, tuple[Ring, str]] = {
 class ByShare(Driver):
     """Brakes by the penetration rate that it receives."""
 
-    own_requirements: ClassVar[Requirements] = Requirements(used_fields=frozenset({"penetration_rate"}))
+    class_requirements: ClassVar[Requirements] = Requirements(used_fields=frozenset({"penetration_rate"}))
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         return -state.penetration_rate, memory

@@ -67,7 +67,7 @@ class Answers(Driver):
 
 
 class PlainAnswers(Answers):
-    own_requirements = NO_REQUIREMENTS
+    class_requirements = NO_REQUIREMENTS
 
 
 def moves(episode: Episode) -> Floats:

@@ -205,7 +205,7 @@ def run_batched_if_supported(
 
 def _shared_settings(task: EpisodeTask) -> tuple[object, ...]:
     """Return the settings that tasks must have in common to be simulated at once."""
-    is_indivisible = task.driver.is_native or task.driver.network_inputs is not None
+    is_indivisible = task.driver.is_driven_by_simulator or task.driver.network_inputs is not None
     kind = support.batch_kind(task.scenario)
     explore = task.explore != 0.0 if kind and kind.has_own_drivers else task.explore
     return task.driver if is_indivisible else None, task.reward, explore
