@@ -73,7 +73,8 @@ def batch_commanded_accelerations(command: Command | None, limits: Limits, rows:
     """
     accelerations: Any = () if command is None else command.acceleration
     if np.shape(accelerations) != (rows,) or not bool(namespace(accelerations).isfinite(accelerations).all()):
-        raise InputError(f"driver: step {step}: accelerations are not allowed; allowed: {rows} finite numbers")
+        allowed = f"{rows} finite numbers, one for each CAV"
+        raise InputError(f"driver: step {step}: acceleration is not allowed; allowed: {allowed}")
     return limits.clip(accelerations)
 
 
