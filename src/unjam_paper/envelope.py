@@ -60,7 +60,7 @@ LANE_CONDITIONS: dict[str, dict[str, Any]] = {
     "a full lane, half of all automated": {"inflow": 2400.0, "off_peak_inflow": 2000.0, "penetration_rate": 0.5},
 }
 """demand on one lane of a motorway without cut-ins"""
-SENSOR_ERROR_FIELDS = ("gap_error", "speed_error")
+SENSOR_ERROR_NAMES = ("gap_error", "speed_error")
 IMPAIRMENTS: dict[str, dict[str, Any]] = {
     "usual car, exact sensors": {},
     "ideal car": {"actuator": INSTANT_ACTUATOR},
@@ -69,8 +69,8 @@ IMPAIRMENTS: dict[str, dict[str, Any]] = {
     **{
         label: {"sensors": Sensors(**errors), "safety": SafetyFilter(**errors)}
         for label, errors in {
-            "gap and speed off by up to 0.3": dict.fromkeys(SENSOR_ERROR_FIELDS, 0.3),
-            "off by up to 1.0": dict.fromkeys(SENSOR_ERROR_FIELDS, 1.0),
+            "gap and speed off by up to 0.3": dict.fromkeys(SENSOR_ERROR_NAMES, 0.3),
+            "off by up to 1.0": dict.fromkeys(SENSOR_ERROR_NAMES, 1.0),
         }.items()
     },
     "every tenth reading missing": {"sensors": Sensors(dropout=0.1)},

@@ -222,7 +222,8 @@ def write_network(
         if rows
     }
     run_netconvert(inputs, ["--no-turnarounds=true", *options], folder)
-    (folder / "road.rou.xml").write_text(f"<routes>{''.join(traffic)}</routes>")
+    routes = f"<routes>{''.join(traffic)}</routes>"
+    (folder / "road.rou.xml").write_text(routes)
     return write_configuration(folder, {})
 
 

@@ -16,7 +16,7 @@ from unjam.worlds.batch.ring.recorded import RecordedBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam_paper.fuel_optimal_plan import PlanLimits
 
-ELITE_SHARE, SMOOTHING, MIN_STD = 0.2, 0.3, 0.03
+ELITE_SHARE, SMOOTHING, MIN_PARAMETER_STD = 0.2, 0.3, 0.03
 """share of candidates that define the next generation; weight of the last distribution in the next one; smallest
 standard deviation of a parameter, relative to its range"""
 SEARCH_SEED = 0
@@ -107,7 +107,7 @@ def search_parameters(
         elite = points[order[: round(ELITE_SHARE * budget.size)]]
         weight = SMOOTHING if generation else 0.0
         mean = weight * mean + (1.0 - weight) * elite.mean(0)
-        std = np.maximum(weight * std + (1.0 - weight) * elite.std(0), MIN_STD)
+        std = np.maximum(weight * std + (1.0 - weight) * elite.std(0), MIN_PARAMETER_STD)
         first = int(order[0])
         if total[first] < best["score"]:
             best_parameters = {name: round(float(values[first]), 4) for name, values in parameters.items()}
