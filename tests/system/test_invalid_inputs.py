@@ -113,7 +113,7 @@ INVALID: dict[str, tuple[str, list[str]]] = {
     ),
     "too many trainings": ("seeds", ["reproduce theory --seeds 1000000000000"]),
     "negative seed": ("seed", ["train ring --seed -1"]),
-    "tuning a family for a reward": ("reward: with rings", ["tune rings --reward eq16"]),
+    "tuning a family for a reward": ("reward: not allowed with rings", ["tune rings --reward eq16"]),
     "tuning a family whose roads become too short": ("length", ["tune rings --length 60"]),
     "tuning with too few steps": ("steps: 10", ["tune rings --steps 10"]),
     "training into a folder that is not empty": ("--resume full", ["train ring --out full"]),
