@@ -274,7 +274,6 @@ class JamAhead(FormulaDriver):
     free_speed_ratio: Positive | None = None
     """the same with a map of ramps; None: there is a cap at any speed ahead"""
 
-
     @model_validator(mode="after")
     def _check_section_order(self) -> "JamAhead":
         first, last = self.first_section, self.last_section
