@@ -1,7 +1,7 @@
 """The safety filter, and the actuator of a vehicle with its delay and lag.
 
-The filter passes an acceleration if the vehicle can afterwards still stop behind a leader that brakes at the assumed
-maximum, and keep its time gap behind one that brakes hard. `docs/safety.md` has the assumptions and the proof.
+The filter allows an acceleration if the vehicle can afterwards still stop behind a leader that brakes with its assumed
+maximum, and keep its time gap behind a leader that brakes hard. `docs/safety.md` has the assumptions and the proof.
 """
 
 import sys
@@ -22,34 +22,34 @@ class ActuatorState(NamedTuple):
 
     acceleration: Array
     pending: tuple[Array, ...] = ()
-    """commands that have not arrived yet, the next one first"""
+    """commands that have not arrived yet, ordered by arrival"""
 
     def map(self, function: Callable[[Array], Array]) -> "ActuatorState":
-        """Return the state with a function applied to each array."""
+        """Return a state with the results of a function for each array."""
         return ActuatorState(function(self.acceleration), tuple(map(function, self.pending)))
 
 
 Latency = Annotated[float, Field(ge=0, le=60)]
-"""delay or time constant of an actuator; a pending command needs memory in each step [s]"""
+"""delay or time constant of an actuator [s]"""
 MAX_RESPONSE_STEPS = 1000
-"""most steps that a command can take to arrive, or that the time constant of a lag can last"""
+"""largest delay, and largest time constant of a lag, in simulation steps, because each step of a delay needs memory"""
 MIN_TIME_GAP_BRAKING = 0.5
-"""smallest braking with which a filter can keep a time gap: it follows the plan to standstill step by step [m/s2]"""
+"""smallest braking with which a filter can keep a time gap [m/s2]: the filter computes each step to standstill"""
 MAX_LEADER_BRAKING = 100.0
-"""largest braking of a leader, ten times that of a car on a dry road [m/s2]; squares of far larger ones overflow"""
+"""largest braking of a leader [m/s2], ten times the braking of a car on a dry road; far larger squares overflow"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class Actuator(Subclassable):
     """Delay and lag of a vehicle's response to commands: da/dt = (u(t - delay) - a) / lag, exact over each step.
 
-    Vehicles with driver assistance systems: lag 0.2 to 0.5 s, delay 0.05 to 0.5 s.
+    Vehicles with driver assistance systems have lags of 0.2 to 0.5 s, and delays of 0.05 to 0.5 s.
     """
 
     delay: Latency = 0.0
     """time until a command arrives, rounded to whole simulation steps [s]"""
     lag: Latency = 0.0
-    """time constant with which the acceleration follows [s]"""
+    """time constant with which the acceleration follows the commands [s]"""
 
     @property
     def is_instant(self) -> bool:
@@ -57,38 +57,38 @@ class Actuator(Subclassable):
         return self.delay == 0.0 == self.lag
 
     def describe(self) -> str:
-        """Return the vehicle in words."""
+        """Return a description of the vehicle for certificates."""
         if self.is_instant:
             return "in a vehicle that obeys at once"
         return f"in a vehicle with {self.delay:g} s delay and {self.lag:g} s lag"
 
     def initial_state(self, like: Array, step: float) -> ActuatorState:
-        """Return the state without acceleration and commands, for vehicles in the shape of `like`."""
+        """Return the state without acceleration and pending commands, with arrays of the type and shape of `like`."""
         return ActuatorState(0.0 * like, (0.0 * like,) * self.delay_steps(step))
 
     def check_step(self, step: float) -> None:
-        """Raise `ValueError` if the response takes more than `MAX_RESPONSE_STEPS`, each of which takes time."""
+        """Raise `ValueError` if delay or lag is longer than `MAX_RESPONSE_STEPS` simulation steps."""
         for name, value in (("delay", self.delay), ("lag", self.lag)):
             if value > MAX_RESPONSE_STEPS * step:
                 allowed = f"at most {MAX_RESPONSE_STEPS:,} steps of {step:g} s"
                 raise ValueError(f"actuator.{name}: {value:g} is not allowed; allowed: {allowed}")
 
     def delay_steps(self, step: float) -> int:
-        """Return the number of simulation steps until a command arrives."""
+        """Return the delay in simulation steps."""
         return round(self.delay / step)
 
     def apply_command(self, command: Array, speed: Array, state: ActuatorState, step: float) -> ActuatorState:
-        """Return the state after a command, with the acceleration for this step; brakes cannot reverse a vehicle."""
+        """Return the state after a command, with the acceleration of this step; brakes cannot reverse a vehicle."""
         arriving, *pending = *state.pending, command
         decay = self.decay(step)
         acceleration = state.acceleration * decay + arriving * (1.0 - decay)
         return ActuatorState(clamp_min(acceleration, -speed / step), tuple(pending))
 
     def equivalent_speed(self, speed: Array, state: ActuatorState, braking: float, step: float) -> Array:
-        """Return the speed z of a vehicle without lag that drives at least as far under any commands [m/s].
+        """Return the speed z of a vehicle without lag that drives at least as far after the same commands [m/s].
 
         z = v + T (a + `braking`) with T = h r / (1 - r), where r is the share of the difference to a command that
-        remains after one step of length h. For any command u, one step turns z into z + h u: as without lag.
+        remains after one step of length h. For any command u, one step turns z into z + h u, as without lag.
         """
         return speed + self.response_time(step) * (state.acceleration + braking)
 
@@ -105,7 +105,7 @@ class Actuator(Subclassable):
 INSTANT_ACTUATOR = Actuator()
 """an ideal vehicle, which responds to commands at once"""
 STANDARD_ACTUATOR = Actuator(delay=0.2, lag=0.3)
-"""a usual car: an assumption, see `docs/string-stability.md`"""
+"""assumed vehicle: a usual car, see `docs/string-stability.md`"""
 
 
 class FollowingState(NamedTuple):
@@ -118,10 +118,10 @@ class FollowingState(NamedTuple):
 
 
 MAX_COMMAND, MAX_TRACED_SPEED = 20.0, 50.0
-"""largest acceleration that a vehicle with delay or lag can be allowed [m/s2], and highest speed for which its exported
-graph keeps time gaps [m/s]"""
+"""for a vehicle with delay or lag: largest allowed acceleration [m/s2], and highest speed for which its exported graph
+keeps time gaps [m/s]"""
 MAX_LEADER_GAP = 1e6
-"""finite gap that replaces larger ones in formulas that count steps [m]"""
+"""finite gap that replaces larger gaps in formulas that count steps [m]"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -133,16 +133,16 @@ class SafetyFilter(Subclassable):
     """
 
     active: bool = True
-    """whether it acts at all"""
+    """whether the filter limits accelerations"""
     braking: Positive = 6.0
     """maximum braking of the own vehicle, b_min [m/s2]"""
     leader_braking: Positive = 6.0
     """maximum braking of any leader, b_max, at least `braking` [m/s2]"""
     standstill_gap: NonNegative = 1.0
-    """remaining gap when both vehicles stand [m]"""
+    """gap that remains when both vehicles stand [m]"""
     time_gap: NonNegative = 1.0
-    """minimum time gap, beyond the standstill gap, behind a leader that brakes with at most `time_gap_braking` [s];
-    0: none"""
+    """minimum time gap, in addition to the standstill gap, behind a leader that brakes with at most `time_gap_braking`
+    [s]; 0: no time gap"""
     time_gap_braking: Positive = 4.5
     """braking with which the minimum time gap is kept, from 0.5 to `braking` [m/s2]"""
     gap_error: NonNegative = 0.0
@@ -152,14 +152,14 @@ class SafetyFilter(Subclassable):
 
     @model_validator(mode="after")
     def _check_braking(self) -> "SafetyFilter":
-        own_braking, leader, time_gap = self.braking, self.leader_braking, self.time_gap_braking
-        if leader < own_braking:  # else the gap may be smallest before both stand
-            raise ValueError(f"leader_braking: {leader:g} is not allowed; allowed: >= braking, {own_braking:g}")
-        if leader > MAX_LEADER_BRAKING:
-            raise ValueError(f"leader_braking: {leader:g} is not allowed; allowed: <= {MAX_LEADER_BRAKING:g}")
-        if not MIN_TIME_GAP_BRAKING <= time_gap <= own_braking:
-            allowed = f"{MIN_TIME_GAP_BRAKING:g} to braking, {own_braking:g}"
-            raise ValueError(f"time_gap_braking: {time_gap:g} is not allowed; allowed: {allowed}")
+        braking, leader_braking, time_gap_braking = self.braking, self.leader_braking, self.time_gap_braking
+        if leader_braking < braking:  # otherwise the gap may be smallest before both vehicles stand
+            raise ValueError(f"leader_braking: {leader_braking:g} is not allowed; allowed: >= braking, {braking:g}")
+        if leader_braking > MAX_LEADER_BRAKING:
+            raise ValueError(f"leader_braking: {leader_braking:g} is not allowed; allowed: <= {MAX_LEADER_BRAKING:g}")
+        if not MIN_TIME_GAP_BRAKING <= time_gap_braking <= braking:
+            allowed = f"{MIN_TIME_GAP_BRAKING:g} to braking, {braking:g}"
+            raise ValueError(f"time_gap_braking: {time_gap_braking:g} is not allowed; allowed: {allowed}")
         return self
 
     def limit(
@@ -169,13 +169,13 @@ class SafetyFilter(Subclassable):
         step: float,
         actuation: tuple[Actuator, ActuatorState] | None = None,
     ) -> Array:
-        """Return the allowed part of a desired acceleration [m/s2] that holds for one `step` of simulation [s].
+        """Return the desired acceleration, reduced to the highest allowed one for one simulation step of `step` [s].
 
-        Without `actuation`, an actuator and its current state, the vehicle responds at once.
+        `actuation` is an actuator and its current state; if it is None, the vehicle responds at once.
         """
         if not self.active:
             return acceleration
-        # With a time gap shorter than a step, the formulas below allow less than these bounds.
+        # With a time gap shorter than a step, the formulas of `max_acceleration` allow less than these simple bounds.
         if type(acceleration) is float and actuation is None and not 0.0 < self.time_gap < step:
             speed = next_speed(state.speed, acceleration, step)
             leader = clamp_min(state.leader_speed - self.speed_error, 0.0)
@@ -183,28 +183,28 @@ class SafetyFilter(Subclassable):
             if self._is_clearly_safe(speed, leader, gap, step):
                 return acceleration
         if actuation is not None and (type(acceleration) is float or namespace(acceleration) is np):
-            return self._limit_by_plan_if_needed(acceleration, state, step, *actuation)
+            return self._limit_if_unclear(acceleration, state, step, *actuation)
         return clamp_max(acceleration, self.max_acceleration(state, step, actuation))
 
     def max_acceleration(
         self, state: FollowingState, step: float, actuation: tuple[Actuator, ActuatorState] | None = None
     ) -> Array:
-        """Return the highest acceleration that may be commanded; maximum braking if none may."""
+        """Return the highest allowed command [m/s2]; maximum braking if no command is allowed."""
         leader = clamp_min(state.leader_speed - self.speed_error, 0.0)
         gap = clamp_max(state.gap, MAX_LEADER_GAP) - (self.gap_error + self.standstill_gap)
-        bounded = FollowingState(state.speed, leader, gap)
+        bounded_state = FollowingState(state.speed, leader, gap)
         speed = state.speed
         if actuation is not None:
             actuator, actuator_state = actuation
-            standing = actuator.equivalent_speed(0.0 * speed, ActuatorState(0.0 * speed), self.braking, step)
+            speed_at_rest = actuator.equivalent_speed(0.0 * speed, ActuatorState(0.0 * speed), self.braking, step)
             speed = actuator.equivalent_speed(speed, actuator_state, self.braking, step)
             for command in actuator_state.pending:
-                speed = clamp_min(speed + command * step, standing)
+                speed = clamp_min(speed + command * step, speed_at_rest)
                 gap = gap - speed * step
-        end = gap + stopping_distance(leader, self.leader_braking, step)
-        allowed = (max_speed_to_stop(end, self.braking, step) - speed) / step
+        distance = gap + stopping_distance(leader, self.leader_braking, step)
+        allowed = (max_speed_to_stop(distance, self.braking, step) - speed) / step
         if self.time_gap and actuation is not None:
-            allowed = clamp_max(allowed, self._max_command_for_time_gap(bounded, step, *actuation))
+            allowed = clamp_max(allowed, self._max_command_for_time_gap(bounded_state, step, *actuation))
         elif self.time_gap:
             allowed = clamp_max(allowed, (self._max_speed_for_time_gap(leader, gap, step) - speed) / step)
         return clamp_min(allowed, -self.braking)
@@ -212,63 +212,68 @@ class SafetyFilter(Subclassable):
     def _max_command_for_time_gap(
         self, state: FollowingState, step: float, actuator: Actuator, actuator_state: ActuatorState
     ) -> Array:
-        # After the pending commands, and n further ones of `time_gap_braking`, own speed and gap are linear in the
-        # command as long as the vehicle moves; each n gives a bound. `state.gap` is reduced by the standstill gap.
+        # The vehicle receives the pending commands, the command, and then n commands to brake with `time_gap_braking`.
+        # As long as the vehicle moves, its speed and gap are linear in the command: each n gives an upper bound of the
+        # command. `state.gap` is reduced by the standstill gap.
         braking, time_gap, decay = self.time_gap_braking, self.time_gap, actuator.decay(step)
         speed, leader, gap = state
         for _ in actuator_state.pending:
             actuator_state = actuator.apply_command(-braking, speed, actuator_state, step)
             speed, leader = next_speed(speed, actuator_state.acceleration, step), next_speed(leader, -braking, step)
             gap = gap + (leader - speed) * step
-        equivalent = actuator.equivalent_speed(speed, actuator_state, braking, step)
-        fading, remaining, distance, above = equivalent - speed, 1.0, 0.0, MAX_COMMAND + braking
-        allowed = 0.0 * speed + above
-        for number in range(1, _steps_to_standstill(equivalent + above * step, braking * step) + 1):
+        equivalent_speed = actuator.equivalent_speed(speed, actuator_state, braking, step)
+        lag_speed, max_allowed = equivalent_speed - speed, MAX_COMMAND + braking
+        allowed = 0.0 * speed + max_allowed  # commands relative to -braking
+        remaining, distance_per_command = 1.0, 0.0
+        for n in range(1, _steps_to_standstill(equivalent_speed + max_allowed * step, braking * step) + 1):
             remaining *= decay
-            speed = equivalent - braking * step * number - fading * remaining
+            speed = equivalent_speed - braking * step * n - lag_speed * remaining
             leader = next_speed(leader, -braking, step)
             gap = gap + (leader - speed) * step
-            gained = step * (1.0 - remaining)  # speed and distance by each m/s2 of the command above the braking
-            distance += step * gained
-            allowed = clamp_max(allowed, (gap - time_gap * speed) / (distance + time_gap * gained))
+            speed_per_command = step * (1.0 - remaining)
+            distance_per_command += step * speed_per_command
+            bound = (gap - time_gap * speed) / (distance_per_command + time_gap * speed_per_command)
+            allowed = clamp_max(allowed, bound)
         return allowed - braking
 
     def _max_speed_for_time_gap(self, leader_speed: Array, gap: Array, step: float) -> Array:
         """Return the highest speed that keeps the time gap while both brake; `gap` is reduced by the standstill gap."""
         braking, time_gap = self.time_gap_braking, self.time_gap
-        later = clamp_min(leader_speed - braking * step, 0.0)
-        end = gap + stopping_distance(leader_speed, braking, step)
-        near = (end - stopping_distance(later, braking, step)) / (time_gap + step)
-        # At closing speeds above this one, the time gap has its minimum at some later speed.
-        matters = later + time_gap * braking
-        far = max_speed_to_stop(end - braking * (time_gap + step / 2.0) ** 2 / 2.0, braking, step)
-        return clamp_max(near, clamp_min(far, matters))
+        next_leader_speed = clamp_min(leader_speed - braking * step, 0.0)
+        distance = gap + stopping_distance(leader_speed, braking, step)
+        first_step_bound = (distance - stopping_distance(next_leader_speed, braking, step)) / (time_gap + step)
+        # Above this speed, the time gap has its minimum in a later step.
+        max_first_step_speed = next_leader_speed + time_gap * braking
+        later_bound = max_speed_to_stop(distance - braking * (time_gap + step / 2.0) ** 2 / 2.0, braking, step)
+        return clamp_max(first_step_bound, clamp_min(later_bound, max_first_step_speed))
 
-    def _limit_by_plan_if_needed(
+    def _limit_if_unclear(
         self, acceleration: Array, state: FollowingState, step: float, actuator: Actuator, actuator_state: ActuatorState
     ) -> Array:
-        # Plans of braking are only made where they matter. Until it stands, the vehicle is never faster than `top`, and
-        # drives at most as far as one that keeps this speed until the command arrives, and then brakes without lag. The
-        # gap to a leader that brakes equally hard is smallest now or at the end: the bounds below suffice for any plan.
+        # `max_acceleration`, which computes each step of braking, is called only if simple bounds do not prove that the
+        # acceleration is safe. Until the vehicle stands, it is never faster than `top_speed`. It drives at most as far
+        # as a vehicle that keeps this speed until the command arrives, and then brakes without lag. The gap to a leader
+        # that brakes equally hard is smallest now or at the end. Therefore the bounds below are sufficient.
         speed, leader, gap = state
         gap = gap - (self.gap_error + self.standstill_gap)
         leader, commands = clamp_min(leader - self.speed_error, 0.0), clamp_min(acceleration, 0.0)
         for pending in actuator_state.pending:
             commands = commands + clamp_min(pending, 0.0)
         response_time = actuator.response_time(step)
-        top = speed + clamp_min(response_time * (actuator_state.acceleration + self.braking), 0.0)
-        top = clamp_min(top, response_time * self.braking) + step * commands
-        first = step * (len(actuator_state.pending) + 1) * top
-        if type(acceleration) is float and self._is_clearly_safe(top, leader, gap - first, step):
+        top_speed = speed + clamp_min(response_time * (actuator_state.acceleration + self.braking), 0.0)
+        top_speed = clamp_min(top_speed, response_time * self.braking) + step * commands
+        delay_distance = step * (len(actuator_state.pending) + 1) * top_speed
+        if type(acceleration) is float and self._is_clearly_safe(top_speed, leader, gap - delay_distance, step):
             return acceleration
 
-        def margin(braking: float, leader_braking: float) -> Array:
-            return stopping_distance(leader, leader_braking, step) - first - stopping_distance(top, braking, step)
+        def min_gap_change(braking: float, leader_braking: float) -> Array:
+            leader_distance = stopping_distance(leader, leader_braking, step)
+            return leader_distance - delay_distance - stopping_distance(top_speed, braking, step)
 
         braking = self.time_gap_braking
-        at_end = gap + margin(self.braking, self.leader_braking)
-        with_time_gap = gap + clamp_max(margin(braking, braking), 0.0) - self.time_gap * top
-        is_unclear = (at_end < 0.0) | (with_time_gap < 0.0)
+        final_gap = gap + min_gap_change(self.braking, self.leader_braking)
+        time_gap_margin = gap + clamp_max(min_gap_change(braking, braking), 0.0) - self.time_gap * top_speed
+        is_unclear = (final_gap < 0.0) | (time_gap_margin < 0.0)
         if type(acceleration) is float:
             if not is_unclear:
                 return acceleration
@@ -277,29 +282,32 @@ class SafetyFilter(Subclassable):
         if len(rows) == 0:
             return acceleration
         limited = np.array(acceleration)
-        pending = tuple(command[rows] for command in actuator_state.pending)
-        selected = actuator, ActuatorState(actuator_state.acceleration[rows], pending)
-        near = FollowingState(*(values[rows] for values in state))
-        limited[rows] = np.minimum(limited[rows], self.max_acceleration(near, step, selected))
+        unclear_state = FollowingState(*(array[rows] for array in state))
+        unclear_actuation = actuator, actuator_state.map(lambda array: array[rows])
+        limited[rows] = np.minimum(limited[rows], self.max_acceleration(unclear_state, step, unclear_actuation))
         return limited
 
     def _is_clearly_safe(self, speed: float, leader: float, gap: float, step: float) -> bool:
-        """Return whether simple bounds prove that braking from a speed keeps both gaps."""
-        # Stopping distances are at least v (v / b - h) / 2, and at most b h h / 8 more.
+        """Return whether simple bounds prove that braking from a speed keeps standstill gap and time gap."""
+        # With speed v, braking b and step h, stopping distances are at least v (v / b - h) / 2, and at most b h h / 8
+        # longer.
         half, square, leader_square = (leader - speed) * step / 2.0, speed * speed / 2.0, leader * leader / 2.0
         braking, own_braking, error = self.time_gap_braking, self.braking, step * step / 8.0
-        at_end = leader_square / self.leader_braking - square / own_braking - half - own_braking * error
-        with_time_gap = min((leader_square - square) / braking - half - braking * error, 0.0)
-        return gap + at_end >= 0.0 and gap + with_time_gap >= self.time_gap * speed
+        final_change = leader_square / self.leader_braking - square / own_braking - half - own_braking * error
+        time_gap_change = min((leader_square - square) / braking - half - braking * error, 0.0)
+        return gap + final_change >= 0.0 and gap + time_gap_change >= self.time_gap * speed
 
 
-def _steps_to_standstill(speed: Array, change: float) -> int:
-    """Return after how many steps the fastest vehicle stands that slows by `change` in each [m/s]."""
+def _steps_to_standstill(speed: Array, speed_change: float) -> int:
+    """Return the number of steps in which the fastest vehicle stops if each step reduces speed by `speed_change` [m/s].
+
+    The result for a traced graph is a constant, for `MAX_TRACED_SPEED`.
+    """
     if type(speed) is not float:
         torch = sys.modules.get("torch")
         is_traced = torch is not None and torch.compiler.is_compiling()
         speed = MAX_TRACED_SPEED if is_traced else speed.max().item() if len(speed) else 0.0
-    return int(speed / change) + 1
+    return int(speed / speed_change) + 1
 
 
 def actuate(
@@ -307,46 +315,50 @@ def actuate(
     actuator: Actuator,
     acceleration: Array,
     state: FollowingState,
-    before: ActuatorState,
+    actuator_state: ActuatorState,
     step: float,
 ) -> tuple[Array, ActuatorState]:
-    """Return the filtered command for a desired acceleration, and the actuator's state in this step."""
+    """Return the filtered command for a desired acceleration, and the new state of the actuator."""
     if actuator.is_instant:
         command = safety.limit(acceleration, state, step)
         return command, ActuatorState(command)
-    command = safety.limit(acceleration, state, step, (actuator, before))
-    return command, actuator.apply_command(command, state.speed, before, step)
+    command = safety.limit(acceleration, state, step, (actuator, actuator_state))
+    return command, actuator.apply_command(command, state.speed, actuator_state, step)
 
 
 class CAVActuation:
-    """Filter and actuator of CAVs by name: a desired acceleration is filtered, then applied with delay and lag."""
+    """Filters desired accelerations of CAVs, and applies them with delay and lag.
+
+    The actuator states are stored by the id of a CAV, or by one id for several CAVs if states are arrays.
+    """
 
     def __init__(self, safety: SafetyFilter, actuator: Actuator, step: float) -> None:
-        """Take the settings of all CAVs; `step` is the simulation step [s]."""
+        """Set filter and actuator of all CAVs; `step` is the simulation step [s]."""
         self._safety, self._actuator, self._step = safety, actuator, step
         self._has_lag = not actuator.is_instant
         self._states: dict[str, ActuatorState] = {}
 
-    def set_state(self, name: str, state: ActuatorState) -> None:
-        """Let the vehicles of this name continue with accelerations and pending commands."""
-        self._states[name] = state
+    def set_state(self, cav_id: str, state: ActuatorState) -> None:
+        """Set accelerations and pending commands."""
+        self._states[cav_id] = state
 
     def reset_rows(self, rows: Any) -> None:
-        """Let some of the vehicles with a common name start again, without acceleration and commands."""
-        for name, state in self._states.items():
-            initial = self._actuator.initial_state(state.acceleration, self._step)
-            self._states[name] = replace_columns(state, rows, initial, rows)
+        """Remove accelerations and pending commands of some rows."""
+        for cav_id, state in self._states.items():
+            initial_state = self._actuator.initial_state(state.acceleration, self._step)
+            self._states[cav_id] = replace_columns(state, rows, initial_state, rows)
 
     def detach(self) -> None:
-        """Let no gradients of torch flow through the states so far."""
-        for name, (acceleration, pending) in self._states.items():
-            self._states[name] = ActuatorState(acceleration.detach(), tuple(command.detach() for command in pending))
+        """Stop gradients of torch at the current states."""
+        for cav_id, state in self._states.items():
+            self._states[cav_id] = state.map(lambda tensor: tensor.detach())
 
-    def apply(self, name: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
+    def apply(self, cav_id: str, acceleration: Array, state: FollowingState) -> tuple[Array, Array]:
         """Return the filtered command for a desired acceleration, and the acceleration in this simulation step."""
         actuator, step = self._actuator, self._step
-        previous_state = self._states.get(name) or actuator.initial_state(state.speed, step)
-        command, new_state = actuate(self._safety, actuator, acceleration, state, previous_state, step)
+        actuator_state = self._states.get(cav_id) or actuator.initial_state(state.speed, step)
+        command, new_state = actuate(self._safety, actuator, acceleration, state, actuator_state, step)
         if self._has_lag:
-            self._states[name] = new_state
+            self._states[cav_id] = new_state
+
         return command, new_state.acceleration

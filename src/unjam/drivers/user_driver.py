@@ -1,6 +1,6 @@
 """The user's own drivers and functions: objects of this process, and names in Python files, `path.py:name`.
 
-Such a file is executed as code: use only files that you trust.
+unjam executes such a file: use only files that you trust.
 """
 
 import inspect
@@ -28,9 +28,9 @@ from unjam.trust import check_code_unchanged, remember_trusted, resolve_code_pat
 from unjam.user_code import UserCode, read_code
 
 _module_lock = RLock()
-"""held while a file runs: its modules then have their short names in the global `sys.modules`"""
+"""lock while a file runs, because modules next to it then have short names in the global `sys.modules`"""
 _modules: dict[tuple[Path, str], ModuleType] = {}
-"""modules that run once in a process, by path and hash of their code"""
+"""modules of files that have run in this process, by path and hash of their code"""
 
 
 def is_file_reference(text: str) -> bool:
@@ -39,12 +39,12 @@ def is_file_reference(text: str) -> bool:
 
 
 def object_label(candidate: Any) -> str:
-    """Return the name of a function or a class; for other objects that of their class."""
+    """Return the name of a function or a class; for other objects the name of their class."""
     return getattr(candidate, "__name__", type(candidate).__name__)
 
 
 def object_reference(candidate: Any) -> str:
-    """Return `path.py:name` for a function or a class of a Python file; empty if it has no such name."""
+    """Return `path.py:name` for a function or a class at the top level of a Python file; empty for other objects."""
     module, name = sys.modules.get(getattr(candidate, "__module__", "")), getattr(candidate, "__qualname__", "")
     path = getattr(module, "__file__", None) or ""
     return f"{path}:{name}" if path.endswith(".py") and getattr(module, name, None) is candidate else ""
@@ -52,17 +52,20 @@ def object_reference(candidate: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class UserFunction:
-    """A function of the user; if it fails, one line says where."""
+    """A function of the user; its errors become an `InputError` with the line that failed."""
 
     function: Callable[..., Any]
     label: str
-    """name in messages: its own name, or `path.py:name`"""
+    """name in messages: name of the function, or `path.py:name`"""
     file: str = ""
-    """path of its code"""
+    """path of the function's code"""
 
     @classmethod
     def from_object(cls, candidate: Any, argument: str, reference: "FileReference | None" = None) -> "UserFunction":
-        """Return a function of `argument`, of this process or a file; raise `InputError` if it is not a function."""
+        """Return a function of this process, or of the file of `reference`; `InputError` if it is not a function.
+
+        The message says that functions take `argument`.
+        """
         label = str(reference or object_label(candidate))
         if not callable(candidate) or inspect.isclass(candidate):
             raise InputError(f"{label}: is not a function of {argument}")
@@ -81,46 +84,51 @@ class UserFunction:
 
 
 def last_line(error: BaseException, file: str) -> str:
-    """Return ` (line N)` with the last line of a file that was executed before an error; empty if none was."""
+    """Return ` (line N)` with the last line of a file that ran before an error; empty if no line did."""
     lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == file]
     return f" (line {lines[-1]})" if lines else ""
 
 
 def _as_numpy_function(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of arrays; a `torch.nn.Module` gets tensors of its own type and device, with gradients."""
-    torch: Any = sys.modules.get("torch")  # it is imported where its modules exist; workers run without it
+    """Return a function of arrays; for a `torch.nn.Module`, it converts arrays, and tensors with their gradients."""
+    torch: Any = sys.modules.get("torch")  # imported already if there are modules; workers run without torch
     module: Any = function
     if torch is None or not isinstance(module, torch.nn.Module):
         return function
 
-    def call(rows: Any) -> Any:
-        first = rows[0]
+    def call_module(argument: Any) -> Any:
+        """Return the results for an array, or for a record of arrays."""
+        first = argument[0]
         is_tensor = isinstance(first, torch.Tensor)
         like = next(module.parameters(), first if is_tensor else torch.zeros((), dtype=torch.float32, device="cpu"))
 
-        def as_own(values: Any) -> Any:
+        def to_module_tensor(values: Any) -> Any:
             tensor = values if isinstance(values, torch.Tensor) else torch.tensor(values, device="cpu")
             return tensor.to(like) if tensor.is_floating_point() else tensor.to(like.device)
 
-        is_record = hasattr(rows, "_fields")
-        own = type(rows)(*(None if row is None else as_own(row) for row in rows)) if is_record else as_own(rows)
+        if hasattr(argument, "_fields"):
+            module_argument = type(argument)(
+                *(None if values is None else to_module_tensor(values) for values in argument)
+            )
+        else:
+            module_argument = to_module_tensor(argument)
         if is_tensor:
-            return map_leaves(lambda tensor: tensor.to(first), module(own))
+            return map_leaves(lambda tensor: tensor.to(first), module(module_argument))
         with torch.no_grad():
-            return map_leaves(lambda tensor: tensor.cpu().numpy(), module(own))
+            return map_leaves(lambda tensor: tensor.cpu().numpy(), module(module_argument))
 
-    return call
+    return call_module
 
 
 @dataclass(frozen=True)
 class FileReference:
-    """A name in a Python file."""
+    """A reference to an object at the top level of a Python file."""
 
     path: Path
-    """resolved"""
+    """resolved path of the file"""
     name: str
     sha256: str = field(default="", kw_only=True, repr=False, compare=False)
-    """hash of the code; if given, the file must have it"""
+    """hash that the code must have; empty: any code"""
 
     @classmethod
     def parse(cls, text: str) -> "FileReference":
@@ -134,7 +142,7 @@ class FileReference:
         return f"{self.path.name}:{self.name}"
 
     def read_code(self) -> UserCode:
-        """Return the code of the file; `InputError` if it is missing, unreadable or not Python, or has another hash."""
+        """Return the code; `InputError` if the file is missing, unreadable or not Python, or has another hash."""
         if not os.path.isfile(self.path):
             raise InputError(f"Python file: {str(self.path)!r} is not a file")
         if self.path.suffix != ".py":
@@ -148,11 +156,11 @@ class FileReference:
         return code
 
     def load_object(self, code: UserCode | None = None) -> Any:
-        """Run the file, from `code` if given, and return the object with the name; raise `InputError` as both parts."""
+        """Run `code`, or the code of the file, and return the object; `InputError` as `run_file` and `find_object`."""
         return self.find_object(self.run_file(code or self.read_code()))
 
     def load_object_once(self) -> tuple[Any, "FileReference"]:
-        """Return as `load_object`, and the reference with its hash; the same code runs once in a process."""
+        """Return the object as `load_object`, and the reference with the hash; the same code runs once in a process."""
         code = self.read_code()
         key = self.path, code.sha256
         if key not in _modules:
@@ -166,20 +174,20 @@ class FileReference:
         try:
             with _module_lock, redirect_user_output():
                 return code.run()
-        except (Exception, SystemExit) as error:  # any error of the user's code is the user's to fix
+        except (Exception, SystemExit) as error:  # the user's code may raise any error
             reason = "" if isinstance(error, InputError) else f"{type(error).__name__} when loading it: "
             raise InputError(f"{self.path.name}: {reason}{error}") from error
 
     def find_object(self, module: ModuleType) -> Any:
-        """Return the object of a module with the name; raise `InputError` if it has none."""
+        """Return the object with the name in the module of the file; raise `InputError` if there is none."""
         if not hasattr(module, self.name):
-            public = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
-            raise InputError(f"{self.path.name}: has no {self.name!r}; it has: {public}")
+            public_names = ", ".join(key for key in vars(module) if not key.startswith("_")) or "nothing"
+            raise InputError(f"{self.path.name}: has no {self.name!r}; it has: {public_names}")
         return getattr(module, self.name)
 
 
 def code_hashes(names: Iterable[str]) -> dict[str, str]:
-    """Return the hash of the code of each of the `names` that is `path.py:name`, by path."""
+    """Return the hashes of the files of all `names` with the form `path.py:name`, by path."""
     codes = (FileReference.parse(name).read_code() for name in names if is_file_reference(name))
     return {str(code.path): code.sha256 for code in codes}
 
@@ -190,53 +198,56 @@ class UserDriver(Driver):
     implementation: Any
 
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
-        """Return that it may read any field, and the attribute `time_step` of the user's driver."""
+        """Return the requirements of the class, all fields as possible inputs, and `time_step` of the user's driver."""
         if isinstance(self.implementation, Driver):
-            steps = self.implementation.requirements(road).time_steps
+            time_steps = self.implementation.requirements(road).time_steps
         else:
-            declared_step = getattr(self.implementation, "time_step", None)
-            steps = frozenset({float(declared_step)} if isinstance(declared_step, int | float) else ())
-        return self.class_requirements._replace(reads_any_field=True, time_steps=steps)
+            time_step = getattr(self.implementation, "time_step", None)
+            time_steps = frozenset({float(time_step)} if isinstance(time_step, int | float) else ())
+        return self.class_requirements._replace(reads_any_field=True, time_steps=time_steps)
 
     def call_user_code(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """Return the result of the user's function."""
         return function(*arguments)
 
     def _call_method(self, name: str, *arguments: Any) -> Any:
-        """Return the result of a method of the user's driver; that of `Driver` if it has no such method."""
+        """Return the result of a method of the user's driver, or of `Driver` if the user's driver does not have it."""
         method = getattr(self.implementation, name, None) or getattr(super(), name)
         return self.call_user_code(method, *arguments)
 
     def initial_memory(self, n: int) -> Memory:
-        """Return the initial memory of the user's driver; raise `InputError` if it is none."""
+        """Return the initial memory of the user's driver; raise `InputError` as `check_memory`."""
         return check_memory(self._call_method("initial_memory", n), n, f"{self.describe()}: initial_memory({n})")
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return the memory of the user's driver after the warm-up, if it has `recall`."""
+        """Return the memory of the user's driver after a warm-up; `memory` if the driver has no method `recall`."""
         if not hasattr(self.implementation, "recall"):
             return memory
         answer = self._call_method("recall", memory, history)
         return check_memory(answer, len(history.speed), f"{self.describe()}: recall()")
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the user's acceleration and memory; raise `InputError` if the user's code fails, or one is invalid."""
+        """Return accelerations, shape (n,), and memory; `InputError` if the code fails, or for other answers."""
         rows, label = np.size(state.speed), self.describe()
-        if rows == 0:  # the user's code may need a row: the minimum of an empty array is an error
+        if rows == 0:  # the user's code may fail without rows: an empty array has no minimum
             return np.zeros(0), memory
         answer = self._call_method("act", state, memory)
         if not (isinstance(answer, tuple) and len(answer) == 2):
             raise InputError(f"{label}: act() returns {answer!r:.60}; allowed: (accelerations, memory)")
-        numbers, new_memory = to_answer_array(answer[0], rows, label), check_memory(answer[1], rows, f"{label}: act()")
-        is_single = getattr(answer[0], "dtype", None) == np.float32  # stays so: rows may differ by its rounding
-        return numbers.astype(np.float32) if is_single else numbers, new_memory
+        acceleration, new_memory = answer
+        array = to_answer_array(acceleration, rows, label)
+        check_memory(new_memory, rows, f"{label}: act()")
+        # Single precision is kept, because `check_driver` then allows larger differences between rows.
+        has_single_precision = getattr(acceleration, "dtype", None) == np.float32
+        return array.astype(np.float32) if has_single_precision else array, new_memory
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
-        """Return the time gaps of the user's driver, if it has `time_gaps`."""
-        answer, rows = self._call_method("time_gaps", state, memory) if np.size(state.speed) else None, len(state.speed)
-        return None if answer is None else to_answer_array(answer, rows, self.describe(), "time gap")
+        """Return the time gaps of the user's driver; None if it has no method `time_gaps`."""
+        answer = self._call_method("time_gaps", state, memory) if np.size(state.speed) else None
+        return None if answer is None else to_answer_array(answer, len(state.speed), self.describe(), "time gap")
 
     def memory_features(self, memory: Memory) -> Array | None:
-        """Return the memory features of the user's driver, if it has `memory_features`."""
+        """Return the memory features of the user's driver; None if it has no method `memory_features`."""
         return self._call_method("memory_features", memory)
 
 
@@ -260,20 +271,20 @@ class FileDriver(FileReference, UserDriver):
         return UserFunction(function, str(self), str(self.path))(*arguments)
 
     def requirements(self, road: RoadInterface | None = None) -> Requirements:
-        """Return those of the user's driver; a class without `time_step` assumes the argument that it received."""
+        """Return the requirements of the user's driver, with the argument `time_step` if it has no such attribute."""
         requirements = super().requirements(road)
         if requirements.time_steps or not _takes_time_step(type(self.implementation)):
             return requirements
         return requirements._replace(time_steps=frozenset({self.parameters.get("time_step", self.time_step)}))
 
     def describe(self) -> str:
-        """Return the names of file and driver, and the given parameters."""
+        """Return the names of file and driver, and the parameters."""
         return label_with_parameters(str(self), self.parameters)
 
 
 @dataclass(frozen=True)
 class _FunctionImplementation:
-    """A plain function `state -> acceleration` with the methods of a driver."""
+    """An object with the methods of a driver for a function `state -> acceleration`."""
 
     function: Callable[[LocalState], Array]
 
@@ -292,7 +303,7 @@ class PythonDriver(UserDriver):
     label: str
 
     def describe(self) -> str:
-        """Return the name of the function or the class."""
+        """Return the name of the function or class."""
         return self.label
 
 
@@ -313,20 +324,23 @@ DriverLike = Driver | DriverProtocol | type[Driver] | type[DriverProtocol] | Cal
 
 
 def as_driver(driver: DriverLike, time_step: float = FileDriver.time_step) -> Driver:
-    """Return any `DriverLike` as a `Driver`; raise `InputError` if it is none. `time_step` is its control step [s]."""
+    """Return a `DriverLike` with the control step `time_step` [s] as a `Driver`; raise `InputError` if it is none."""
     if isinstance(driver, str):
         raise invalid_value("driver", driver, f"an object, such as unjam.make_driver({driver!r}, {time_step})")
-    name = object_label(driver)
-    made = driver if isinstance(driver, Driver) else _make_implementation(driver, time_step, f"driver {name}")
-    return made if isinstance(made, Driver) else PythonDriver(made, name)
+    if isinstance(driver, Driver):
+        return driver
+    label = object_label(driver)
+    implementation = _make_implementation(driver, time_step, f"driver {label}")
+    return implementation if isinstance(implementation, Driver) else PythonDriver(implementation, label)
 
 
 def _make_implementation(candidate: Any, time_step: float, label: str, parameters: dict[str, Any] | None = None) -> Any:
-    """Return an object with `act` and `initial_memory` from one, from a class with `parameters`, or from a function."""
+    """Return an object with `act` and `initial_memory` for an object, a class with `parameters`, or a function."""
+
     if inspect.isclass(candidate):
         try:
-            steps = {"time_step": time_step} if _takes_time_step(candidate) else {}
-            candidate = candidate(**steps | (parameters or {}))
+            step_parameter = {"time_step": time_step} if _takes_time_step(candidate) else {}
+            candidate = candidate(**step_parameter | (parameters or {}))
         except Exception as error:
             raise InputError(f"{label}: {type(error).__name__} when made: {error}") from error
     elif parameters:
@@ -340,5 +354,5 @@ def _make_implementation(candidate: Any, time_step: float, label: str, parameter
     raise InputError(f"{label}: is neither a function nor a class with act(state, memory)")
 
 
-def _takes_time_step(kind: type[Any]) -> bool:
-    return "time_step" in inspect.signature(kind).parameters
+def _takes_time_step(driver_class: type[Any]) -> bool:
+    return "time_step" in inspect.signature(driver_class).parameters

@@ -1,4 +1,4 @@
-"""Drivers that contain other drivers: mixtures and switches, impaired sensing, the safety filter, history features."""
+"""Drivers that contain other drivers: mixtures, switches, impairments, the safety filter, and history features."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -25,61 +25,62 @@ from unjam.tree import map_leaves, named_parts
 COMPOSITE_CONFIG: ConfigDict = {**STRICT, "arbitrary_types_allowed": True}
 """configuration of parameter dataclasses with drivers among their fields"""
 DRIVER_INDEX_KEY = "driver_index"
-"""name in the memory of a mixture: the driver of a CAV"""
+"""key in the memory of a mixture: index of the driver of each CAV"""
 INNER_KEY = "inner"
-"""name in the memory of a wrapper: that of the inner driver"""
+"""key in the memory of a wrapper: memory of the inner driver"""
 AVERAGING_TIMES = (10.0, 40.0, 160.0)
 """time constants of the means [s]: within a wave, of a wave, of several waves"""
 SPEED_STD_SCALE, MEAN_GAP_SCALE = 2.0, 20.0
 """divisors of the standard deviation of speed [m/s] and of the mean gap [m] in network inputs"""
 MEAN_KEYS = ("mean_speed", "mean_square", "mean_gap")
-"""names of the means in the memory, before their averaging time"""
+"""keys of the means in the memory, without the averaging time that follows"""
 MAX_DELAY_ERROR = 1e-9
 """allowed difference between the delay of an actuator and whole control steps [s]"""
 MAX_GATHERING_TIME = 30.0
 """time in which all vehicles gather if their queue fits on the road [s]"""
 MIN_SHARED_PENETRATION_RATE = 0.06
-"""penetration rate from which a closed road counts as shared by several CAVs; one CAV among 16 vehicles counts, too,
-because the rate does not give their number"""
+"""penetration rate from which on a closed road counts as shared by several CAVs; a single CAV among 16 vehicles also
+reaches it, because the rate does not contain the number of CAVs"""
 
 
 def select_rows(condition: Array, if_true: Array, if_false: Array) -> Array:
-    """Return the rows of one of two arrays of any equal shape, by a condition of shape (n,)."""
+    """Return an array with rows of `if_true` or `if_false`, of equal shapes, by a condition of shape (n,)."""
     return np.where(condition.reshape(-1, *[1] * (np.ndim(if_true) - 1)), if_true, if_false)
 
 
 class CompositeDriver(Driver):
-    """A driver that contains other drivers in fields of a dataclass; the field `driver` has the memory name `inner`."""
+    """A dataclass with drivers in its fields; field names are the keys of their memories, but `inner` for `driver`."""
 
     @cached_property
     def inner_drivers(self) -> dict[str, Driver]:
-        """The drivers in its fields, in order."""
+        """Drivers in the fields, in order, by the keys of their memories."""
         parts = (named_parts(self) or {}).items()
         return {INNER_KEY if name == "driver" else name: part for name, part in parts if isinstance(part, Driver)}
 
 
 class DriverWrapper(CompositeDriver):
-    """A driver around one inner driver."""
+    """A driver that contains one inner driver, with its time gaps and memory features."""
 
     inner_key: ClassVar[str] = INNER_KEY
+    """key of the inner driver"""
 
     @property
     def memory_inputs(self) -> tuple[ScaledInput, ...]:
-        """Those of the inner driver."""
+        """Descriptions of the columns of the inner driver's memory features, in order."""
         return self.inner_drivers[self.inner_key].memory_inputs
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
-        """Return those of the inner driver."""
+        """Return the time gaps of the inner driver."""
         return self.inner_drivers[self.inner_key].time_gaps(state, memory[self.inner_key])
 
     def memory_features(self, memory: Memory) -> Array | None:
-        """Return those of the inner driver."""
+        """Return the memory features of the inner driver."""
         return self.inner_drivers[self.inner_key].memory_features(memory[self.inner_key])
 
 
 @dataclass(frozen=True)
 class MixedDriver(CompositeDriver):
-    """Assigns drivers to CAVs in turn, again from the first after the last; CAVs of open roads in order of entry."""
+    """Assigns its drivers to CAVs in rotation; on open roads, in the order in which the CAVs enter."""
 
     class_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)
 
@@ -91,42 +92,42 @@ class MixedDriver(CompositeDriver):
 
     @cached_property
     def inner_drivers(self) -> dict[str, Driver]:
-        """All of them, by number."""
-        return {str(number): driver for number, driver in enumerate(self.drivers)}
+        """All drivers, by their indices as text."""
+        return {str(index): driver for index, driver in enumerate(self.drivers)}
 
     def initial_memory(self, n: int) -> Memory:
-        """Return the driver of each CAV, and the memories of all drivers for all CAVs."""
+        """Return the index of the driver of each CAV, and the memories of all drivers for all CAVs."""
         return {DRIVER_INDEX_KEY: np.arange(n, dtype=np.float64) % len(self.drivers), **super().initial_memory(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the acceleration by the driver of each CAV, and the new memory."""
+        """Return the acceleration of each CAV from its driver, and the new memory."""
         answers = {key: driver.act(state, memory[key]) for key, driver in self.inner_drivers.items()}
         new_memories = {key: new_memory for key, (_, new_memory) in answers.items()}
-        return self._select(memory, (acceleration for acceleration, _ in answers.values())), {**memory, **new_memories}
+        accelerations = self._select_by_driver(memory, (acceleration for acceleration, _ in answers.values()))
+        return accelerations, {**memory, **new_memories}
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
-        """Return the time gap by the driver of each CAV."""
-        return self._select(
-            memory, (driver.time_gaps(state, memory[key]) for key, driver in self.inner_drivers.items())
-        )
+        """Return the time gap of each CAV from its driver, NaN for drivers without; None if no driver has time gaps."""
+        all_time_gaps = (driver.time_gaps(state, memory[key]) for key, driver in self.inner_drivers.items())
+        return self._select_by_driver(memory, all_time_gaps)
 
-    def _select(self, memory: Memory, answers: Iterable[Array | None]) -> Array | None:
-        """Return the answer by the driver of each CAV, NaN for those without; None if there is no answer."""
+    def _select_by_driver(self, memory: Memory, answers: Iterable[Array | None]) -> Array | None:
+        """Return the answer for each CAV from its driver, NaN for drivers without; None if no driver has an answer."""
         selected = None
-        for number, answer in enumerate(answers):
+        for index, answer in enumerate(answers):
             if answer is not None:
                 previous = answer * nan if selected is None else selected
-                selected = namespace(answer).where(memory[DRIVER_INDEX_KEY] == number, answer, previous)
+                selected = namespace(answer).where(memory[DRIVER_INDEX_KEY] == index, answer, previous)
         return selected
 
     def describe(self) -> str:
-        """Return all of them, joined by +."""
+        """Return the descriptions of all drivers, joined by +."""
         return "+".join(driver.describe() for driver in self.drivers)
 
 
 @parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class ImpairedDriver(DriverWrapper):
-    """Drives as another driver does with noisy gaps and delayed commands."""
+    """An inner driver with noise on its observed gaps, and a delay of its commands."""
 
     driver: Driver
     delay: NonNegative = 0.0
@@ -144,12 +145,12 @@ class ImpairedDriver(DriverWrapper):
         return self
 
     def initial_memory(self, n: int) -> Memory:
-        """Return the memory of the inner driver, no elapsed step, and zero accelerations until the delay has passed."""
+        """Return the memory of the inner driver, zero elapsed steps, and a zero acceleration for each delayed step."""
         delay_steps = round(self.delay / self.time_step)
         return {**super().initial_memory(n), "step": np.zeros(n), "pending": np.zeros((n, delay_steps))}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the acceleration of the inner driver from `delay` ago, and store the current one."""
+        """Return the inner driver's acceleration from `delay` ago, and the memory with its current acceleration."""
         acceleration, new_memory = self.driver.act(self._add_gap_noise(state, memory["step"]), memory[INNER_KEY])
         pending = np.concatenate([memory["pending"], np.asarray(acceleration)[:, None]], axis=1)
         return pending[:, 0], {INNER_KEY: new_memory, "step": memory["step"] + 1.0, "pending": pending[:, 1:]}
@@ -157,7 +158,7 @@ class ImpairedDriver(DriverWrapper):
     def _add_gap_noise(self, state: LocalState, step: Array) -> LocalState:
         if self.gap_noise == 0.0 or not len(step):
             return state
-        # The answer of a driver must not depend on other rows, so the observation of a row seeds its noise.
+        # Rows must not influence each other. Therefore the observation of a row is the seed of its noise.
         rows = np.stack([step, state.speed, state.leader_gap, state.follower_gap], -1)
         noise = [np.random.default_rng(row.view(np.uint64).tolist()).normal(size=2) for row in rows]
         ahead, behind = self.gap_noise * np.array(noise).T
@@ -167,18 +168,18 @@ class ImpairedDriver(DriverWrapper):
         )
 
     def describe(self) -> str:
-        """Return the inner driver and its impairments."""
+        """Return the description of the inner driver, and its impairments."""
         impairments = (("delay", self.delay, "s"), ("gap noise", self.gap_noise, "m"))
-        words = [f"{name} {value:g} {unit}" for name, value, unit in impairments if value]
-        return f"{self.driver.describe()} ({', '.join(words) or 'unimpaired'})"
+        texts = [f"{name} {value:g} {unit}" for name, value, unit in impairments if value]
+        return f"{self.driver.describe()} ({', '.join(texts) or 'unimpaired'})"
 
 
 @parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class FilteredDriver(DriverWrapper):
-    """Another driver with the limits and the safety filter of a road, for a vehicle without its own filter.
+    """An inner driver with the limits and the safety filter of a road, for vehicles without their own filter.
 
-    Controllers are exported in this form. On a road with the same filter and actuator and one simulation step per
-    control step, nothing changes.
+    Controllers are exported in this form. A road with the same filter and actuator, and one simulation step per control
+    step, does not change its commands.
     """
 
     class_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
@@ -190,7 +191,7 @@ class FilteredDriver(DriverWrapper):
     time_step: Positive
     """control step [s]"""
     actuator: Actuator = INSTANT_ACTUATOR
-    """delay and lag of the vehicle that carries out the commands"""
+    """delay and lag of the vehicle"""
 
     @model_validator(mode="after")
     def _check_delay(self) -> "FilteredDriver":
@@ -202,26 +203,26 @@ class FilteredDriver(DriverWrapper):
 
     @cached_property
     def limits(self) -> Limits:
-        """Limits of the result: those of the driver, and the brakes of the vehicle."""
+        """Limits of the filtered acceleration: the action limit, and maximum braking if it is harder [m/s2]."""
         return Limits(-max(self.action_limit, self.safety.braking), self.action_limit)
 
     def initial_memory(self, n: int) -> Memory:
         """Return the memory of the inner driver, and an actuator without acceleration and pending commands."""
-        at_rest = self.actuator.initial_state(np.zeros(n), self.time_step)
-        return {**super().initial_memory(n), **self._actuator_memory(at_rest)}
+        actuator_state = self.actuator.initial_state(np.zeros(n), self.time_step)
+        return {**super().initial_memory(n), **self._actuator_memory(actuator_state)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the filtered acceleration of the inner driver, and the new memory."""
         acceleration, new_memory = self.driver.act(state, memory[INNER_KEY])
         acceleration = clip(acceleration, -self.action_limit, self.action_limit)
-        following, actuator, step = FollowingState(*state[:3]), self.actuator, self.time_step
-        previous_state = ActuatorState(memory.get("acceleration"), tuple(memory[key] for key in self._pending_keys))
-        command, responding = actuate(self.safety, actuator, acceleration, following, previous_state, step)
-        return command, {INNER_KEY: new_memory, **self._actuator_memory(responding)}
+        following_state, actuator, step = FollowingState(*state[:3]), self.actuator, self.time_step
+        actuator_state = ActuatorState(memory.get("acceleration"), tuple(memory[key] for key in self._pending_keys))
+        command, new_state = actuate(self.safety, actuator, acceleration, following_state, actuator_state, step)
+        return command, {INNER_KEY: new_memory, **self._actuator_memory(new_state)}
 
     @cached_property
     def _pending_keys(self) -> tuple[str, ...]:
-        return tuple(f"pending_{number}" for number in range(self.actuator.delay_steps(self.time_step)))
+        return tuple(f"pending_{index}" for index in range(self.actuator.delay_steps(self.time_step)))
 
     def _actuator_memory(self, state: ActuatorState) -> Memory:
         if self.actuator.is_instant:
@@ -229,13 +230,13 @@ class FilteredDriver(DriverWrapper):
         return {"acceleration": state.acceleration, **dict(zip(self._pending_keys, state.pending, strict=True))}
 
     def describe(self) -> str:
-        """Return the inner driver, and that it is filtered."""
+        """Return the description of the inner driver, and that it is filtered."""
         return f"{self.driver.describe()}, filtered"
 
 
 @parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class HistoryDriver(DriverWrapper):
-    """Drives as another driver does, and keeps means of its own speed, its square, and its gap for a network."""
+    """An inner driver with means of own speed, its square, and leader gap, as memory features for a network."""
 
     class_requirements: ClassVar[Requirements] = NO_REQUIREMENTS
 
@@ -245,19 +246,26 @@ class HistoryDriver(DriverWrapper):
 
     @property
     def memory_inputs(self) -> tuple[ScaledInput, ...]:
-        """Those of the inner driver, and its own."""
-        kinds = (("mean own speed", SPEED_SCALE, "m/s"), ("standard deviation of own speed", SPEED_STD_SCALE, "m/s"))
-        entries = [(time, *kind) for time in AVERAGING_TIMES for kind in (*kinds, ("mean gap", MEAN_GAP_SCALE, "m"))]
-        own_inputs = (ScaledInput(f"{name} over {time:g} s", scale, unit) for time, name, scale, unit in entries)
-        return (*self.driver.memory_inputs, *own_inputs)
+        """Descriptions of the inner driver's memory features and of the means, in order."""
+        statistics = (
+            ("mean own speed", SPEED_SCALE, "m/s"),
+            ("standard deviation of own speed", SPEED_STD_SCALE, "m/s"),
+            ("mean gap", MEAN_GAP_SCALE, "m"),
+        )
+        history_inputs = (
+            ScaledInput(f"{name} over {time:g} s", scale, unit)
+            for time in AVERAGING_TIMES
+            for name, scale, unit in statistics
+        )
+        return (*self.driver.memory_inputs, *history_inputs)
 
     def initial_memory(self, n: int) -> Memory:
-        """Return the memory of the inner driver, and means over no steps."""
-        means = {f"{name}_{time:g}": np.zeros(n) for time in AVERAGING_TIMES for name in MEAN_KEYS}
+        """Return the memory of the inner driver, zero steps, and zero means."""
+        means = {f"{key}_{time:g}": np.zeros(n) for time in AVERAGING_TIMES for key in MEAN_KEYS}
         return {**super().initial_memory(n), "steps": np.zeros(n), **means}
 
     def recall(self, memory: Memory, history: LocalState) -> Memory:
-        """Return `memory` as if both had observed `history`."""
+        """Return `memory` as if the inner driver and the means had observed `history`."""
         memory = super().recall(memory, history)
         for step in range(history.speed.shape[1]):
             memory = self._update_means(memory, history.speed[:, step], history.leader_gap[:, step])
@@ -275,33 +283,33 @@ class HistoryDriver(DriverWrapper):
         for time in AVERAGING_TIMES:
             late_weight = 1.0 - exp(-self.time_step / time)
             weight = xp.where(early_weight > late_weight, early_weight, early_weight * 0.0 + late_weight)
-            for name, value in zip(MEAN_KEYS, (speed, speed * speed, gap), strict=True):
-                mean = memory[f"{name}_{time:g}"]
-                new_memory[f"{name}_{time:g}"] = mean + weight * (value - mean)
+            for key, value in zip(MEAN_KEYS, (speed, speed * speed, gap), strict=True):
+                mean = memory[f"{key}_{time:g}"]
+                new_memory[f"{key}_{time:g}"] = mean + weight * (value - mean)
         return new_memory
 
     def memory_features(self, memory: Memory) -> Array:
-        """Return those of the inner driver; mean and standard deviation of speed and mean gap by averaging time."""
+        """Return the inner driver's features; mean and standard deviation of speed, and mean gap, by averaging time."""
         columns: list[Array] = []
         for time in AVERAGING_TIMES:
-            speed, square, gap = (memory[f"{name}_{time:g}"] for name in MEAN_KEYS)
-            deviation = square_root(clamp_min(square - speed * speed, 0.0) + 1e-9)  # never the root of zero
+            speed, square, gap = (memory[f"{key}_{time:g}"] for key in MEAN_KEYS)
+            deviation = square_root(clamp_min(square - speed * speed, 0.0) + 1e-9)  # the gradient at zero is infinite
             columns += [speed / SPEED_SCALE, deviation / SPEED_STD_SCALE, gap / MEAN_GAP_SCALE]
-        own_columns = stack_columns(tuple(columns))
+        history_columns = stack_columns(tuple(columns))
         inner_columns = self.driver.memory_features(memory[INNER_KEY])
-        return own_columns if inner_columns is None else join_columns([inner_columns, own_columns])
+        return history_columns if inner_columns is None else join_columns([inner_columns, history_columns])
 
     def describe(self) -> str:
-        """Return the inner driver, and that it has a history."""
+        """Return the description of the inner driver, and that it has a history."""
         return f"{self.driver.describe()}, with history"
 
 
 @parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class QueueFallback(CompositeDriver):
-    """Drives by a driver that leads all others in one queue, and by a fallback once that queue has not held.
+    """Switches from a driver that leads all vehicles in one queue to a fallback if the queue does not form, or breaks.
 
-    A queue that is longer than half a lap meets its own tail at the crossing, and no map provides the time gaps of
-    human drivers. So it must form within `MAX_GATHERING_TIME`, and must not break. The switch is final.
+    A queue that is longer than half a lap meets its own tail at the crossing, and no map contains the time gaps of
+    human drivers. Therefore the queue must form within `MAX_GATHERING_TIME`. The switch is final.
     """
 
     primary: Driver
@@ -312,13 +320,14 @@ class QueueFallback(CompositeDriver):
     class_requirements: ClassVar[Requirements] = Requirements(needs_loop=True, needs_numpy=True)
 
     def initial_memory(self, n: int) -> Memory:
-        """Return the memories of both, without elapsed time [s], queue and switch."""
-        own_memory = {key: np.zeros(n) for key in ("elapsed", "has_gathered", "gave_up")}
-        return {**super().initial_memory(n), **own_memory}
+        """Return the memories of both drivers, and zeros: no elapsed time [s], no queue, and no switch."""
+        queue_memory = {key: np.zeros(n) for key in ("elapsed", "has_gathered", "gave_up")}
+        return {**super().initial_memory(n), **queue_memory}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the acceleration by the active driver, and the new memory; that of the fallback starts with it."""
-        new_memory = self._update_memory(state, memory)
+        """Return the acceleration of the active driver, and the new memory; the fallback remembers no steps before."""
+
+        new_memory = self._update_queue_memory(state, memory)
         gave_up = new_memory["gave_up"]
         if type(gave_up) is float:
             key, driver = ("fallback", self.fallback) if gave_up else ("primary", self.primary)
@@ -326,29 +335,29 @@ class QueueFallback(CompositeDriver):
             return acceleration, new_memory
         acceleration, new_memory["primary"] = self.primary.act(state, memory["primary"])
         fallback_acceleration, fallback_memory = self.fallback.act(state, memory["fallback"])
-        select = partial(select_rows, gave_up > 0.0)
-        new_memory["fallback"] = map_leaves(select, fallback_memory, memory["fallback"])
-        return select(fallback_acceleration, acceleration), new_memory
+        select_active = partial(select_rows, gave_up > 0.0)
+        new_memory["fallback"] = map_leaves(select_active, fallback_memory, memory["fallback"])
+        return select_active(fallback_acceleration, acceleration), new_memory
 
-    def _update_memory(self, state: LocalState, memory: Memory) -> Memory:
-        free, elapsed = state.leader_gap / state.loop_length, memory["elapsed"] + self.time_step
-        xp, ones = namespace(free), memory["has_gathered"] * 0.0 + 1.0
-        gathered = xp.where(free >= GATHERED_LAP_FRACTION, ones, memory["has_gathered"])
-        is_broken = (gathered > 0.0) & (free < BROKEN_LAP_FRACTION)
-        failed = is_broken | ((gathered == 0.0) & (elapsed > MAX_GATHERING_TIME))
-        gave_up = xp.where(failed, ones, memory["gave_up"])
-        return {**memory, "elapsed": elapsed, "has_gathered": gathered, "gave_up": gave_up}
+    def _update_queue_memory(self, state: LocalState, memory: Memory) -> Memory:
+        gap_fraction, elapsed = state.leader_gap / state.loop_length, memory["elapsed"] + self.time_step
+        xp, ones = namespace(gap_fraction), memory["has_gathered"] * 0.0 + 1.0
+        has_gathered = xp.where(gap_fraction >= GATHERED_LAP_FRACTION, ones, memory["has_gathered"])
+        is_broken = (has_gathered > 0.0) & (gap_fraction < BROKEN_LAP_FRACTION)
+        has_failed = is_broken | ((has_gathered == 0.0) & (elapsed > MAX_GATHERING_TIME))
+        gave_up = xp.where(has_failed, ones, memory["gave_up"])
+        return {**memory, "elapsed": elapsed, "has_gathered": has_gathered, "gave_up": gave_up}
 
     def describe(self) -> str:
-        """Return both."""
+        """Return the descriptions of both drivers."""
         return f"{self.primary.describe()} while the queue holds, else {self.fallback.describe()}"
 
 
 @parameter_dataclass(frozen=True, config=COMPOSITE_CONFIG)
 class RoadTypeSwitch(CompositeDriver):
-    """Drives by one of its inner drivers, selected by road type: from the vehicle's map and roadside messages.
+    """Drives by the inner driver for the type of the road, which map and roadside messages determine.
 
-    All CAVs of an episode are on one road. The memories for other road types keep their initial values.
+    All CAVs of an episode are on one road. Memories of drivers for other road types keep their initial values.
     """
 
     class_requirements: ClassVar[Requirements] = Requirements(
@@ -356,7 +365,8 @@ class RoadTypeSwitch(CompositeDriver):
     )
 
     motorway: Driver
-    """driver on roads with measured speeds of the lanes ahead"""
+    """driver on roads that provide `lane_speeds`"""
+
     crossing_loop: Driver
     """driver on a closed road that crosses itself"""
     loop: Driver
@@ -368,7 +378,7 @@ class RoadTypeSwitch(CompositeDriver):
     None: `loop`"""
 
     def active_drivers(self, road: RoadInterface | None) -> Iterable[Driver]:
-        """Return the driver of an open road, or all drivers of closed roads."""
+        """Return the driver for an open `road`, or the drivers for closed roads; all drivers if `road` is None."""
         if road is None:
             return self.inner_drivers.values()
         if road.is_closed:
@@ -376,19 +386,19 @@ class RoadTypeSwitch(CompositeDriver):
         return (self.motorway if "lane_speeds" in road.provided_fields else self.open_road,)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the acceleration by the driver for this road type, and the new memory."""
-        name = self._road_type(state)
-        acceleration, new_memory = self.inner_drivers[name].act(state, memory[name])
-        return acceleration, {**memory, name: new_memory}
+        """Return the acceleration of the driver for this road type, and the new memory."""
+        road_type = self._road_type(state)
+        acceleration, new_memory = self.inner_drivers[road_type].act(state, memory[road_type])
+        return acceleration, {**memory, road_type: new_memory}
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
-        """Return those of the driver for this road type."""
-        name = self._road_type(state)
-        return self.inner_drivers[name].time_gaps(state, memory[name])
+        """Return the time gaps of the driver for this road type."""
+        road_type = self._road_type(state)
+        return self.inner_drivers[road_type].time_gaps(state, memory[road_type])
 
     def describe(self) -> str:
-        """Return all of them with their road types."""
-        return ", ".join(f"{name}: {driver.describe()}" for name, driver in self.inner_drivers.items())
+        """Return the descriptions of all drivers with their road types."""
+        return ", ".join(f"{road_type}: {driver.describe()}" for road_type, driver in self.inner_drivers.items())
 
     def _road_type(self, state: LocalState) -> str:
         if state.lane_speeds is not None:
