@@ -2,6 +2,7 @@ import re
 import warnings
 from collections.abc import Callable
 from contextlib import closing
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
@@ -237,6 +238,31 @@ def test_tensors_are_what_arrays_are(name: str) -> None:
             np.testing.assert_allclose(own, other, atol=1e-9)
         assert info.keys() == tensor_info.keys()
         assert all(isinstance(values, torch.Tensor) for values in tensor_info["reward_terms"].values())
+
+
+BAD_REWARDS: dict[str, tuple[Callable[[Outcome], Any], str]] = {
+    "NaN": (lambda outcome: {"bad": outcome.speeds.mean(-1) * nan}, "term 'bad' is nan; allowed: finite, at most 1e"),
+    "infinite": (lambda outcome: {"bad": outcome.speeds.mean(-1) - inf}, "term 'bad' is -inf; allowed: finite"),
+    "large": (lambda outcome: {"bad": 0.0 * outcome.speeds.mean(-1) + 1e300}, r"term 'bad' is 1e\+300; allowed"),
+    "opposite infinities": (
+        lambda outcome: {"good": outcome.speeds.mean(-1) + 1e200, "bad": outcome.speeds.mean(-1) - 1e200},
+        r"term 'good' is 1e\+200; allowed",
+    ),
+    "empty": (lambda outcome: {}, "it has no terms; allowed: at least one"),
+    "texts": (lambda outcome: {"bad": ["a", "b"]}, "term 'bad' is not numbers|a list is not allowed for the term"),
+    "objects": (lambda outcome: {"bad": np.array([None, None])}, "term 'bad' is nan; allowed|a ndarray is not allowed"),
+    "complex": (lambda outcome: {"bad": 1j * outcome.speeds.mean(-1)}, "is not numbers|a Tensor is not allowed"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_REWARDS)
+@pytest.mark.parametrize("device", ["", "cpu"])
+def test_a_reward_that_single_environments_refuse_is_refused(name: str, device: str) -> None:
+    reward, message = BAD_REWARDS[name]
+    environment = RoadVectorEnv(2, device=device, reward=reward)
+    environment.reset(seed=0)
+    with pytest.raises(InputError, match=message):
+        environment.step(torch.zeros(2, 1) if device else np.zeros((2, 1)))
 
 
 def test_a_reward_in_numpy_is_refused_where_results_are_tensors() -> None:

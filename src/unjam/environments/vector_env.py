@@ -36,7 +36,7 @@ from unjam.worlds.batch.ring.world import RingBatch
 from unjam.worlds.batch.run import start_batch_drive
 from unjam.worlds.batch.support import required_batch_kind, statistically_unsupported_reason
 from unjam.worlds.episode import as_seed
-from unjam.worlds.reward import Outcome, RewardLike, check_tensor_terms, validate_reward_terms
+from unjam.worlds.reward import MAX_REWARD_TERM, Outcome, RewardLike, check_tensor_terms, validate_reward_terms
 
 EXPERT_CHECK_STEPS = 3  # random steps in which an expert must drive each row by itself, without a state of its own
 MAX_ENVIRONMENTS = 1_000_000  # maximum number of environments, of which each takes 2 kB or more
@@ -369,11 +369,13 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         reward = self._road.reward
         if self._road.has_user_reward:  # it may write into the arrays
             outcome = Outcome(*map(copy_array, outcome))
+            if self._is_numpy:
+                return dict(validate_reward_terms(reward, outcome, row_name="environment"))
         terms = reward(outcome)
-        if not self._is_numpy:
+        if self._road.has_user_reward:
             check_tensor_terms(reward, terms)
         is_valid = all(getattr(values, "shape", None) == (self.num_envs,) for values in terms.values())
-        if not is_valid or (self._is_numpy and not np.isfinite(sum(terms.values())).all()):
+        if not is_valid or (self._is_numpy and not (abs(sum(terms.values())) <= MAX_REWARD_TERM).all()):
             terms = validate_reward_terms(reward, outcome, row_name="environment")
         return {name: self._kind.to_array(values) for name, values in terms.items()}
 

@@ -343,11 +343,19 @@ def validate_reward_terms(
 
 
 def check_tensor_terms(reward: Reward, terms: dict[str, Array]) -> None:
-    """Raise `InputError` unless all terms of a reward are torch tensors, as the `Outcome` that it had."""
+    """Raise `InputError` unless a reward has terms, and all are torch tensors of allowed real numbers."""
+    label = f"reward {object_label(reward)}"
+    if not terms:
+        raise InputError(f"{label}: it has no terms; allowed: at least one")
     for name, values in terms.items():
-        if namespace(values) is np or isinstance(values, float | int):
+        is_complex = getattr(values, "is_complex", None)
+        if is_complex is None or is_complex():
             kind = f"a {type(values).__name__} is not allowed for the term {name!r}"
-            raise InputError(f"reward {object_label(reward)}: {kind}; allowed: a tensor, made of those of the Outcome")
+            raise InputError(f"{label}: {kind}; allowed: a tensor of real numbers, made of those of the Outcome")
+        is_allowed = abs(1.0 * values.detach()) <= MAX_REWARD_TERM  # truth values have no absolute value
+        if not bool(is_allowed.all()):
+            value, allowed = float(values.detach()[~is_allowed][0]), f"finite, at most {MAX_REWARD_TERM:g}"
+            raise InputError(f"{label}: term {name!r} is {value:g}; allowed: {allowed}")
 
 
 def step_reward_terms(reward: Reward, outcome: Outcome, step: int, needs_rows: bool) -> dict[str, float]:
