@@ -184,8 +184,8 @@ def fuel_ml_per_km(episode: Episode) -> float:
 
 def outflow_veh_per_h(episode: Episode) -> float:
     """Flow [veh/h]. On a closed road: distance of all vehicles over length and time (Edie 1963). On an open
-    road: vehicles that left it over the planned duration; with a demand peak, in its last ten minutes. Behind a
-    recorded vehicle: distance of the platoon over its length and time.
+    road: vehicles that left it over the time of all planned control steps; with a demand peak, in its last ten
+    minutes. Behind a recorded vehicle: distance of the platoon over its length and time.
     """
     step, steps = episode.control_step, episode.control_steps
     if episode.demand_peak[1] > 0:
