@@ -79,7 +79,7 @@ def test_what_a_recipe_leaves_out_is_said_to_be_a_default(tmp_path: Path) -> Non
         del manifest["driver"]["expert"]["time_constant"]
 
     for content, words in (
-        (content_of(), "of which nothing was ignored"),
+        (content_of(), "built from all entries of its recipe"),
         (write_changed(tmp_path, leave_out).read_bytes(), "missing parameters have the defaults of this version"),
     ):
         found = verify_controller_file(written(tmp_path, content))
@@ -144,7 +144,7 @@ def test_a_manifest_that_says_something_else_is_refused(
     tmp_path: Path, change: Callable[[dict[str, Any]], object], key: str
 ) -> None:
     words = refusal_message(write_changed(tmp_path, change))
-    assert f"its manifest says of {key}" in words or f"manifest.{key}: missing" in words
+    assert f"controller: manifest.{key}" in words or f"manifest.{key}: missing" in words
 
 
 def test_a_sample_that_the_driver_does_not_answer_so_is_refused(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Controllers as files, and the construction of drivers from names.
 
 A `.unjam` file is an uncompressed zip archive of a manifest in JSON (observation, memory, recipe of the driver),
-weights in safetensors and, in exported files, a recorded sample and an ONNX graph. Nothing in it is ever executed.
+weights in safetensors and, in exported files, a recorded sample and an ONNX graph. It contains no code to execute.
 """
 
 import os
@@ -30,21 +30,21 @@ DEFAULT_DRIVER = "unjam:best"  # driver of commands without `--driver`: the cont
 
 
 def make_driver(name: str, time_step: float) -> Driver:
-    """Return the driver with a name; raise `InputError` if there is none, or a parameter is wrong.
+    """Return the driver with a name; raise `InputError` if no driver has the name, or a parameter is wrong.
 
     Args:
-        name: a name (`pi`), with parameters (`pi:time_constant=1,window=30`), your own (`path.py:name`), a run folder,
-            a `.unjam` file, a `.zip` file of Stable-Baselines3 with a model that observes `local`, also with its
-            control step (`ppo.zip:policy_time_step=1.0`), an `.onnx` file with a description (`policy.toml`), or a
-            packaged controller (`unjam:ring-best`); or several of them joined by `+`, which CAVs use in turn.
+        name: a name (`pi`), with parameters (`pi:time_constant=1,window=30`), your own driver (`path.py:name`), a run
+            folder, a `.unjam` file, a `.zip` file of Stable-Baselines3 with a model that observes `local`, also with
+            its control step (`ppo.zip:policy_time_step=1.0`), an `.onnx` file with a description (`policy.toml`), or a
+            packaged controller (`unjam:ring-best`); or several names joined by `+`: CAVs use these drivers in rotation.
         time_step: control step of the road [s].
     """
-    parts = split_names(name)
-    if len(parts) > 1:
-        return MixedDriver(tuple(make_driver(part, time_step) for part in parts))
+    single_names = split_names(name)
+    if len(single_names) > 1:
+        return MixedDriver(tuple(make_driver(single_name, time_step) for single_name in single_names))
     if name.startswith(PACKAGED_PREFIX):
         return load_controller(name)
-    is_folder = os.path.isdir(name)  # a folder is never a file with code, whatever its name
+    is_folder = os.path.isdir(name)  # also with a name that ends like a file with code
     file, parameters = split_parameters(name)
     if file.endswith(".zip") and not is_folder:
         from unjam.adapters.policies import policy_driver
@@ -56,8 +56,8 @@ def make_driver(name: str, time_step: float) -> Driver:
         from unjam.adapters.onnx_file import onnx_driver
 
         return onnx_driver(name, time_step=time_step)
-    is_named = name.partition(":")[0] in DRIVERS or (is_file_reference(name) and not is_folder)
-    if not is_named and (name.endswith(SUFFIX) or is_folder):
+    is_driver_name = name.partition(":")[0] in DRIVERS or (is_file_reference(name) and not is_folder)
+    if not is_driver_name and (name.endswith(SUFFIX) or is_folder):
         return load_controller(name)
     return driver_from_name(name, time_step)
 
@@ -71,12 +71,13 @@ def make_expert(name: str | DriverLike, time_step: float) -> Driver:
 
 
 def controller_path(driver_name: str) -> Path | None:
-    """Return the file of the controller with a driver's name; None if the driver is none."""
+    """Return the `.unjam` file of a driver's name; None if the driver is not a controller."""
     path = controller_file(driver_name)
     return path if path.suffix == SUFFIX and os.path.isfile(path) else None
 
 
 def controller_hash(driver_name: str) -> str | None:
-    """Return the SHA-256 of the controller with a driver's name; None if the driver is none."""
+    """Return the SHA-256 of the `.unjam` file of a driver's name; None if the driver is not a controller."""
+
     path = controller_path(driver_name)
     return None if path is None else sha256_of(path.read_bytes())

@@ -23,11 +23,11 @@ from unjam.worlds.world import CarFollowingWorld
 
 ISO_MEAN_SECONDS, LEADER_STOP_SECONDS = 2.0, 20.0
 """averaging time of accelerations in ISO 15622; simulated time after the start of a leader's emergency stop [s]"""
-ATTACK_SECONDS, ATTACK_STEP_SECONDS = 40.0, 1.0  # of an adversarial maneuver, and of each of its accelerations
-ATTACK_POPULATION, ATTACK_GENERATIONS, ATTACK_ELITES = 128, 16, 12  # of the cross-entropy method
+ATTACK_SECONDS, ATTACK_STEP_SECONDS = 40.0, 1.0  # duration of an adversarial maneuver, and of each acceleration in it
+ATTACK_POPULATION, ATTACK_GENERATIONS, ATTACK_ELITES = 128, 16, 12  # sizes in the cross-entropy method
 MAX_LEADER_ACCELERATION = 3.0  # largest acceleration of an adversarial leader [m/s2]
-MAX_SPEED = 100.0  # largest speed in a state [m/s]
-MAX_LOOP_LENGTH = 1e7  # length of a closed road: gaps can be nearly as long [m]
+MAX_SPEED = 100.0  # largest allowed speed in a state [m/s]
+MAX_LOOP_LENGTH = 1e7  # largest length of a closed road in the limit of gaps [m]
 MIN_MOVING_SPEED = 1.0  # speed above which time gaps are evaluated [m/s]
 
 
@@ -41,7 +41,7 @@ class WorstCases:
     min_gap: float
     min_time_gap: float  # above 1 m/s, behind a leader that brakes with at most `SafetyFilter.time_gap_braking`
     max_braking: float
-    attack: tuple[float, ...]  # the leader's accelerations with the smallest gap, one per second
+    attack: tuple[float, ...]  # accelerations of the leader in the maneuver with the smallest gap, one per second
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Comfort:
 
 @dataclass(frozen=True)
 class OperatingDomain:
-    """Ranges of the visited states: smallest and largest values."""
+    """Smallest and largest values of the visited states [m/s, m]."""
 
     speed: tuple[float, float]
     leader_speed: tuple[float, float]
@@ -64,16 +64,16 @@ class OperatingDomain:
 
     def contains(self, states: Any) -> Any:
         """Return whether states lie within the ranges, a Boolean for each row."""
-        inside: Any = True
+        is_inside: Any = True
         for name, (low, high) in asdict(self).items():
             value = getattr(states, name)
-            inside = inside & (value >= low) & (value <= high)
-        return inside
+            is_inside = is_inside & (value >= low) & (value <= high)
+        return is_inside
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """All results."""
+    """All results of a certification."""
 
     worst_cases: WorstCases
     comfort: Comfort
@@ -92,16 +92,16 @@ def make_certificate(controller: Controller) -> dict[str, Any]:
         raise InputError(f"certify: a controller without a scenario is not allowed; allowed: {allowed}")
     with reject_damaged("certify"):
         states, _ = read_sample(controller.parts[SAMPLE_PART])
-        road = controller.manifest["scenario"]
-        humans = build_dataclass(IDMParameters, road["humans"], "controller: humans")
-        actuator = build_dataclass(Actuator, road.get("actuator", {}), "controller: actuator")
+        scenario = controller.manifest["scenario"]
+        humans = build_dataclass(IDMParameters, scenario["humans"], "controller: humans")
+        actuator = build_dataclass(Actuator, scenario.get("actuator", {}), "controller: actuator")
     if driver.actuator != actuator:
         raise InputError(f"certify: a filter for {driver.actuator} is not allowed on its road; allowed: {actuator}")
     return asdict(certify_driver(driver, states, humans))
 
 
 def describe_worst_cases(certificate: dict[str, Any], driver: FilteredDriver) -> str:
-    """Return in one line from which states and behind which leaders a controller was simulated, and what happened."""
+    """Return one line with the initial states and leaders of the simulated worst cases, contacts and minimum gap."""
     worst, domain = certificate["worst_cases"], certificate["domain"]
     speeds, gaps = ("{:.3g} to {:.3g}".format(*domain[name]) for name in ("speed", "leader_gap"))
     braking = f"at most {driver.safety.leader_braking:g} m/s2"
@@ -114,114 +114,125 @@ def describe_worst_cases(certificate: dict[str, Any], driver: FilteredDriver) ->
 
 
 def falls_behind(result: dict[str, Any]) -> bool:
-    """Return whether a vehicle falls behind its leader in a test of string stability, so that it has no gain."""
+    """Return whether a vehicle falls behind its leader in a test of string stability, and therefore has no gain."""
     return any(gain is None or isnan(gain) for gain in result["gains"])
 
 
 def describe_string_stability(certificate: dict[str, Any], driver: FilteredDriver) -> str:
-    """Return in one line whether a controller amplifies oscillations of its leader, and in which vehicle."""
+    """Return one line on whether a controller amplifies oscillations of its leader, with its vehicle."""
     results, vehicle = certificate["string_stability"], driver.actuator.describe()
     if not results:
         return f"string stability was not tested, {vehicle}"
     if any(result["amplified_band"] for result in results):
         gain = max(gain for result in results for gain in result["gains"] if gain is not None and not isnan(gain))
         return f"not string stable, {vehicle}: amplifies oscillations up to {gain:.3g} times"
-    if behind := [f"{result['speed']:g}" for result in results if falls_behind(result)]:
-        return f"string stability is unknown, {vehicle}: at {', '.join(behind)} m/s it falls behind its leader"
+    if speeds := [f"{result['speed']:g}" for result in results if falls_behind(result)]:
+        return f"string stability is unknown, {vehicle}: at {', '.join(speeds)} m/s it falls behind its leader"
     return f"string stable, {vehicle}"
 
 
 FollowingSimulator = Callable[[FollowingState, Floats], FollowingState]
-"""simulates a controller behind leaders, from initial states and the leaders' accelerations, shape (steps, rows)"""
+"""function that simulates a controller behind leaders, given initial states, shape (rows,), and accelerations of the
+leaders [m/s2], shape (steps, rows); it returns the states in all steps"""
 
 
 def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: IDMParameters) -> Certificate:
-    """Return the certificate of a controller with its filter, from simulations that begin in states of shape (T,)."""
-    loop = float(visited_states.loop_length[0])
+    """Return the certificate of a controller with its filter, from simulations that begin in visited states.
+
+    `visited_states` has arrays of shape (T,), and `humans` are the human drivers of the road.
+    """
+    loop_length = float(visited_states.loop_length[0])
     fields = frozenset(name for name, values in visited_states._asdict().items() if values is not None)
-    road = RoadInterface("the road of its filter", not np.isnan(loop), True, fields, driver.time_step)
+    road = RoadInterface("the road of its filter", not np.isnan(loop_length), True, fields, driver.time_step)
     if reason := driver.requirements(road).unmet_reason(road):
         raise InputError(f"certify: the driver is not allowed on {road.title}: {reason}")
 
     def simulate(initial_states: FollowingState, leader_accelerations: Floats) -> FollowingState:
-        vehicle = driver.limits, driver.time_step, loop, driver.actuator
+        vehicle = driver.limits, driver.time_step, loop_length, driver.actuator
         return drive_world(CarFollowingWorld(initial_states, leader_accelerations, *vehicle), driver)
 
-    states, fewest = FollowingState(*visited_states[:3]), 1 + _steps_of_mean(driver.time_step)
+    states, min_count = FollowingState(*visited_states[:3]), 1 + _averaged_steps(driver.time_step)
     if driver.time_step > LEADER_STOP_SECONDS:
         raise invalid_value("certify: control step", driver.time_step, f"at most {LEADER_STOP_SECONDS:g} s")
-    if len(states.speed) < fewest:
-        count = format_count(len(states.speed), "state")
-        raise InputError(f"certify: a sample of {count} is not allowed; allowed: {fewest} or more")
-    max_gap = float(np.fmax(min(loop, MAX_LOOP_LENGTH), MAX_OBSERVED_GAP))
-    limits = {"speed": MAX_SPEED, "leader speed": MAX_SPEED, "gap": max_gap}
-    for (name, largest), values in zip(limits.items(), states, strict=True):
-        if not ((values >= 0.0) & (values <= largest)).all():  # refuses NaN, too
-            raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {largest:g} in each state")
+    if len(states.speed) < min_count:
+        count_text = format_count(len(states.speed), "state")
+        raise InputError(f"certify: a sample of {count_text} is not allowed; allowed: {min_count} or more")
+    max_gap = float(np.fmax(min(loop_length, MAX_LOOP_LENGTH), MAX_OBSERVED_GAP))
+    maxima = {"speed": MAX_SPEED, "leader speed": MAX_SPEED, "gap": max_gap}
+    for (name, maximum), values in zip(maxima.items(), states, strict=True):
+        if not ((values >= 0.0) & (values <= maximum)).all():  # also for NaN
+            raise InputError(f"certify: {name} of the sample is not allowed; allowed: 0 to {maximum:g} in each state")
     ranges = [(float(values.min()), float(values.max())) for values in states]
     speeds = operating_speeds(float(states.speed.mean()), humans)
-    worst_cases, comfort = _worst_cases(simulate, states, driver), _comfort(states.speed, driver.time_step)
-    stability = measure_string_stability(driver, speeds, humans, loop)
+    worst_cases = _simulate_worst_cases(simulate, states, driver)
+    comfort = _measure_comfort(states.speed, driver.time_step)
+    stability = measure_string_stability(driver, speeds, humans, loop_length)
     return Certificate(worst_cases, comfort, stability, OperatingDomain(*ranges))
 
 
-def _steps_of_mean(time_step: float) -> int:
+def _averaged_steps(time_step: float) -> int:
     return max(1, round(ISO_MEAN_SECONDS / time_step))
 
 
-def _worst_cases(simulate: FollowingSimulator, states: FollowingState, driver: FilteredDriver) -> WorstCases:
+def _simulate_worst_cases(simulate: FollowingSimulator, states: FollowingState, driver: FilteredDriver) -> WorstCases:
     safety, step = driver.safety, driver.time_step
     actuation = driver.actuator, driver.actuator.initial_state(states.speed, step)
-    is_safe = safety.max_acceleration(states, step, actuation) > -safety.braking  # it promises nothing elsewhere
+    # In other states, even maximum braking may not avoid contact.
+    is_safe = safety.max_acceleration(states, step, actuation) > -safety.braking
     if not is_safe.any():
         raise InputError("certify: the filter cannot avoid contact in any state of the sample; allowed: in some")
     states = FollowingState(*(values[is_safe] for values in states))
     rows = len(states.speed)
-    stop = np.full((round(LEADER_STOP_SECONDS / step), rows), -safety.leader_braking)
-    hard_stop = simulate(states, stop)
-    gentle_stop = simulate(states, stop * (safety.time_gap_braking / safety.leader_braking))
+    leader_accelerations = np.full((round(LEADER_STOP_SECONDS / step), rows), -safety.leader_braking)
+    hard_stop = simulate(states, leader_accelerations)
+    gentle_stop = simulate(states, leader_accelerations * (safety.time_gap_braking / safety.leader_braking))
     attacked, attack, attack_steps = _search_attacks(simulate, states, driver)
-    records, is_moving = (hard_stop, gentle_stop, attacked), gentle_stop.speed > MIN_MOVING_SPEED
+    simulations, is_moving = (hard_stop, gentle_stop, attacked), gentle_stop.speed > MIN_MOVING_SPEED
     return WorstCases(
         leader_stops=rows,
-        steps=2 * stop.size + attack_steps,
-        contacts=int(sum((record.gap.min(0) < 0.0).sum() for record in records)),
-        min_gap=float(min(record.gap.min() for record in records)),
+        steps=2 * leader_accelerations.size + attack_steps,
+        contacts=int(sum((simulation.gap.min(0) < 0.0).sum() for simulation in simulations)),
+        min_gap=float(min(simulation.gap.min() for simulation in simulations)),
         min_time_gap=float((gentle_stop.gap[is_moving] / gentle_stop.speed[is_moving]).min(initial=np.inf)),
-        max_braking=max(float(-np.diff(record.speed, axis=0).min()) / step for record in records),
+        max_braking=max(float(-np.diff(simulation.speed, axis=0).min()) / step for simulation in simulations),
         attack=tuple(np.round(attack, 2).tolist()),
     )
 
 
-def _comfort(speeds: Floats, step: float) -> Comfort:
-    steps = _steps_of_mean(step)
-    means = (speeds[steps:] - speeds[:-steps]) / (steps * step)
-    earlier_speeds = speeds[: len(means)]
-    max_braking, max_acceleration = (np.interp(earlier_speeds, [5.0, 20.0], ends) for ends in ([5.0, 3.5], [4.0, 2.0]))
+def _measure_comfort(speeds: Floats, step: float) -> Comfort:
+    steps = _averaged_steps(step)
+    mean_accelerations = (speeds[steps:] - speeds[:-steps]) / (steps * step)
+    first_speeds = speeds[: len(mean_accelerations)]
+    max_braking, max_acceleration = (np.interp(first_speeds, [5.0, 20.0], ends) for ends in ([5.0, 3.5], [4.0, 2.0]))
     accelerations = np.diff(speeds) / step
+    is_comfortable = (mean_accelerations >= -max_braking) & (mean_accelerations <= max_acceleration)
     return Comfort(
         rms_acceleration=float(np.sqrt((accelerations**2).mean())),
-        max_braking=float(-means.min(initial=0.0)),
-        meets_iso_15622=bool(((means >= -max_braking) & (means <= max_acceleration)).all()),
+        max_braking=float(-mean_accelerations.min(initial=0.0)),
+        meets_iso_15622=bool(is_comfortable.all()),
     )
 
 
 def _search_attacks(
     simulate: FollowingSimulator, states: FollowingState, driver: FilteredDriver
 ) -> tuple[FollowingState, Floats, int]:
-    """Return the generation with the smallest gap, its worst maneuver, and the simulated steps of single vehicles."""
-    pieces, repeats = round(ATTACK_SECONDS / ATTACK_STEP_SECONDS), max(1, round(ATTACK_STEP_SECONDS / driver.time_step))
+    """Search for accelerations of the leader that make gaps small, by the cross-entropy method.
+
+    Return the simulation of the generation with the smallest gap, the leader's accelerations for this gap, and the
+    number of simulated steps of single vehicles.
+    """
+    size, repeats = round(ATTACK_SECONDS / ATTACK_STEP_SECONDS), max(1, round(ATTACK_STEP_SECONDS / driver.time_step))
     low, high, generator = -driver.safety.leader_braking, MAX_LEADER_ACCELERATION, np.random.default_rng(0)
-    mean, spread = np.zeros(pieces), np.full(pieces, (high - low) / 2.0)
-    chosen = generator.integers(len(states.speed), size=ATTACK_POPULATION)
-    start = FollowingState(*(values[chosen] for values in states))
-    worst: list[tuple[FollowingState, Floats]] = []
+    mean, std = np.zeros(size), np.full(size, (high - low) / 2.0)
+    rows = generator.integers(len(states.speed), size=ATTACK_POPULATION)
+    initial_states = FollowingState(*(values[rows] for values in states))
+    generations: list[tuple[FollowingState, Floats]] = []
     for _ in range(ATTACK_GENERATIONS):
-        maneuvers = np.clip(generator.normal(mean, spread, (ATTACK_POPULATION, pieces)), low, high)
-        record = simulate(start, np.repeat(maneuvers, repeats, axis=1).T)
-        order = np.argsort(record.gap.min(0))
-        worst.append((record, maneuvers[order[0]]))
+        maneuvers = np.clip(generator.normal(mean, std, (ATTACK_POPULATION, size)), low, high)
+        simulation = simulate(initial_states, np.repeat(maneuvers, repeats, axis=1).T)
+        order = np.argsort(simulation.gap.min(0))
+        generations.append((simulation, maneuvers[order[0]]))
         elites = maneuvers[order[:ATTACK_ELITES]]
-        mean, spread = elites.mean(0), elites.std(0) + 0.2
-    steps = ATTACK_GENERATIONS * ATTACK_POPULATION * pieces * repeats
-    return *min(worst, key=lambda outcome: outcome[0].gap.min()), steps
+        mean, std = elites.mean(0), elites.std(0) + 0.2
+    steps = ATTACK_GENERATIONS * ATTACK_POPULATION * size * repeats
+    return *min(generations, key=lambda generation: generation[0].gap.min()), steps

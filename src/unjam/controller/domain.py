@@ -18,15 +18,18 @@ from unjam.worlds.record import Episode
 
 IRRELEVANT_PARAMETERS = {
     *("horizon", "emission_class", "remember_warmup", "population", "recordings", "begin", "window", "platoon")
-}  # scenario parameters that do not make it another scenario
-KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")  # of scenarios, in descriptions
-MAX_LISTED_PARAMETERS = 3  # parameters that a note names
-SB3_SUFFIX = ".zip"  # end of the names of models of Stable-Baselines3
-OUTSIDE_DOMAIN_THRESHOLD = 0.05  # share of control steps from which a note reports it
+}  # parameters in which the scenario of a controller may differ without a note
+KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")  # in descriptions of scenarios
+MAX_LISTED_PARAMETERS = 3  # largest number of parameters that a note lists
+SB3_SUFFIX = ".zip"  # end of the file names of models of Stable-Baselines3
+OUTSIDE_DOMAIN_THRESHOLD = 0.05  # share of control steps outside of the domain above which there is a note
 
 
 def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[str, Episode]) -> list[str]:
-    """Return a note for each controller made for another road (a recipe), or outside its domain in its episodes."""
+    """Return notes on controllers that drive on another road than in training, or outside of their certified domain.
+
+    `road` is the recipe of a scenario; `names` are names of drivers, and `episodes` their first episodes by name.
+    """
     notes = []
     for name in names:
         if name.endswith(SB3_SUFFIX):
@@ -43,39 +46,43 @@ def controller_notes(road: dict[str, Any], names: Iterable[str], episodes: dict[
         states = [trajectory.states for trajectory in episodes[name].trajectories] if name in episodes else []
         share = max((outside_domain_share(controller, state) for state in states), default=0.0)
         if share > OUTSIDE_DOMAIN_THRESHOLD:
-            steps = f"{100 * share:.0f} % of the control steps of its first episode"
-            notes.append(f"{name} was outside of its certified domain in {steps}")
+            share_text = f"{100 * share:.0f} % of the control steps of its first episode"
+            notes.append(f"{name} was outside of its certified domain in {share_text}")
     return notes
 
 
 def control_step_note(name: str, steps: Iterable[float]) -> str:
-    """Return the note for a model of Stable-Baselines3 on roads with these control steps [s]."""
+    """Return the note for a model of Stable-Baselines3 on roads with the given control steps [s]."""
     step_text = " or ".join(f"{step:g}" for step in sorted(set(steps)))
-    other = f"{name}:policy_time_step=1.0"
-    return f"{name} does not contain its control step: here it acts every {step_text} s; {other} sets another"
+    example = f"{name}:policy_time_step=1.0"
+    return f"{name} does not contain its control step: here it acts every {step_text} s; {example} sets another"
 
 
 def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
-    """Return how the recipe of a scenario differs from that of a controller's training; a range within does not."""
-    trained = manifest.get("scenario")
-    if not isinstance(trained, dict):
+    """Return how the recipe of a scenario differs from the scenario of a controller's training; empty if it does not.
+
+    A range within the range of the training is not a difference.
+    """
+    training_road = manifest.get("scenario")
+    if not isinstance(training_road, dict):
         return ""
     verb = "tuned" if "tuning" in manifest else "trained"
-    if trained.get("kind") != road["kind"]:
-        return f"was {verb} on the {_value_text(trained.get('kind'))} road, not on the {road['kind']} road"
-    trained_values, road_values = map(_flatten_recipe, (trained, road))
-    known = [name for name in road_values if name in trained_values and name not in IRRELEVANT_PARAMETERS]
-    differ = [name for name in known if not _is_within(trained_values[name], road_values[name])]
-    if not differ:
+    if training_road.get("kind") != road["kind"]:
+        return f"was {verb} on the {_value_text(training_road.get('kind'))} road, not on the {road['kind']} road"
+    training_values, values = map(_flatten_recipe, (training_road, road))
+    common_names = [name for name in values if name in training_values and name not in IRRELEVANT_PARAMETERS]
+    different_names = [name for name in common_names if not _is_within(training_values[name], values[name])]
+    if not different_names:
         return ""
-    listed = differ[:MAX_LISTED_PARAMETERS]
-    words = [f"{name} {_value_text(road_values[name])} (there {_value_text(trained_values[name])})" for name in listed]
-    more = [f"{len(differ) - len(listed)} more"] if len(differ) > len(listed) else []
-    return f"was {verb} on the {road['kind']} road with other parameters: {', '.join(words + more)}"
+    listed = different_names[:MAX_LISTED_PARAMETERS]
+    texts = [f"{name} {_value_text(values[name])} (there {_value_text(training_values[name])})" for name in listed]
+    if len(different_names) > len(listed):
+        texts.append(f"{len(different_names) - len(listed)} more")
+    return f"was {verb} on the {road['kind']} road with other parameters: {', '.join(texts)}"
 
 
 def _flatten_recipe(recipe: dict[str, Any]) -> dict[str, Any]:
-    """Return a recipe with dotted keys, and the number of its ramps."""
+    """Return a recipe with dotted keys, and with the number of its ramps."""
     if isinstance(ramps := recipe.get("ramps"), list | tuple):
         recipe = {**recipe, "ramps": {"count": len(ramps), **dict(enumerate(ramps))}}
     return flatten_keys(recipe)
@@ -86,15 +93,15 @@ def road_description(manifest: dict[str, Any]) -> str:
     road = manifest.get("scenario")
     if not isinstance(road, dict):
         return ""
-    facts = [f"{name} {_value_text(road[name])}" for name in KEY_PARAMETERS if road.get(name) is not None]
-    return ", ".join([_value_text(road.get("kind")), *facts])
+    texts = [f"{name} {_value_text(road[name])}" for name in KEY_PARAMETERS if road.get(name) is not None]
+    return ", ".join([_value_text(road.get("kind")), *texts])
 
 
 def _is_within(training_value: Any, value: Any) -> bool:
-    """Return whether a value is that of the training; for ranges, whether it lies within."""
+    """Return whether a value equals the value of the training, or lies within it if both are ranges."""
     training_value, value = json.loads(json.dumps([training_value, value]))  # turns tuples into lists
-    pair = isinstance(value, list) and isinstance(training_value, list) and len(value) == len(training_value) == 2
-    return training_value == value or (pair and training_value[0] <= value[0] and value[1] <= training_value[1])
+    are_ranges = isinstance(value, list) and isinstance(training_value, list) and len(value) == len(training_value) == 2
+    return training_value == value or (are_ranges and training_value[0] <= value[0] and value[1] <= training_value[1])
 
 
 def _value_text(value: Any) -> str:
@@ -109,6 +116,7 @@ def outside_domain_share(controller: Controller, states: LocalState) -> float:
     try:
         values = parse_json(controller.parts[CERTIFICATE_PART])["domain"]
         domain = build_dataclass(OperatingDomain, values, "certificate: domain")
-    except (*UNREADABLE_ERRORS, InputError):  # `unjam verify` reports it; the results of a drive must not be lost
+    except (*UNREADABLE_ERRORS, InputError):  # `unjam verify` reports the error, which must not end a drive
         return 0.0
+
     return float(1.0 - np.mean(domain.contains(states)))

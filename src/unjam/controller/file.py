@@ -1,4 +1,4 @@
-"""Writing and reading a `.unjam` file: archive, manifest and recorded sample, and the checks of them."""
+"""Write, read and check `.unjam` files: archive, manifest and recorded sample."""
 
 import io
 import os
@@ -35,12 +35,12 @@ MANIFEST_PART, WEIGHTS_PART = "manifest.json", "weights.safetensors"
 SAMPLE_PART, GRAPH_PART, CERTIFICATE_PART = "sample.safetensors", "controller.onnx", "certificate.json"
 SIGNATURE_PART = "signature.json"
 ARCHIVE_PARTS = (MANIFEST_PART, WEIGHTS_PART, SAMPLE_PART, GRAPH_PART, CERTIFICATE_PART, SIGNATURE_PART)
-"""all parts of an archive, in the order of signed ones; exported controllers have a sample and may have a graph,
-certified ones a certificate, signed ones a signature"""
+"""all parts of an archive, in the order of signed archives. Exported controllers have a sample and may have a graph,
+certified controllers have a certificate, and signed controllers a signature"""
 MAX_PART_BYTES, MAX_JSON_BYTES = 64 * 2**20, {MANIFEST_PART: 2**20, CERTIFICATE_PART: 2**20, SIGNATURE_PART: 10_000}
-"""maximum sizes: of one part, and of parts in JSON, which take many times their size in memory"""
-LOCAL_HEADER_BYTES, INDEX_ENTRY_BYTES, ARCHIVE_END_BYTES = 30, 46, 22  # of a zip archive without extra fields
-MAX_SAMPLE_STEPS = 1000  # control steps
+"""largest size of a part, and of the parts in JSON, which need many times their size in memory"""
+LOCAL_HEADER_BYTES, INDEX_ENTRY_BYTES, ARCHIVE_END_BYTES = 30, 46, 22  # sizes in a zip archive without extra fields
+MAX_SAMPLE_STEPS = 1000  # largest number of control steps in a sample
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ class Controller:
 
     driver: Driver
     manifest: dict[str, Any]
-    parts: dict[str, bytes]  # content of the archive, by name
-    signed_by: str | None = None  # fingerprint of the key that signed it; None without a signature
+    parts: dict[str, bytes]  # parts of the archive by name
+    signed_by: str | None = None  # fingerprint of the key of the signature; None without a signature
 
 
 def controller_bytes(driver: Driver, metadata: dict[str, Any], parts: dict[str, bytes] | None = None) -> bytes:
-    """Return the content of a `.unjam` file; `metadata` has `PROVENANCE_ENTRIES`, also the `action_limit` [m/s2]."""
+    """Return the content of a `.unjam` file; `metadata` are `PROVENANCE_ENTRIES`, `parts` optional further parts."""
     recipe, arrays = driver_recipe(driver)
     manifest = {"format": MANIFEST_FORMAT, "unjam": __version__, "driver": recipe}
     manifest |= driver_interface(driver, metadata.get("action_limit")) | metadata
@@ -67,12 +67,12 @@ def _pack_with_hashes(manifest: dict[str, Any], parts: dict[str, bytes]) -> byte
 
 
 def trained_bytes(controller: Controller) -> bytes:
-    """Return the content of a controller as its training wrote it, without a certificate and a signature."""
+    """Return the content of a controller's file after training: only its manifest and weights."""
     return _pack_with_hashes(controller.manifest, {WEIGHTS_PART: controller.parts[WEIGHTS_PART]})
 
 
 def add_certificate(file: Path, controller: Controller, certificate: dict[str, Any]) -> None:
-    """Write a controller again with its certificate; raise `InputError` if it is signed, or has changed meanwhile."""
+    """Add a certificate to the file of a controller; raise `InputError` if the file is signed, or has changed."""
     check_unsigned(controller)
     _check_unchanged(file, controller)
     parts = {**controller.parts, CERTIFICATE_PART: to_json(certificate, indent=1).encode()}
@@ -83,12 +83,12 @@ def add_certificate(file: Path, controller: Controller, certificate: dict[str, A
 def check_unsigned(controller: Controller) -> None:
     """Raise `InputError` if a controller is signed, so that it must not change."""
     if controller.signed_by is not None:
-        signed = f"controller: a file that is signed (by {controller.signed_by}) is not allowed"
-        raise InputError(f"{signed}; allowed: one that is not: certify it first, then sign it")
+        reason = f"controller: a file that is signed (by {controller.signed_by}) is not allowed"
+        raise InputError(f"{reason}; allowed: one that is not: certify it first, then sign it")
 
 
 def add_signature(file: Path, controller: Controller, key: "Ed25519PrivateKey") -> None:
-    """Write a controller again with the signature of `key` only; raise `InputError` if it has changed meanwhile."""
+    """Sign the file of a controller in place of an earlier signature; raise `InputError` if the file has changed."""
     from unjam.controller.signature import signature_of
 
     _check_unchanged(file, controller)
@@ -112,10 +112,10 @@ def load_controller(path: Path | str) -> Driver:
 
 
 def read_controller(path: Path | str) -> Controller:
-    """Return the checked content of a `.unjam` file, of one in a run folder, or of a packaged controller.
+    """Return the checked content of a `.unjam` file, a run folder, or a packaged controller.
 
-    Raise `InputError` if it does not exist, is damaged or not a controller, or refers to Python code that is not
-    trusted or lies outside of a run folder.
+    Raise `InputError` if the file does not exist, is damaged or not a controller, or refers to Python code that is not
+    trusted. Only controllers in run folders may refer to Python code.
     """
     path, file = Path(path), controller_file(path)
     if not os.path.isfile(file):
@@ -132,8 +132,8 @@ def read_controller(path: Path | str) -> Controller:
         _check_code(file.name, manifest["driver"], path.is_dir())
         arrays = load(parts[WEIGHTS_PART])
         driver = driver_from_recipe(manifest["driver"], arrays)
-        if unknown := arrays.keys() - driver_recipe(driver)[1].keys():
-            raise InputError(f"controller {file.name}: weights {min(unknown)!r} belong to no network")
+        if unused_weights := arrays.keys() - driver_recipe(driver)[1].keys():
+            raise InputError(f"controller {file.name}: weights {min(unused_weights)!r} belong to no network")
         return Controller(driver, manifest, parts, signed_by)
     except UNREADABLE_ERRORS as error:
         hint = "" if file.suffix == SUFFIX else "; allowed: a .unjam file, which unjam export writes"
@@ -141,14 +141,14 @@ def read_controller(path: Path | str) -> Controller:
 
 
 def controller_file(path: Path | str) -> Path:
-    """Return the file of a controller: a packaged one (`unjam:ring-best`), that in a run folder, or the path itself."""
+    """Return the file for `unjam:NAME`, a packaged controller, or for a run folder; otherwise the path itself."""
     if str(path).startswith(PACKAGED_PREFIX):
         return packaged_file(str(path).removeprefix(PACKAGED_PREFIX))
     return Path(path, f"controller{SUFFIX}") if os.path.isdir(path) else Path(path)
 
 
 def packaged_names() -> list[str]:
-    """Return the names of the controllers in the package: `ring-best`."""
+    """Return the names of the packaged controllers, such as `ring-best`."""
     return sorted(path.stem for path in PACKAGED_FOLDER.glob(f"*{SUFFIX}"))
 
 
@@ -163,16 +163,16 @@ def _check_signature(file: Path, parts: dict[str, bytes]) -> str:
     """Return the fingerprint of the key that signed `parts`; raise `InputError` if the signature does not fit."""
     from unjam.controller.signature import forged_error, signer_of  # slow to import, and rarely needed
 
-    ordered = _ordered_parts(parts)
-    signed = {name: part for name, part in ordered.items() if name != SIGNATURE_PART}
-    fingerprint = signer_of(file.name, signed, parts[SIGNATURE_PART])
-    if file.read_bytes() != pack_parts(ordered):  # an archive may contain more than its parts
+    ordered_parts = _ordered_parts(parts)
+    signed_parts = {name: part for name, part in ordered_parts.items() if name != SIGNATURE_PART}
+    fingerprint = signer_of(file.name, signed_parts, parts[SIGNATURE_PART])
+    if file.read_bytes() != pack_parts(ordered_parts):  # the archive may contain other bytes
         raise forged_error(file.name)
     return fingerprint
 
 
 def _check_code(name: str, recipe: Any, is_in_folder: bool) -> None:
-    """Raise `InputError` if a driver is Python code outside of a run folder, changed since, or not trusted."""
+    """Raise `InputError` if a driver contains Python code outside of a run folder, changed code, or untrusted code."""
     for reference in user_code_recipes(recipe):
         path = resolve_code_path(reference["path"])
         if not is_in_folder:
@@ -186,7 +186,7 @@ def _check_code(name: str, recipe: Any, is_in_folder: bool) -> None:
 
 
 def pack_parts(parts: dict[str, bytes]) -> bytes:
-    """Return the archive of `parts`; the same parts give the same bytes."""
+    """Return the archive of `parts`; equal parts give equal bytes."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_STORED) as archive:
         for name, part in parts.items():
@@ -197,13 +197,13 @@ def pack_parts(parts: dict[str, bytes]) -> bytes:
 
 
 def unpack_parts(file: Path) -> dict[str, bytes]:
-    """Return the parts of an archive, in memory; raise `InputError` for an unallowed part or bytes outside the parts.
+    """Return the parts of an archive by name; raise `InputError` for a part that is not allowed, or further bytes.
 
-    Raise `zipfile.BadZipFile`, `OSError`, `EOFError` or `RuntimeError` if it is not an archive, or damaged.
+    Raise `zipfile.BadZipFile`, `OSError`, `EOFError` or `RuntimeError` if the file is not an archive, or is damaged.
     """
-    size, largest = file.stat().st_size, len(ARCHIVE_PARTS) * MAX_PART_BYTES
-    if size > largest:
-        raise InputError(f"controller {file.name}: {size} bytes; allowed: at most {largest}")
+    size, max_size = file.stat().st_size, len(ARCHIVE_PARTS) * MAX_PART_BYTES
+    if size > max_size:
+        raise InputError(f"controller {file.name}: {size} bytes; allowed: at most {max_size}")
     parts: dict[str, bytes] = {}
     with zipfile.ZipFile(file) as archive:
         for entry in archive.infolist():
@@ -212,10 +212,11 @@ def unpack_parts(file: Path) -> dict[str, bytes]:
             if reason := _entry_error(entry):
                 raise InputError(f"controller {file.name}: part {entry.filename!r} {reason}")
             parts[entry.filename] = archive.read(entry)
-        # Neither hashes nor a signature cover other bytes, which may be a second file of another kind.
-        headers = LOCAL_HEADER_BYTES + INDEX_ENTRY_BYTES  # in front of a part and in the index, each with its name
-        packed = (headers + 2 * len(entry.filename.encode()) + entry.compress_size for entry in archive.infolist())
-        if size != ARCHIVE_END_BYTES + sum(packed):
+        # Hashes and signature do not protect bytes outside of the parts. Headers of a part, in front of it and in the
+        # index, contain its name.
+        header_size = LOCAL_HEADER_BYTES + INDEX_ENTRY_BYTES
+        sizes = (header_size + 2 * len(entry.filename.encode()) + entry.compress_size for entry in archive.infolist())
+        if size != ARCHIVE_END_BYTES + sum(sizes):
             raise InputError(f"controller {file.name}: has bytes outside its parts; allowed: none, as unjam writes it")
     for name in (MANIFEST_PART, WEIGHTS_PART):
         if name not in parts:
@@ -224,7 +225,7 @@ def unpack_parts(file: Path) -> dict[str, bytes]:
 
 
 def _entry_error(entry: zipfile.ZipInfo) -> str:
-    """Return why an entry is not allowed; empty if it is."""
+    """Return why an entry is not allowed; empty if it is allowed."""
     if entry.filename not in ARCHIVE_PARTS:
         return f"is unknown; allowed: {', '.join(ARCHIVE_PARTS)}"
     if stat.S_ISLNK(entry.external_attr >> 16):
@@ -232,12 +233,12 @@ def _entry_error(entry: zipfile.ZipInfo) -> str:
     is_stored = entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size
     if not is_stored or entry.flag_bits & 1:
         return "is compressed or encrypted; allowed: neither"
-    largest = MAX_JSON_BYTES.get(entry.filename, MAX_PART_BYTES)
-    return f"has {entry.file_size} bytes; allowed: at most {largest}" if entry.file_size > largest else ""
+    max_size = MAX_JSON_BYTES.get(entry.filename, MAX_PART_BYTES)
+    return f"has {entry.file_size} bytes; allowed: at most {max_size}" if entry.file_size > max_size else ""
 
 
 def sample_bytes(driver: Driver, states: LocalState, action_limit: float) -> bytes:
-    """Return the sample part of an archive: `states`, arrays of shape (T,), and the answers of `driver`."""
+    """Return the sample part of an archive: `states`, arrays of shape (T,), and the accelerations of `driver`."""
     arrays = {name: np.array(values, np.float64) for name, values in states._asdict().items() if values is not None}
     return save({**arrays, ACTION_NAME: replay_states(driver, states, action_limit)})
 
@@ -245,23 +246,24 @@ def sample_bytes(driver: Driver, states: LocalState, action_limit: float) -> byt
 def read_sample(part: bytes) -> tuple[LocalState, Floats]:
     """Return the states of a sample and its accelerations [m/s2], shape (T,); `InputError` for a wrong array."""
     arrays: dict[str, Any] = load(part)
-    required, known = {*COMMON_FIELDS, ACTION_NAME}, {*LocalState._fields, ACTION_NAME}
-    if unfit := (required - arrays.keys()) | (arrays.keys() - known):
-        name = min(unfit)
-        raise InputError(f"sample: {name!r} is {'missing' if name in required else 'unknown'}")
-    answers = arrays.pop(ACTION_NAME)
-    for name, values in {**arrays, ACTION_NAME: answers}.items():
-        shape = (len(values), FIELD_SIZES[name]) if name in FIELD_SIZES else answers.shape
-        if values.ndim != len(shape) or values.shape != shape or values.dtype != np.float64:
-            raise InputError(f"sample: {name!r} has shape {values.shape} of {values.dtype}; allowed: numbers")
-    if not 1 <= len(answers) <= MAX_SAMPLE_STEPS:
-        raise invalid_value("sample: control steps", len(answers), f"1 to {MAX_SAMPLE_STEPS}")
-    if not np.isfinite(answers).all():
+    required_names, known_names = {*COMMON_FIELDS, ACTION_NAME}, {*LocalState._fields, ACTION_NAME}
+    if wrong_names := (required_names - arrays.keys()) | (arrays.keys() - known_names):
+        name = min(wrong_names)
+        raise InputError(f"sample: {name!r} is {'missing' if name in required_names else 'unknown'}")
+    accelerations = arrays.pop(ACTION_NAME)
+    for name, array in {**arrays, ACTION_NAME: accelerations}.items():
+        shape = (len(array), FIELD_SIZES[name]) if name in FIELD_SIZES else accelerations.shape
+        if array.ndim != len(shape) or array.shape != shape or array.dtype != np.float64:
+            raise InputError(f"sample: {name!r} has shape {array.shape} of {array.dtype}; allowed: numbers")
+    if not 1 <= len(accelerations) <= MAX_SAMPLE_STEPS:
+        raise invalid_value("sample: control steps", len(accelerations), f"1 to {MAX_SAMPLE_STEPS}")
+    if not np.isfinite(accelerations).all():
         raise InputError("sample: a recorded acceleration is not finite")
-    return LocalState(**arrays), answers
+    return LocalState(**arrays), accelerations
 
 
 def replay_states(driver: Driver, states: LocalState, action_limit: float) -> Floats:
-    """Return a driver's answers within a limit [m/s2] to consecutive states of one CAV, shape (T,)."""
+    """Return a driver's accelerations within a limit [m/s2] for consecutive states of one CAV, shape (T,)."""
+
     world = RecordedWorld(states.select(np.s_[:, None]), Limits.symmetric(action_limit))
     return drive_world(world, driver).ravel()

@@ -1,4 +1,4 @@
-"""The manifest of a `.unjam` file: its schema, and the description of a driver to which it is compared."""
+"""The manifest of a `.unjam` file: its schema, and the description of a driver with which it is compared."""
 
 from dataclasses import field
 from inspect import signature
@@ -16,8 +16,8 @@ from unjam.files import parse_json
 from unjam.parameters import STRICT, build_dataclass, parameter_dataclass
 from unjam.tree import leaves
 
-MANIFEST_FORMAT = 5  # version of the schema, the only one that is read
-ACTION_NAME = "acceleration"  # name of the recorded answers in a sample and of the output of a graph
+MANIFEST_FORMAT = 5  # version of the schema; files with other versions are refused
+ACTION_NAME = "acceleration"  # name of the recorded accelerations in a sample, and of the output of a graph
 JsonObject = dict[str, Any]
 _StrictPositive = Annotated[StrictFloat, Field(gt=0)]
 
@@ -51,7 +51,7 @@ class Manifest:
 PROVENANCE_ENTRIES = tuple(
     parameter.name for parameter in signature(Manifest).parameters.values() if parameter.default != parameter.empty
 )
-"""optional entries, which only the maker can know: origin and measured results of a controller"""
+"""optional entries that only the maker of a controller can know: origin and measured results"""
 
 
 def read_manifest(name: str, part: bytes) -> JsonObject:
@@ -65,17 +65,17 @@ def read_manifest(name: str, part: bytes) -> JsonObject:
         maker = f"unjam {short_text(manifest.get('unjam'))}"
         raise InputError(f"controller {name}: format {version}, written by {maker}, is not allowed; allowed: {allowed}")
     build_dataclass(Manifest, manifest, f"controller {name}: manifest")
-    road = manifest.get("scenario", {})
-    step, steps, limit = (road.get(key) for key in ("simulation_step", "steps_per_control_step", "action_limit"))
-    step = step * steps if type(step) is float and type(steps) is int else None
-    for key, expected in (("time_step", step), ("action_limit", limit)):
+    scenario = manifest.get("scenario", {})
+    step, count, limit = (scenario.get(key) for key in ("simulation_step", "steps_per_control_step", "action_limit"))
+    control_step = step * count if type(step) is float and type(count) is int else None
+    for key, expected in (("time_step", control_step), ("action_limit", limit)):
         if key in manifest and expected is not None and manifest[key] != expected:
             raise invalid_value(f"controller {name}: manifest.{key}", manifest[key], f"{expected}, as in its scenario")
     return manifest
 
 
 def short_text(value: Any) -> str:
-    """Return a value of a file as a short text on one line; `...` stands for a missing value."""
+    """Return a value of a file as a short text on one line; `...` is a missing value."""
     text = "nothing" if value is ... else repr(value)
     return text if len(text) < 200 else f"{text[:200]}..."
 
@@ -83,62 +83,62 @@ def short_text(value: Any) -> str:
 def first_difference(
     expected: Any, actual: Any, tolerance: float = 0.0, allows_missing: bool = False, name: str = ""
 ) -> tuple[str, Any, Any] | None:
-    """Return the first place at which two JSON documents differ, and both values; None if they are equal.
+    """Return the name of the first entry in which two JSON documents differ, and its values; None if they are equal.
 
-    A Boolean is not a number, and null is not a missing entry, which is `...`. Integers are compared exactly, floats
-    with a `tolerance`, relative for those above 1. With `allows_missing`, `expected` may omit entries of `actual`;
-    `name` is the place of both within a larger document.
+    A Boolean is not a number. A missing entry has the value `...`, and differs from null. Integers are compared
+    exactly, floats with a `tolerance`, which is relative for values above 1. With `allows_missing`, `expected` may omit
+    entries of `actual`. `name` is the name of both values within a larger document.
     """
     if isinstance(expected, dict) and isinstance(actual, dict):
         keys = expected.keys() if allows_missing else expected.keys() | actual.keys()
-        pairs = [(f"{name}.{key}".strip("."), expected.get(key, ...), actual.get(key, ...)) for key in sorted(keys)]
+        entries = [(f"{name}.{key}".strip("."), expected.get(key, ...), actual.get(key, ...)) for key in sorted(keys)]
     elif isinstance(expected, list) and isinstance(actual, list) and len(expected) == len(actual):
-        pairs = [(f"{name}[{i}]", one, other) for i, (one, other) in enumerate(zip(expected, actual, strict=True))]
+        entries = [(f"{name}[{index}]", *pair) for index, pair in enumerate(zip(expected, actual, strict=True))]
     elif type(expected) is type(actual) and expected == actual:
         return None
     else:
         is_number = {type(expected), type(actual)} <= {int, float} and not (type(expected) is type(actual) is int)
-        one, other = (float(str(expected)), float(str(actual))) if is_number else (nan, nan)
-        return None if abs(other - one) <= tolerance * max(1.0, abs(other)) else (name, expected, actual)
-    differences = (first_difference(one, other, tolerance, allows_missing, key) for key, one, other in pairs)
+        x, y = (float(str(expected)), float(str(actual))) if is_number else (nan, nan)
+        return None if abs(y - x) <= tolerance * max(1.0, abs(y)) else (name, expected, actual)
+    differences = (first_difference(x, y, tolerance, allows_missing, entry_name) for entry_name, x, y in entries)
     return next((difference for difference in differences if difference is not None), None)
 
 
 def driver_interface(driver: Driver, action_limit: float | None = None) -> JsonObject:
-    """Return the interface of a controller beyond the recipe of its driver, as JSON.
+    """Return the interface of a controller as JSON: entries of the manifest that follow from its driver.
 
-    `observation`: inputs in each control step, in order, in SI units; `networks`: inputs of each network, in order, by
-    the prefix of its memory: each number is divided by its scale; `memory`: its entries for each CAV, with their
-    initial values, null for NaN; `action`: the acceleration with its bounds; `action_repeat`: control steps for which
-    a residual is repeated. `action_limit` is that of its road [m/s2], for drivers without their own limits.
+    `observation`: inputs in each control step, in order, in SI units; `networks`: inputs of each network, in order,
+    each divided by its scale, by the prefix of the network's memory; `memory`: entries for each CAV, with initial
+    values, null for NaN; `action`: the acceleration with its bounds; `action_repeat`: control steps for which a
+    residual is repeated. `action_limit` is the limit of the road [m/s2], for drivers without their own limits.
     """
     low, high = driver.limits or (None if action_limit is None else -action_limit, action_limit)
     return {
         "observation": [{"name": name, "unit": STATE_UNITS[name]} for name in driver.requirements().input_fields],
         "networks": _network_inputs(driver),
-        "memory": [_memory_entry(name, value[0]) for name, value in leaves(driver.initial_memory(1))],
+        "memory": [_memory_entry(name, rows[0]) for name, rows in leaves(driver.initial_memory(1))],
         "action": {"name": ACTION_NAME, "unit": "m/s2", "low": low, "high": high},
         "action_repeat": driver.action_repeat,
     }
 
 
 def graph_names(driver: Driver) -> tuple[list[str], list[str]]:
-    """Return the names of a graph's inputs (state, memory) and outputs (acceleration, memory after it)."""
-    memory = [name for name, _ in leaves(driver.initial_memory(1))]
-    inputs = [*driver.requirements().input_fields, *(f"memory.{name}" for name in memory)]
-    return inputs, [ACTION_NAME, *(f"next.{name}" for name in memory)]
+    """Return the names of a graph's inputs (state, memory) and outputs (acceleration, new memory)."""
+    memory_names = [name for name, _ in leaves(driver.initial_memory(1))]
+    inputs = [*driver.requirements().input_fields, *(f"memory.{name}" for name in memory_names)]
+    return inputs, [ACTION_NAME, *(f"next.{name}" for name in memory_names)]
 
 
 def _network_inputs(driver: Driver, prefix: str = "") -> dict[str, list[JsonObject]]:
     inputs = driver.network_inputs
     entries = {} if inputs is None else {prefix: [entry._asdict() for entry in inputs]}
-    for name, inner in driver.inner_drivers.items():
-        entries |= _network_inputs(inner, f"{prefix}{name}.")
+    for name, inner_driver in driver.inner_drivers.items():
+        entries |= _network_inputs(inner_driver, f"{prefix}{name}.")
     return entries
 
 
-def _memory_entry(name: str, value: Any) -> JsonObject:
-    values = np.asarray(value, np.float64)
-    distinct = np.unique(values)  # NaN is one value
-    initial = distinct[0].item() if len(distinct) == 1 else values.tolist()
-    return {"name": name, "shape": list(values.shape), "initial": None if initial != initial else initial}
+def _memory_entry(name: str, initial_values: Any) -> JsonObject:
+    array = np.asarray(initial_values, np.float64)
+    unique_values = np.unique(array)  # all NaN count as one value
+    initial = unique_values[0].item() if len(unique_values) == 1 else array.tolist()
+    return {"name": name, "shape": list(array.shape), "initial": None if initial != initial else initial}

@@ -23,83 +23,86 @@ from unjam.tree import leaves, replace_leaves
 
 
 class ControllerModule(nn.Module):
-    """A driver and the bounds of its action as a pure function of tensors, in the order of the graph."""
+    """A driver and the limit of its acceleration as a pure function of tensors, in the order of the graph."""
 
     def __init__(self, driver: Driver, action_limit: float) -> None:
         super().__init__()
         self.driver = driver
         self.limits = Limits.symmetric(action_limit)
         self.initial_memory = driver.initial_memory(1)
-        self.names = driver.requirements().input_fields
+        self.field_names = driver.requirements().input_fields
         self.memory_names = [name for name, _ in leaves(self.initial_memory)]
 
     def forward(self, *arrays: Tensor) -> tuple[Tensor, ...]:
         """Return the acceleration [m/s2] and the new memory, for state and memory in `arrays`."""
-        names = self.names
+        names = self.field_names
         state = LocalState(**dict(zip(names, arrays[: len(names)], strict=True)))
         memory: dict[str, Any] = dict(zip(self.memory_names, arrays[len(names) :], strict=True))
         for name in self.memory_names:
-            if name.rpartition(".")[2] == "window":  # in a form that a graph can represent
+            if name.rpartition(".")[2] == "window":  # a graph can contain only this form of windows
                 memory[name] = CircularWindow(memory[name], memory[f"{name.removesuffix('window')}count"])
-        acceleration, after = self.driver.act(state, replace_leaves(self.initial_memory, memory))
-        values = dict(leaves(after))
-        new_memory = (values[name] for name in self.memory_names)
-        rows = (value.rows if isinstance(value, CircularWindow) else value.clone() for value in new_memory)
-        return self.limits.clip(acceleration), *rows
+        acceleration, new_memory = self.driver.act(state, replace_leaves(self.initial_memory, memory))
+        values = dict(leaves(new_memory))
+        ordered_values = (values[name] for name in self.memory_names)
+        tensors = (value.rows if isinstance(value, CircularWindow) else value.clone() for value in ordered_values)
+        return self.limits.clip(acceleration), *tensors
 
 
 def _float64_constant() -> Callable[..., Any]:
-    """Return a function that adds a plain number to the graph: that of onnxscript would reduce it to float32."""
+    """Return a function that adds a plain number to the graph in float64; onnxscript's own one uses float32."""
     operators = import_optional("onnxscript").opset20
     import onnx_ir  # a dependency of onnxscript
 
-    def constant(value: float, dtype: int = onnx_ir.DataType.DOUBLE, **_: Any) -> Any:
-        exact = np.asarray(value, onnx_ir.DataType(dtype).numpy())
-        return operators.Constant(value=onnx_ir.tensor(exact))  # pyright: ignore[reportArgumentType]
+    def add_constant(value: float, dtype: int = onnx_ir.DataType.DOUBLE, **_: Any) -> Any:
+        array = np.asarray(value, onnx_ir.DataType(dtype).numpy())
+        return operators.Constant(value=onnx_ir.tensor(array))  # pyright: ignore[reportArgumentType]
 
-    return constant
+    return add_constant
 
 
 def onnx_graph(driver: Driver, action_limit: float) -> bytes:
     """Return the ONNX graph of a driver with its acceleration clipped to `action_limit` [m/s2], in float64.
 
-    Inputs are the fields of `LocalState` and `memory.NAME` for each entry of the memory; outputs are `acceleration`
-    and `next.NAME`. The first axis of each is the row of the CAV. Raise `InputError` if the driver does not consist of
-    formulas for torch, `MissingPartError` if onnxscript is not installed.
+    Inputs are the fields of `LocalState`, and `memory.NAME` for each entry of the memory; outputs are `acceleration`
+    and `next.NAME`. All of them have one row for each CAV. Raise `InputError` if the driver does not consist of
+    formulas for torch, and `MissingPartError` if onnxscript is not installed.
     """
     if driver.requirements().needs_numpy or driver.is_driven_by_simulator:
         raise InputError(f"onnx: {driver.describe()} is not allowed; allowed: drivers that run on tensors")
-    exact = {torch.ops.aten.scalar_tensor.default: _float64_constant()}
+    translations = {torch.ops.aten.scalar_tensor.default: _float64_constant()}
     inputs, outputs = graph_names(driver)
     example_rows = 2  # the exported graph takes any number of rows
-    like: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}  # whatever the defaults of the program are
-    state = state_of_ones(driver.requirements().input_fields, partial(torch.ones, **like), example_rows)
+    tensor_options: dict[str, Any] = {"dtype": torch.float64, "device": "cpu"}  # torch may have other defaults
+    state = state_of_ones(driver.requirements().input_fields, partial(torch.ones, **tensor_options), example_rows)
     memory = driver.initial_memory(example_rows)
-    arrays = [value for value in state if value is not None]
-    arrays += [torch.as_tensor(value, **like) for _, value in leaves(memory)]
+    examples = [tensor for tensor in state if tensor is not None]
+    examples += [torch.as_tensor(array, **tensor_options) for _, array in leaves(memory)]
     if driver.time_gaps(state, memory) is not None:
         raise InputError(f"onnx: {driver.describe()} is not allowed: a graph cannot command time gaps")
-    options: dict[str, Any] = {"input_names": inputs, "output_names": outputs, "custom_translation_table": exact}
+    options: dict[str, Any] = {"input_names": inputs, "output_names": outputs, "custom_translation_table": translations}
     rows = torch.export.Dim("cavs")
-    options |= {"dynamic_shapes": (tuple({0: rows} for _ in arrays),), "opset_version": ONNX_OPSET}
+    options |= {"dynamic_shapes": (tuple({0: rows} for _ in examples),), "opset_version": ONNX_OPSET}
     module = ControllerModule(driver, action_limit).eval()
     with torch.no_grad(), quiet_onnx_export():
-        program: Any = torch.onnx.export(module, tuple(arrays), dynamo=True, optimize=False, verbose=False, **options)
-    _simplify(program.model)
+        program: Any = torch.onnx.export(module, tuple(examples), dynamo=True, optimize=False, verbose=False, **options)
+    _simplify_graph(program.model)
     proto = program.model_proto
-    for value in (*proto.graph.input, *proto.graph.output, *proto.graph.value_info):
-        value.ClearField("metadata_props")  # `ClearMetadataAndDocStringPass` clears only those of nodes
+    for value_info in (*proto.graph.input, *proto.graph.output, *proto.graph.value_info):
+        value_info.ClearField("metadata_props")  # `ClearMetadataAndDocStringPass` clears only metadata of nodes
     return proto.SerializeToString()
 
 
 def describe_graph(part: bytes, driver: Driver, action_limit: float, time_step: float) -> bytes:
-    """Return a graph with units, and a description of `unjam.adapters.onnx_driver` for a control step [s] in TOML."""
-    interface, needs = driver_interface(driver, action_limit), driver.requirements()
+    """Return a graph with units, and with a description in TOML that `unjam.adapters.onnx_driver` reads.
+
+    `time_step` is the control step of the controller [s].
+    """
+    interface, requirements = driver_interface(driver, action_limit), driver.requirements()
     action, memory = interface["action"], {entry["name"]: entry["initial"] for entry in interface["memory"]}
-    is_needed = {"loop_length": needs.needs_loop, "route_position": needs.needs_coordinate}
+    is_required = {"loop_length": requirements.needs_loop, "route_position": requirements.needs_coordinate}
     names = [entry["name"] for entry in interface["observation"]]
     description = {
-        "inputs": [{"quantity": name} | ({} if is_needed.get(name, True) else {"optional": True}) for name in names],
+        "inputs": [{"quantity": name} | ({} if is_required.get(name, True) else {"optional": True}) for name in names],
         "output": {"tensor": action["name"], "limits": [float(action["low"]), float(action["high"])]},
         "time_step": time_step,
         "memory": [
@@ -111,14 +114,15 @@ def describe_graph(part: bytes, driver: Driver, action_limit: float, time_step: 
     model.doc_string = f"{driver.describe()}: a control step of {time_step:g} s; {EXPORT_NOTE}"
     model.metadata_props.add(key=DESCRIPTION_KEY, value=tomli_w.dumps(description))
     units = {entry["name"]: entry["unit"] for entry in (*interface["observation"], action)}
-    for value in (*model.graph.input, *model.graph.output):
-        state = "state, given back in the next control step; initial values are in the metadata"
-        value.doc_string = f"[{units[value.name]}]" if value.name in units else state
+    memory_text = "state, given back in the next control step; initial values are in the metadata"
+    for value_info in (*model.graph.input, *model.graph.output):
+        value_info.doc_string = f"[{units[value_info.name]}]" if value_info.name in units else memory_text
     return model.SerializeToString()
 
 
-def _simplify(model: Any) -> None:
-    """Fold constants, and remove paths of files; the exporter's optimizer breaks graphs with nested clips."""
+def _simplify_graph(model: Any) -> None:
+    """Fold constants, and remove file paths; torch's own optimizer breaks graphs with nested clips."""
+
     from onnx_ir.passes import common
     from onnxscript import optimizer
 

@@ -1,7 +1,7 @@
-"""Ed25519 signatures of controllers; this module loads `cryptography`, so it is only imported for keys and signatures.
+"""Ed25519 signatures of controllers; import this module only for keys and signatures, because it loads `cryptography`.
 
-The signed message is a text: a header, a line with the public key, and the SHA-256 and name of each other part,
-sorted by name and including the manifest.
+The signed message is a text: a header, a line with the public key, and lines with SHA-256 and name of each part except
+the signature, sorted by name.
 """
 
 import json
@@ -26,10 +26,10 @@ FIELD_PRIME = 2**255 - 19
 GROUP_ORDER = 2**252 + 27742317777372353535851937790883648493
 _ORDER_8 = 0x05FC536D880238B13933C6D305ACDFD5F098EFF289F4C345B027B2C28F95E826
 SMALL_ORDER_POINTS = {0, 1, FIELD_PRIME - 1, _ORDER_8, FIELD_PRIME - _ORDER_8}
-"""y coordinates of the eight points of an order that divides 8: with such a key one signature fits any message.
-Source: RFC 8032, section 5.1; Chalkias et al. 2020, Taming the many EdDSAs"""
+"""y coordinates of the eight points with an order that divides 8: with such a key, one signature is valid for any
+message. Source: RFC 8032, section 5.1; Chalkias et al. 2020, Taming the many EdDSAs"""
 WEAK_KEY_TEXT = "a weak Ed25519 key, for which signatures can be forged,"
-SIGNATURE_HEADER = "unjam controller, signature 1"  # unlike anything else signed with the same key
+SIGNATURE_HEADER = "unjam controller, signature 1"  # distinguishes the message from others signed with the same key
 KeyT = TypeVar("KeyT", Ed25519PrivateKey, Ed25519PublicKey)
 
 
@@ -43,25 +43,28 @@ class KeyPair:
 
 
 def make_keys(name: Path) -> KeyPair:
-    """Write new `NAME.key`, readable by its owner only, and `NAME.pub`, both or neither; `InputError` if one exists."""
+    """Write a new key pair to `NAME.key`, which only the owner can read, and `NAME.pub`; `InputError` if one exists.
+
+    If the second file cannot be written, remove the first one.
+    """
     if not name.name:
         raise invalid_value("name", str(name), "the common start of the names of two new files")
-    private, public = (name.with_name(name.name + ending) for ending in (".key", ".pub"))
-    check_parent_folder(private)
-    for file in (private, public):
+    private_file, public_file = (name.with_name(name.name + suffix) for suffix in (".key", ".pub"))
+    check_parent_folder(private_file)
+    for file in (private_file, public_file):
         if os.path.lexists(file):
             raise invalid_value("name", str(name), f"a name without keys: {str(file)!r} exists")
-    key = Ed25519PrivateKey.generate()
-    public_key = key.public_key()
-    secret = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-    write_new_file(private, secret, mode=0o600)
+    private_key = Ed25519PrivateKey.generate()
+    public_key = private_key.public_key()
+    private_pem = private_key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    write_new_file(private_file, private_pem, mode=0o600)
     try:
-        content = public_key.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
-        write_new_file(public, content, mode=0o644)
+        public_pem = public_key.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
+        write_new_file(public_file, public_pem, mode=0o644)
     except BaseException:
-        remove(private)
+        remove(private_file)
         raise
-    return KeyPair(private, public, fingerprint_of(public_key))
+    return KeyPair(private_file, public_file, fingerprint_of(public_key))
 
 
 def read_private_key(file: Path) -> Ed25519PrivateKey:
@@ -82,13 +85,13 @@ def _read_key(field: str, file: Path, kind: str, key_class: type[KeyT]) -> KeyT:
         raise invalid_value(field, str(file), allowed)
     try:
         content = file.read_bytes()
-    except OSError as error:  # some special files look like files
+    except OSError as error:  # reading some special files fails
         raise InputError(f"{field}: {str(file)!r} cannot be read: {error.strerror}; allowed: {allowed}") from None
     try:
         is_private = key_class is Ed25519PrivateKey
         load_private, load_public = serialization.load_pem_private_key, serialization.load_pem_public_key
         key: Any = load_private(content, None) if is_private else load_public(content)
-    except TypeError:  # it needs a password
+    except TypeError:  # the key needs a password
         raise InputError(f"{field}: {str(file)!r} is encrypted; allowed: {allowed}") from None
     except (ValueError, UnsupportedAlgorithm):
         key = None
@@ -112,32 +115,31 @@ def fingerprint_of(key: Ed25519PublicKey) -> str:
 
 
 def signature_of(parts: dict[str, bytes], key: Ed25519PrivateKey) -> bytes:
-    """Return the signature part of an archive with the other `parts`; it is deterministic."""
+    """Return the signature part of an archive with the other `parts`; equal arguments give equal bytes."""
     public_key = key.public_key()
-    raw = public_key.public_bytes_raw()
-    return _signature_json(public_key, raw, key.sign(_signed_message(parts, raw)))
+    public_bytes = public_key.public_bytes_raw()
+    return _signature_json(public_key, public_bytes, key.sign(_signed_message(parts, public_bytes)))
 
 
-def signer_of(name: str, parts: dict[str, bytes], part: bytes) -> str:
-    """Return the fingerprint of the key that signed `parts`, by the signature `part`; else `InputError`."""
+def signer_of(name: str, parts: dict[str, bytes], signature_part: bytes) -> str:
+    """Return the fingerprint of the key that signed `parts`; raise `InputError` if the signature is not valid."""
     format_error = InputError(f"controller {name}: its signature is not one that unjam writes")
-    forged = forged_error(name)
     try:
-        document = json.loads(part)
-        raw, signature = bytes.fromhex(document["public_key"]), bytes.fromhex(document["signature"])
-        key = Ed25519PublicKey.from_public_bytes(raw)
+        document = json.loads(signature_part)
+        public_bytes, signature = bytes.fromhex(document["public_key"]), bytes.fromhex(document["signature"])
+        key = Ed25519PublicKey.from_public_bytes(public_bytes)
     except (ValueError, LookupError, TypeError, RecursionError):
         raise format_error from None
-    if part != _signature_json(key, raw, signature):  # it contains something else
+    if signature_part != _signature_json(key, public_bytes, signature):  # the part contains something else
         raise format_error
-    if is_weak_point(raw):
+    if is_weak_point(public_bytes):
         raise InputError(f"controller {name}: it is signed by {WEAK_KEY_TEXT} which is not allowed")
     if is_weak_point(signature[:32]) or int.from_bytes(signature[32:], "little") >= GROUP_ORDER:
-        raise forged
+        raise forged_error(name)
     try:
-        key.verify(signature, _signed_message(parts, raw))
+        key.verify(signature, _signed_message(parts, public_bytes))
     except InvalidSignature:
-        raise forged from None
+        raise forged_error(name) from None
     return fingerprint_of(key)
 
 
@@ -146,11 +148,12 @@ def forged_error(name: str) -> InputError:
     return InputError(f"controller {name}: forged: it was changed after it was signed")
 
 
-def _signed_message(parts: dict[str, bytes], public_key: bytes) -> bytes:
-    hashes = [f"{sha256_of(part)}  {name}" for name, part in sorted(parts.items())]
-    return "".join(f"{line}\n" for line in (SIGNATURE_HEADER, f"public key {public_key.hex()}", *hashes)).encode()
+def _signed_message(parts: dict[str, bytes], public_bytes: bytes) -> bytes:
+    hash_lines = [f"{sha256_of(part)}  {name}" for name, part in sorted(parts.items())]
+    lines = SIGNATURE_HEADER, f"public key {public_bytes.hex()}", *hash_lines
+    return "".join(f"{line}\n" for line in lines).encode()
 
 
-def _signature_json(key: Ed25519PublicKey, public_key: bytes, signature: bytes) -> bytes:
-    values = {"fingerprint": fingerprint_of(key), "public_key": public_key.hex(), "signature": signature.hex()}
-    return to_json({"algorithm": "Ed25519", **values}, indent=1).encode()
+def _signature_json(key: Ed25519PublicKey, public_bytes: bytes, signature: bytes) -> bytes:
+    entries = {"fingerprint": fingerprint_of(key), "public_key": public_bytes.hex(), "signature": signature.hex()}
+    return to_json({"algorithm": "Ed25519", **entries}, indent=1).encode()

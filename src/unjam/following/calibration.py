@@ -1,4 +1,4 @@
-"""Calibration of the IDM to recorded drivers: the parameters whose simulated gaps are closest to the recorded ones.
+"""Calibration of the IDM to recorded drivers: the search for parameters with small errors of simulated gaps.
 
 A least-squares fit of single accelerations would give a model that hardly reacts to its leader. Source of the method:
 Treiber and Kesting, Traffic Flow Dynamics (2013), chapter 16.
@@ -28,8 +28,9 @@ from unjam.recordings.trajectories import Floats, FollowingTrajectory, Segments,
 from unjam.scenarios.scenario import Scenario
 
 ParameterRange = tuple[Positive, Positive]
-"""smallest and largest value that the search tries"""
+"""smallest and largest value in the search"""
 HiddenSizes = Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
+"""sizes of the hidden layers of a network"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -49,10 +50,10 @@ class CalibrationSettings:
     initial_headway_weight: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """range of the weight of the initial time headway, see `individual_idm`"""
     weighting: Literal["trajectory", "sample"] = "trajectory"
-    """objective: the mean of the RMS gap errors of the trajectories, or the RMS gap error over all samples, which a few
-    drivers with very large gaps dominate"""
+    """objective: `trajectory` mean of the RMS gap errors of the trajectories; `sample` RMS gap error over all samples,
+    which a few drivers with very large gaps dominate"""
     limits: AccelerationBounds = (-4.0, 2.0)
-    """limits of the acceleration [m/s2]; without them the IDM brakes arbitrarily hard at very small gaps"""
+    """limits of the acceleration [m/s2]; without limits the IDM brakes arbitrarily hard at very small gaps"""
     segment_seconds: Positive = 120.0
     """duration of the segments into which trajectories are cut [s]; each starts with its recorded speed and gap"""
     candidates: PositiveInt = 8
@@ -86,15 +87,17 @@ class MultiStepSettings:
     residual_weight: NonNegative = 0.1
     """weight of the squared residual in the loss; it keeps the residual small where there are no data"""
     validation_interval: PositiveInt = 20
-    """gradient steps between two validations; the weights with the smallest validation error are kept"""
+    """gradient steps between two validations; the result has the weights with the smallest validation error"""
 
 
 CALIBRATED_PARAMETERS = ("desired_speed", "time_headway", "max_acceleration", "comfortable_deceleration", "minimum_gap")
+"""IDM parameters that a calibration can search, in the order of its candidates"""
 CALIBRATION_GRID_SIZE = 32
 """number of grid values with which the search for a single parameter starts"""
 CALIBRATION_TOLERANCE = 1e-3
 """absolute tolerance of the search for a single parameter, in the unit of the parameter"""
 CAV_FOLLOWER_SETTINGS = CalibrationSettings(candidates=4, generations=40)
+"""settings of `calibrate_human_drivers`"""
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,7 @@ class CalibratedIDM:
     seconds: float
     """duration of the data [s]"""
     parameters_at_bounds: tuple[str, ...]
-    """parameters at a bound of their range: the data do not determine them"""
+    """parameters at a bound of their range, which the data do not determine"""
 
 
 def calibrate_idm(
@@ -121,10 +124,10 @@ def calibrate_idm(
 ) -> CalibratedIDM:
     """Return the IDM parameters with the smallest error of the simulated gaps of all `trajectories`.
 
-    The search is differential evolution. `headway_factors` are known factors of the time headway of each trajectory.
-    Raise `InputError` if the trajectories have different time steps.
+    The search is differential evolution. `headway_factors` are known factors of the time headway, one for each
+    trajectory. Raise `InputError` if the trajectories have different time steps.
     """
-    from scipy.optimize import differential_evolution  # takes half a second, which --help need not wait for
+    from scipy.optimize import differential_evolution  # slow to import, and not needed for --help
 
     settings = settings or CalibrationSettings()
     segments = make_segments(trajectories, settings.segment_seconds)
@@ -142,11 +145,11 @@ def calibrate_idm(
     )
     *values, weight = map(float, result.x)
     parameters = IDMParameters(**dict(zip(CALIBRATED_PARAMETERS, values, strict=True)))
-    individual = replace_parameters(parameters, time_headway=parameters.time_headway * factors)
-    simulated = simulate_followers(individual_idm(individual, weight, settings.limits), segments)
-    shares = segments.sample_counts / segments.sample_counts.sum()
-    gap_error, speed_error = (float(np.sqrt((mse * shares).sum())) for mse in (simulated.gap_mse, simulated.speed_mse))
-    collisions, seconds = int(simulated.has_collided.sum()), sum(trajectory.seconds for trajectory in trajectories)
+    segment_parameters = replace_parameters(parameters, time_headway=parameters.time_headway * factors)
+    errors = simulate_followers(individual_idm(segment_parameters, weight, settings.limits), segments)
+    weights = segments.sample_counts / segments.sample_counts.sum()
+    gap_error, speed_error = (float(np.sqrt((mse * weights).sum())) for mse in (errors.gap_mse, errors.speed_mse))
+    collisions, seconds = int(errors.has_collided.sum()), sum(trajectory.seconds for trajectory in trajectories)
     names = CALIBRATED_PARAMETERS
     at_bounds = [name for name in names if is_at_bound(getattr(parameters, name), getattr(settings, name))]
     return CalibratedIDM(parameters, gap_error, speed_error, collisions, seconds, tuple(at_bounds))
@@ -156,27 +159,27 @@ def gap_objective(
     segments: Segments, limits: AccelerationBounds, weighting: str, headway_factors: Floats | float = 1.0
 ) -> Callable[[Floats], Floats]:
     """Return the objective of the search: it maps S candidates, shape (6, S), to their gap errors [m], shape (S,)."""
-    counts, (first, weights) = segments.sample_counts, _trajectory_weights(segments)
+    counts, (first_segments, weights) = segments.sample_counts, _trajectory_weights(segments)
 
-    def objective(candidates: Floats) -> Floats:
-        v0, headway, acceleration, deceleration, minimum_gap, weight = candidates.reshape(6, -1, 1)
+    def compute_gap_errors(candidates: Floats) -> Floats:
+        v0, headway, acceleration, deceleration, minimum_gap, headway_weight = candidates.reshape(6, -1, 1)
         parameters = IDMArrays(v0, headway * headway_factors, acceleration, deceleration, 4.0, minimum_gap)
-        squares = gap_mean_squares(segments, individual_idm(parameters, weight, limits), len(v0))
+        mean_squares = gap_mean_squares(segments, individual_idm(parameters, headway_weight, limits), len(v0))
         if weighting == "trajectory":
-            return np.sqrt(np.add.reduceat(squares * weights, first, axis=1)).mean(1)
-        return np.sqrt((squares * counts).sum(1) / counts.sum())
+            return np.sqrt(np.add.reduceat(mean_squares * weights, first_segments, axis=1)).mean(1)
+        return np.sqrt((mean_squares * counts).sum(1) / counts.sum())
 
-    return objective
+    return compute_gap_errors
 
 
 def gap_mean_squares(segments: Segments, model: DriverModel, candidate_count: int = 1) -> Floats:
     """Return `SimulationErrors.gap_mse` for several candidates at once [m2], shape (candidates, n)."""
-    total = np.zeros((candidate_count, len(segments.sample_counts)))
-    speed, gap = (np.broadcast_to(values, total.shape) for values in segments.initial_state)
+    squares = np.zeros((candidate_count, len(segments.sample_counts)))
+    speed, gap = (np.broadcast_to(values, squares.shape) for values in segments.initial_state)
     states = follow_leader(model(speed, gap), (speed, gap), segments.leader, segments.time_step)
-    for index, (_, gap) in enumerate(states, 1):
-        total += np.square(gap - segments.gap[index]) * segments.is_present[index]
-    return total / segments.sample_counts
+    for step, (_, gap) in enumerate(states, 1):
+        squares += np.square(gap - segments.gap[step]) * segments.is_present[step]
+    return squares / segments.sample_counts
 
 
 def _trajectory_weights(segments: Segments) -> tuple[NDArray[np.intp], Floats]:
@@ -200,87 +203,98 @@ def calibrate_groups(
 ) -> list[CalibratedIDM]:
     """Calibrate parameters for each group of trajectories, for instance for each driver.
 
-    Only parameters in `individual` are searched, a single one for all groups at once; others are those of `typical`. A
-    minute of driving determines a driver's distance, but not the desired speed. `on_progress` gets the finished groups.
+    Search only the parameters in `individual`, and take other parameters from `typical`: a minute of driving determines
+    the time headway of a driver, but not the desired speed. A single parameter is searched for all groups at once.
+    `on_progress` is called with the number of finished groups.
     """
     settings = settings or CalibrationSettings()
     if len(individual) == 1:
-        calibrated = _calibrate_one_parameter(groups, typical, individual[0], settings)
-        on_progress(len(calibrated))
-        return calibrated
-    calibrated = list[CalibratedIDM]()
-    fixed = {name: (getattr(typical, name),) * 2 for name in CALIBRATED_PARAMETERS if name not in individual}
+        results = _calibrate_one_parameter(groups, typical, individual[0], settings)
+        on_progress(len(results))
+        return results
+    results = list[CalibratedIDM]()
+    fixed_ranges = {name: (getattr(typical, name),) * 2 for name in CALIBRATED_PARAMETERS if name not in individual}
     for trajectories in groups:
-        calibrated.append(calibrate_idm(trajectories, replace(settings, **fixed)))
-        on_progress(len(calibrated))
-    return calibrated
+        results.append(calibrate_idm(trajectories, replace(settings, **fixed_ranges)))
+        on_progress(len(results))
+    return results
 
 
 def _calibrate_one_parameter(
     groups: Sequence[Sequence[FollowingTrajectory]], typical: IDMParameters, name: str, settings: CalibrationSettings
 ) -> list[CalibratedIDM]:
     segments = make_segments(list(chain.from_iterable(groups)), settings.segment_seconds)
-    group = np.repeat(np.arange(len(groups)), [len(trajectories) for trajectories in groups])[segments.trajectory_index]
+    trajectory_groups = np.repeat(np.arange(len(groups)), [len(trajectories) for trajectories in groups])
+    segment_groups = trajectory_groups[segments.trajectory_index]
 
-    def model(values: Floats) -> DriverModel:
-        return individual_idm(replace_parameters(typical, **{name: values[group]}), 0.0, settings.limits)
+    def make_model(group_values: Floats) -> DriverModel:
+        parameters = replace_parameters(typical, **{name: group_values[segment_groups]})
+        return individual_idm(parameters, 0.0, settings.limits)
 
-    def errors(values: Floats) -> Floats:
-        (squares,) = gap_mean_squares(segments, model(values))
-        return _group_errors(squares, segments, group, settings.weighting)
+    def compute_errors(group_values: Floats) -> Floats:
+        (mean_squares,) = gap_mean_squares(segments, make_model(group_values))
+        return _group_errors(mean_squares, segments, segment_groups, settings.weighting)
 
     bounds = getattr(settings, name)
-    values = _minimize_on_grid(errors, np.linspace(bounds[0], bounds[1], CALIBRATION_GRID_SIZE), len(groups))
-    simulated = simulate_followers(model(values), segments)
-    mean_squares = simulated.gap_mse, simulated.speed_mse
-    errors_by_group = (_group_errors(mean_square, segments, group, "sample").tolist() for mean_square in mean_squares)
-    collisions, calibrated = np.bincount(group, simulated.has_collided, len(groups)).astype(int).tolist(), []
-    rows = zip(values.tolist(), groups, *errors_by_group, collisions, strict=True)
-    for value, trajectories, gap_error, speed_error, crashes in rows:
+    grid = np.linspace(bounds[0], bounds[1], CALIBRATION_GRID_SIZE)
+    values = _minimize_on_grid(compute_errors, grid, len(groups))
+    errors = simulate_followers(make_model(values), segments)
+    collisions = np.bincount(segment_groups, errors.has_collided, len(groups)).astype(int).tolist()
+    group_errors = (
+        _group_errors(mean_squares, segments, segment_groups, "sample").tolist()
+        for mean_squares in (errors.gap_mse, errors.speed_mse)
+    )
+    results = list[CalibratedIDM]()
+    rows = zip(values.tolist(), groups, *group_errors, collisions, strict=True)
+    for value, trajectories, gap_error, speed_error, group_collisions in rows:
         parameters, at_bounds = replace(typical, **{name: value}), (name,) if is_at_bound(value, bounds) else ()
         seconds = sum(trajectory.seconds for trajectory in trajectories)
-        calibrated.append(CalibratedIDM(parameters, gap_error, speed_error, crashes, seconds, at_bounds))
-    return calibrated
+        results.append(CalibratedIDM(parameters, gap_error, speed_error, group_collisions, seconds, at_bounds))
+    return results
 
 
-def _minimize_on_grid(errors: Callable[[Floats], Floats], grid: Floats, group_count: int) -> Floats:
+def _minimize_on_grid(compute_errors: Callable[[Floats], Floats], grid: Floats, group_count: int) -> Floats:
     """Return the value with the smallest error for each group: the best grid value, refined between its neighbors."""
-    from scipy.optimize import elementwise  # slow to import, see above
+    from scipy.optimize import elementwise  # slow to import
 
-    grid_errors = np.stack([errors(np.full(group_count, value)) for value in grid])
-    best = grid_errors.argmin(0)
-    values = grid[best]
-    inner = np.flatnonzero((best > 0) & (best < CALIBRATION_GRID_SIZE - 1))
+    grid_errors = np.stack([compute_errors(np.full(group_count, value)) for value in grid])
+    best_indices = grid_errors.argmin(0)
+    values = grid[best_indices]
+    inner_groups = np.flatnonzero((best_indices > 0) & (best_indices < CALIBRATION_GRID_SIZE - 1))
 
-    def refined_errors(candidates: Floats, indices: NDArray[np.int64]) -> Floats:
-        every = values.copy()
-        every[indices.astype(int)] = candidates
-        return errors(every)[indices.astype(int)]
+    def compute_some_errors(candidates: Floats, groups: NDArray[np.int64]) -> Floats:
+        candidate_values = values.copy()
+        candidate_values[groups.astype(int)] = candidates
+        return compute_errors(candidate_values)[groups.astype(int)]
 
-    if len(inner):
-        bracket = tuple(grid[best[inner] + shift] for shift in (-1, 0, 1))
+    if len(inner_groups):
+        bracket = tuple(grid[best_indices[inner_groups] + shift] for shift in (-1, 0, 1))
         tolerances = {"xatol": CALIBRATION_TOLERANCE}
-        minimum = elementwise.find_minimum(refined_errors, bracket, args=(inner,), tolerances=tolerances)
-        is_better = minimum.f_x <= grid_errors.min(0)[inner]
-        values[inner[is_better]] = minimum.x[is_better]
+        minimum = elementwise.find_minimum(compute_some_errors, bracket, args=(inner_groups,), tolerances=tolerances)
+        is_better = minimum.f_x <= grid_errors.min(0)[inner_groups]
+        values[inner_groups[is_better]] = minimum.x[is_better]
     return values
 
 
-def _group_errors(mean_squares: Floats, segments: Segments, group: NDArray[np.int64], weighting: str) -> Floats:
+def _group_errors(mean_squares: Floats, segments: Segments, groups: NDArray[np.int64], weighting: str) -> Floats:
+    """Return the RMS error of each group for mean squares of segments; `groups` are the groups of the segments."""
     if weighting == "trajectory":
-        first, weights = _trajectory_weights(segments)
-        errors, group = np.sqrt(np.add.reduceat(mean_squares * weights, first)), group[first]
-        return np.bincount(group, errors) / np.bincount(group)
+        first_segments, weights = _trajectory_weights(segments)
+        errors, groups = np.sqrt(np.add.reduceat(mean_squares * weights, first_segments)), groups[first_segments]
+        return np.bincount(groups, errors) / np.bincount(groups)
     counts = segments.sample_counts
-    return np.sqrt(np.bincount(group, mean_squares * counts) / np.bincount(group, counts))
+    return np.sqrt(np.bincount(groups, mean_squares * counts) / np.bincount(groups, counts))
 
 
 def calibrate_human_drivers(recordings: Iterable[LocalState], scenario: Scenario) -> IDMParameters:
-    """Calibrate the IDM to the followers of CAVs, if any; desired speed and minimum gap stay: slow traffic has none."""
+    """Calibrate the IDM to the followers of CAVs; without followers return the human drivers of the scenario.
+
+    Desired speed and minimum gap are those of the scenario, because slow traffic does not determine them.
+    """
     trajectories = trajectories_behind_cavs(recordings, scenario.control_step, scenario.steps_per_control_step)
-    known = scenario.humans
+    humans = scenario.humans
     if not trajectories:
-        return known
-    fixed = {name: (getattr(known, name),) * 2 for name in ("desired_speed", "minimum_gap")}
-    calibrated = calibrate_idm(trajectories, replace(CAV_FOLLOWER_SETTINGS, **fixed))
-    return replace(calibrated.parameters, exponent=known.exponent)
+        return humans
+    fixed_ranges = {name: (getattr(humans, name),) * 2 for name in ("desired_speed", "minimum_gap")}
+    calibrated = calibrate_idm(trajectories, replace(CAV_FOLLOWER_SETTINGS, **fixed_ranges))
+    return replace(calibrated.parameters, exponent=humans.exponent)
