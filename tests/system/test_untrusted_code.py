@@ -160,4 +160,5 @@ def test_runs_on_foreign_roads_are_listed_and_removed_if_they_are_trusted(
     assert "--trust-code" in refused.stderr
     done = unjam("runs", command, *names, *options, "--trust-code")
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "first").exists() == (command != "remove")
+    assert (tmp_path / "first" / "config.toml").exists() == (command != "remove")
+    assert (tmp_path / "first" / "road.py").exists()  # unjam did not write it

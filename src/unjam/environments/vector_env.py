@@ -375,7 +375,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         if self._road.has_user_reward:
             check_tensor_terms(reward, terms)
         is_valid = all(getattr(values, "shape", None) == (self.num_envs,) for values in terms.values())
-        if not is_valid or (self._is_numpy and not (abs(sum(terms.values())) <= MAX_REWARD_TERM).all()):
+        if not is_valid or (self._is_numpy and not np.all(np.abs(sum(terms.values())) <= MAX_REWARD_TERM)):
             terms = validate_reward_terms(reward, outcome, row_name="environment")
         return {name: self._kind.to_array(values) for name, values in terms.items()}
 
