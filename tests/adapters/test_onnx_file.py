@@ -411,7 +411,7 @@ def test_only_regular_files_of_a_limited_size_are_read(tmp_path: Path, monkeypat
     path.write_bytes(b"nonsense")
     assert "driver policy.onnx: graph: cannot be read: " in refusal(path)
     monkeypatch.setattr("unjam.adapters.onnx_file.MAX_MODEL_BYTES", 7)
-    assert refusal(path) == "driver policy.onnx: more than 7 bytes are not allowed; allowed: at most that"
+    assert refusal(path) == "driver policy.onnx: more than 7 bytes are not allowed; allowed: a smaller file"
 
 
 @pytest.mark.parametrize("name", ["onnx", "onnxruntime"])

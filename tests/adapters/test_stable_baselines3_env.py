@@ -97,7 +97,7 @@ def test_what_one_object_cannot_do_is_refused_in_one_line() -> None:
     with pytest.raises(InputError, match="env_method: 'render' is not allowed"):
         environment.env_method("render")
     environment.set_options([{}, {"length": 230}, {}])
-    with pytest.raises(InputError, match="options: different ones are not allowed"):
+    with pytest.raises(InputError, match="options: different options are not allowed"):
         environment.reset()
     assert environment.env_is_wrapped(gymnasium.Wrapper) == [False] * COUNT
     assert environment.get_attr("num_envs", [0, 1]) == [COUNT, COUNT]

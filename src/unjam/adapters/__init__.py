@@ -21,10 +21,12 @@ __all__ += ["to_sb3_vec_env", "write_onnx_policy"]
 def to_sb3_vec_env(environment: VectorEnv[Any, Any, Any]) -> "SB3VecEnv":
     """Return a vector environment of `gymnasium.make_vec` as a `VecEnv` of Stable-Baselines3.
 
-    With equal seeds, it equals a `DummyVecEnv` of `gymnasium.make`, without Gymnasium's step between two episodes.
+    With equal seeds, it returns the same as a `DummyVecEnv` of `gymnasium.make`, without Gymnasium's step between two
+    episodes.
 
     Raises:
-        InputError: the environment starts the next episode by itself in the same step, or returns tensors.
+        InputError: the environment starts the next episode in the step that ends an episode, or returns tensors.
+
         MissingPartError: Stable-Baselines3 is not installed.
     """
     if not isinstance(environment, VectorEnv):

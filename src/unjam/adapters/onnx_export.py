@@ -1,4 +1,4 @@
-"""Write a network of torch as an ONNX file that describes its inputs and its output."""
+"""Export of a torch network as an ONNX file that contains a description of its inputs and output."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -32,16 +32,16 @@ def write_onnx_policy(
     """Write a network and its description into one file, which `unjam drive -d` and `onnx_driver` read.
 
     Args:
-        network: returns numbers, shape (n,) or (n, 1), for observations in float32, shape (n, inputs).
-        file: its name ends in .onnx.
-        inputs: quantities in the order of the columns, and names of features, such as `"local"`.
+        network: a network that returns numbers, shape (n,) or (n, 1), for observations in float32, shape (n, inputs).
+        file: a path that ends in .onnx.
+        inputs: quantities, and names of features, such as `"local"`, in the order of the columns.
         output: the meaning of the numbers; None: accelerations [m/s2].
-        time_step: control step of the policy [s]; None: that of the road.
-        expert: name of a driver to which the accelerations are added, such as `"pi"`; empty: none.
+        time_step: control step of the policy [s]; None: control step of the road.
+        expert: name of a driver to which the accelerations are added, such as `"pi"`; empty: no expert.
 
     Raises:
         InputError: the name of the file is not allowed, or the network does not fit the inputs.
-        DiskError: its folder does not exist, or the disk is full.
+        DiskError: the folder does not exist, or the disk is full.
         MissingPartError: torch or onnxscript is not installed.
     """
     path, torch = Path(file), import_optional("torch")
@@ -60,7 +60,7 @@ def write_onnx_policy(
         network.train(was_training)
     from onnx_ir.passes import common
 
-    common.ClearMetadataAndDocStringPass()(program.model)  # stack traces have paths of this machine
+    common.ClearMetadataAndDocStringPass()(program.model)  # stack traces contain paths of this machine
     graph = program.model_proto
     tables = [entry if isinstance(entry, str) else _as_table(entry) for entry in inputs]
     description: dict[str, Any] = {"inputs": tables, "output": _as_table(output or PolicyOutput())}
@@ -71,7 +71,7 @@ def write_onnx_policy(
 
 
 def _check_shapes(network: "nn.Module", observations: "Tensor") -> None:
-    """Raise `InputError` unless a network takes the observations and returns a number for each row."""
+    """Raise `InputError` unless a network takes the observations, and returns one number for each row."""
     rows, size = observations.shape
     try:
         shape = tuple(network(observations).shape)
@@ -81,5 +81,5 @@ def _check_shapes(network: "nn.Module", observations: "Tensor") -> None:
         raise invalid_value(f"network: shape of its output for {rows} rows", shape, f"({rows},), ({rows}, 1)")
 
 
-def _as_table(value: PolicyInput | PolicyOutput) -> dict[str, Any]:
-    return {name: entry for name, entry in asdict(value).items() if entry is not None}
+def _as_table(record: PolicyInput | PolicyOutput) -> dict[str, Any]:
+    return {name: value for name, value in asdict(record).items() if value is not None}

@@ -1,4 +1,4 @@
-"""Policies of Stable-Baselines3 and torch, and functions, as drivers of this process."""
+"""Policies of Stable-Baselines3, torch networks and functions as drivers of this process."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -29,75 +29,81 @@ def policy_driver(
 ) -> PolicyDriver:
     """Return a policy as a driver that runs in this process, without exploration.
 
-    With the features of its Gymnasium environment as `inputs`, and the same expert, a model of Stable-Baselines3 drives
-    as in that environment, with its limits and its `VecNormalize`. Its further training changes the driver, too.
+    With the features of its Gymnasium environment as `inputs`, and with the same expert, a model of Stable-Baselines3
+    drives as in that environment, with the limits and the `VecNormalize` of the model. Further training of the model
+    changes the driver, too.
 
     Args:
         policy: a function of observations of n CAVs, shape (n, inputs), that returns numbers, shape (n,) or (n, 1); a
-            `torch.nn.Module`, of which a copy in evaluation mode is such a function, and also takes tensors, as in
-            `DifferentiableRings`; an algorithm or a policy of Stable-Baselines3 whose actions are a `Box` of one
+            `torch.nn.Module`, which is copied in evaluation mode, and also takes tensors, as in
+            `DifferentiableRings`; an algorithm or a policy of Stable-Baselines3 with actions in a `Box` of one
             number; or the path of the .zip file of a model (without unpickling, and without `VecNormalize`).
-        inputs: its observation in order: names of features, `PolicyInput`s, or functions of a `LocalState`.
+        inputs: names of features, `PolicyInput`s, or functions of a `LocalState`, in the order of the observation.
         expert: a driver to which the accelerations are added; None: the policy drives alone.
-        output: what its numbers mean; without limits, those of a model's action space.
+        output: the meaning of the numbers; without limits, those of a model's action space.
         time_step: control step of the road [s].
-        policy_time_step: control step of the policy [s], a multiple of that of the road; None: that of the road,
-            or for models of `unjam export --sb3` the one with which they were trained on such a road.
+        policy_time_step: control step of the policy [s], a multiple of the road's control step; None: the road's
+            control step, or for models of `unjam export --sb3` their action repeat times this step.
 
     Raises:
         InputError: the policy does not take these inputs, returns another shape, has other actions, or is recurrent;
             or the file is missing, damaged or no `MlpPolicy` with continuous actions and usual exploration.
         MissingPartError: torch is not installed, or cannot read weights safely.
     """
-    label, function, size, torch = object_label(policy), policy, None, sys.modules.get("torch")
-    kind = PolicyDriver
+    label, function, input_size, torch = object_label(policy), policy, None, sys.modules.get("torch")
+    driver_class = PolicyDriver
     if isinstance(policy, str | Path):
         label, policy = Path(policy).name, read_policy(Path(policy))
     if hasattr(policy, "predict"):
         _check_model(label, policy)
-        exported = getattr(policy, "unjam", {})  # by `unjam export --sb3`
-        added_to, repeat = to_one_line(exported.get("expert", Constant.name)), exported.get("action_repeat")
-        if policy_time_step is None and isinstance(repeat, int) and repeat > 1:
-            policy_time_step = repeat * time_step
-        if expert is None and added_to != Constant.name:
-            raise InputError(f"{label}: it is a residual; allowed: policy_driver with its expert, {added_to!r}")
-        function, output, size = _predict(policy), _limit_output(output, policy), policy.observation_space.shape[0]
+        metadata = getattr(policy, "unjam", {})  # from `unjam export --sb3`
+        expert_name, action_repeat = one_line(metadata.get("expert", Constant.name)), metadata.get("action_repeat")
+        if policy_time_step is None and isinstance(action_repeat, int) and action_repeat > 1:
+            policy_time_step = action_repeat * time_step
+        if expert is None and expert_name != Constant.name:
+            raise InputError(f"{label}: it is a residual; allowed: policy_driver with its expert, {expert_name!r}")
+        function, output = _model_function(policy), _limit_output(output, policy)
+        input_size = policy.observation_space.shape[0]
     elif torch is not None and isinstance(policy, torch.nn.Module):
-        function, kind = deepcopy(policy).eval().requires_grad_(False), TensorPolicyDriver
+        function, driver_class = deepcopy(policy).eval().requires_grad_(False), TensorPolicyDriver
     function = replace(UserFunction.from_object(function, "observations"), label=label)
-    inner, features = Constant() if expert is None else as_driver(expert, time_step), as_features(inputs)
-    described = observation_size(features, inner)
-    if size not in (None, described):
-        allowed = f"{size}, the inputs of {label}; a Python file that calls policy_driver can name its features"
-        raise InputError(f"inputs: {described} numbers are not allowed; allowed: {allowed}")
+    expert_driver, features = Constant() if expert is None else as_driver(expert, time_step), as_features(inputs)
+    size = observation_size(features, expert_driver)
+    if input_size not in (None, size):
+        allowed = f"{input_size}, the inputs of {label}; a Python file that calls policy_driver can name its features"
+        raise InputError(f"inputs: {size} numbers are not allowed; allowed: {allowed}")
     description = PolicyDescription(features, output, policy_time_step)
-    driver = kind(lambda rows, memory: (function(rows), memory), label, description, inner, time_step)
-    driver.evaluate(np.zeros((2, described)), {})
+    driver = driver_class(lambda rows, memory: (function(rows), memory), label, description, expert_driver, time_step)
+    driver.evaluate(np.zeros((2, size)), {})
     return driver
 
 
 def _check_model(label: str, model: Any) -> None:
-    observed, acted = model.observation_space, model.action_space
-    for name, space, allowed in (("observation", observed, "(n,)"), ("action", acted, "(1,)")):
+    """Raise `InputError` unless a model of Stable-Baselines3 has one-dimensional spaces, one action, and no memory."""
+    observation_space, action_space = model.observation_space, model.action_space
+    for name, space, allowed in (("observation", observation_space, "(n,)"), ("action", action_space, "(1,)")):
         is_box = type(space).__name__ == "Box" and len(space.shape) == 1
-        if not is_box or (space is acted and space.shape != (1,)):
+        if not is_box or (space is action_space and space.shape != (1,)):
             raise invalid_value(f"{label}: {name} space", space, f"Box of shape {allowed}")
-    if model.predict(np.zeros((1, *observed.shape), observed.dtype), deterministic=True)[1] is not None:
+    observation = np.zeros((1, *observation_space.shape), observation_space.dtype)
+    if model.predict(observation, deterministic=True)[1] is not None:
         raise InputError(f"{label}: a recurrent policy is not allowed; allowed: policies without memory")
 
 
-def _predict(model: Any) -> Callable[[NDArray[np.float64]], Any]:
+def _model_function(model: Any) -> Callable[[NDArray[np.float64]], Any]:
+    """Return the deterministic actions of a model as a function of observations, which it clips and normalizes."""
     space, normalization = model.observation_space, getattr(model, "get_vec_normalize_env", lambda: None)()
 
-    def act(observations: NDArray[np.float64]) -> Any:
+    def predict(observations: NDArray[np.float64]) -> Any:
         clipped = observations.clip(space.low, space.high).astype(space.dtype)
         normalized = clipped if normalization is None else normalization.normalize_obs(clipped)
         return model.predict(normalized, deterministic=True)[0]
 
-    return act
+    return predict
 
 
 def _limit_output(output: PolicyOutput, model: Any) -> PolicyOutput:
-    ends = (model.action_space.low[0], model.action_space.high[0])
-    low, high = sorted(float(number) * output.scale + output.offset for number in ends)
+    """Return the output with the limits of a model's action space, unless it has limits or these are infinite."""
+    bounds = (model.action_space.low[0], model.action_space.high[0])
+    low, high = sorted(float(bound) * output.scale + output.offset for bound in bounds)
     return output if output.limits or not np.isfinite([low, high]).all() else replace(output, limits=(low, high))

@@ -12,14 +12,15 @@ from unjam.physics.arrays import Array
 
 
 class SB3VecEnv(VecEnv):
-    """The environments of a `VectorEnv`, each of which starts its next episode in the step that ends one.
+    """A `VectorEnv` as a `VecEnv`: environments start the next episode in the step that ends an episode.
 
-    Gymnasium starts it one step later, in a step that ignores its action. Here `reset` starts it with a mask, so that
-    Stable-Baselines3 never sees this step; the last observation is in the `terminal_observation` of the info.
+    Gymnasium starts the next episode one step later, in a step that ignores the action. Stable-Baselines3 never
+    receives this step, because `reset` with a mask starts the next episode. The `terminal_observation` of the info is
+    the last observation of the ended episode.
     """
 
     def __init__(self, environment: VectorEnv[Any, Any, Any]) -> None:
-        """Check the environment."""
+        """Check and store the environment."""
         mode = environment.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
             raise invalid_value("environment: autoreset_mode", mode, "NEXT_STEP or DISABLED")
@@ -33,10 +34,10 @@ class SB3VecEnv(VecEnv):
         super().__init__(environment.num_envs, environment.single_observation_space, environment.single_action_space)
 
     def reset(self) -> Array:
-        """Start an episode in each environment, of the seeds and with the options that were set before."""
+        """Start an episode in each environment, with the seeds and the options that were set before."""
         options = self._options[0]
-        if any(option != options for option in self._options):
-            raise InputError("options: different ones are not allowed; allowed: the same for all environments")
+        if any(other_options != options for other_options in self._options):
+            raise InputError("options: different options are not allowed; allowed: the same for all environments")
         seeds: Any = None if all(seed is None for seed in self._seeds) else self._seeds
         observations, self.reset_infos = self._environment.reset(seed=seeds, options=dict(options))
         self._reset_seeds()
@@ -54,28 +55,30 @@ class SB3VecEnv(VecEnv):
         for info, is_truncated in zip(infos, truncated & ~terminated, strict=True):
             info["TimeLimit.truncated"] = bool(is_truncated)
         if has_ended.any():
-            last = observations
-            observations, started = self._environment.reset(options={"reset_mask": has_ended.copy()})
+            last_observations = observations
+            observations, reset_infos = self._environment.reset(options={"reset_mask": has_ended.copy()})
             for row in np.flatnonzero(has_ended):
-                infos[row]["terminal_observation"], self.reset_infos[row] = last[row], started[row]
+                infos[row]["terminal_observation"] = last_observations[row]
+                self.reset_infos[row] = reset_infos[row]
         return observations, rewards.astype(np.float32), has_ended, infos
 
     def close(self) -> None:
-        """Close the environments; may be called twice."""
+        """Close the environments; a second call has no effect."""
         self._environment.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the vector environment for each of some environments."""
+        """Return an attribute of the vector environment, once for each of the environments `indices`."""
         return [getattr(self._environment, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse, as the environments are one object."""
+        """Raise `InputError`, because one object contains all environments."""
         raise invalid_value("set_attr", attr_name, "arguments of gymnasium.make_vec")
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Refuse, as the environments are one object."""
+        """Raise `InputError`, because one object contains all environments."""
         raise invalid_value("env_method", method_name, "methods of the vector environment")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Return that no environment has a wrapper of its own."""
+        """Return False for each of the environments `indices`, because single environments have no wrappers."""
+
         return [False for _ in self._get_indices(indices)]

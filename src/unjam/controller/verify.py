@@ -129,9 +129,9 @@ def _describe_provenance(controller: Controller) -> list[PartCheck]:
     checks = [PartCheck("origin", "stated", f"{names}: the maker's statement: nothing in the file can prove it")]
     if road := road_description(manifest):
         step = manifest.get("time_step")
-        other_steps = [] if step is None else controller.driver.requirements().other_time_steps(step)
-        mismatch = f"; a part of the driver has a time_step of {other_steps[0]:g} s, not {step:g} s"
-        checks.append(PartCheck("road", "stated", f"made for the {road}{mismatch if other_steps else ''}"))
+        others = [] if step is None else controller.driver.requirements().other_time_steps(step)
+        mismatch = f"; a part of the driver has a time_step of {others[0]:g} s, not {step:g} s" if others else ""
+        checks.append(PartCheck("road", "stated", f"made for the {road}{mismatch}"))
     return checks
 
 

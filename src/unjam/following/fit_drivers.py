@@ -29,14 +29,15 @@ from unjam.scenarios.population import Population
 from unjam.text import format_count, shorten_list
 
 DriverProgress = Callable[[int, int], object]
-"""called with the number of finished drivers and the number of all drivers"""
+"""function that receives the number of finished drivers and the number of all drivers"""
 RESIDUAL_VALIDATION_SHARE = 0.2
 """share of the drivers whose trajectories validate a residual"""
 MIN_RESIDUAL_DRIVERS = 5
 """minimum number of drivers for a residual, so that at least one of them validates it"""
 MIN_SUSPICIOUS_PARAMETERS = 3
-"""number of parameters at a bound from which on a warning suspects wrong units or data"""
+"""number of parameters at a bound from which on there is a warning of wrong units or data"""
 FILTER_FIELDS = ("kind", "split", "driver")
+"""fields of a trajectory by which trajectories can be selected"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -45,11 +46,11 @@ class FitDriversSettings:
 
     calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     individual: Annotated[tuple[str, ...], Field(min_length=1)] = ("time_headway",)
-    """names of the IDM parameters that are individual; the others are the same for all drivers. On NGSIM, calibrated to
-    half a minute of each driver, individual time headways predict the other half better than one IDM for all drivers;
-    five individual parameters predict it much worse"""
+    """names of the IDM parameters that are individual; other parameters are the same for all drivers. On NGSIM, after
+    a calibration to half a minute of each driver, individual time headways predict the other half better than one IDM
+    for all drivers; five individual parameters predict it much worse"""
     rounds: PositiveInt = 3
-    """number of rounds; each calibrates the common parameters, then the individual ones"""
+    """number of rounds; each round calibrates the common parameters, then the individual parameters"""
     residual: bool = False
     """whether a network learns an acceleration that is added to the IDM of every driver"""
     multi_step: MultiStepSettings = field(default_factory=MultiStepSettings)
@@ -59,17 +60,17 @@ class FitDriversSettings:
 
 @plain_dataclass(frozen=True)
 class FittedDrivers:
-    """A population, and notes about its data."""
+    """A calibrated population, and notes on its data."""
 
     population: Population
     notes: list[str]
-    """summary of each file, and whether its trajectories are interpolated"""
+    """summary of each file, and a note if trajectories are interpolated"""
 
     def facts(self) -> dict[str, Any]:
-        """Return the main facts for JSON."""
+        """Return statistics of the population and results of the fit as JSON."""
         population = self.population
-        facts = {"drivers": len(population.drivers), "parameter_statistics": population.parameter_statistics()}
-        return facts | {key: value for key, value in population.metadata["fit"].items() if key != "settings"}
+        statistics = {"drivers": len(population.drivers), "parameter_statistics": population.parameter_statistics()}
+        return statistics | {key: value for key, value in population.metadata["fit"].items() if key != "settings"}
 
     def report_lines(self) -> list[str]:
         """Return the lines of a report: errors of the simulated gaps, warnings, and the use of the residual."""
@@ -80,16 +81,17 @@ class FittedDrivers:
         lines = [f"root mean squared error of the simulated gap: {comparison}"]
         at_bounds = fit["common"]["parameters_at_bounds"]
         if len(at_bounds) >= MIN_SUSPICIOUS_PARAMETERS:
-            count = f"{len(at_bounds)} of {len(CALIBRATED_PARAMETERS)} parameters are at a bound of their range"
+            problem = f"{len(at_bounds)} of {len(CALIBRATED_PARAMETERS)} parameters are at a bound of their range"
             reason = "this is not plausible for human drivers; are speeds in m/s and gaps in m?"
-            lines.append(f"warning: {count} ({', '.join(at_bounds)}): {reason}")
+            lines.append(f"warning: {problem} ({', '.join(at_bounds)}): {reason}")
         collisions = sum(detail["collisions"] > 0 for detail in details)
         if collisions:
             lines.append(f"in the simulation, {format_count(collisions, 'driver')} had a collision with the leader")
         if "residual_gap_errors" in fit:
-            first_error, best = fit["residual_gap_errors"][0], min(fit["residual_gap_errors"])
+            base_error, best_error = fit["residual_gap_errors"][0], min(fit["residual_gap_errors"])
             use = "used" if fit["residual_is_better"] else "not used, because it is not better"
-            lines.append(f"residual: {use}: {first_error:.2f} m without, {best:.2f} m with it, on validation drivers")
+            comparison = f"{base_error:.2f} m without, {best_error:.2f} m with it, on validation drivers"
+            lines.append(f"residual: {use}: {comparison}")
         return lines
 
 
@@ -102,28 +104,32 @@ def fit_drivers_from_files(
     filters: dict[str, str] | None = None,
     on_progress: DriverProgress = lambda *done: None,
 ) -> FittedDrivers:
-    """Calibrate a population to the trajectories in files, with `overrides` of `FitDriversSettings`.
+    """Calibrate a population to the trajectories in files.
 
-    `format`, `drop_bad_rows` and `driver_columns` are those of `read_trajectories`; `filters` values of `kind`, `split`
-    or `driver`. Raise `InputError` if a file, a row or a setting is wrong, or no trajectory is selected.
+    `overrides` are values for `FitDriversSettings`; `format`, `drop_bad_rows` and `driver_columns` are arguments of
+    `read_trajectories`; `filters` are required values of `FILTER_FIELDS`. Raise `InputError` if a file, a row or a
+    setting is wrong, or if no trajectory is selected.
+
     """
     settings = build_dataclass(FitDriversSettings, nest_keys(overrides), "")
+    options = ReadOptions(drop_bad_rows=drop_bad_rows, driver_columns=driver_columns)
     trajectories: list[FollowingTrajectory] = []
     notes = []
-    for file, stem in zip(files, _name_prefixes(files), strict=True):
-        read = read_trajectories(file, format, ReadOptions(drop_bad_rows=drop_bad_rows, driver_columns=driver_columns))
-        notes += [f"{file.name}: {line}" for line in read.summary_lines()]
+    for file, prefix in zip(files, _name_prefixes(files), strict=True):
+        loaded = read_trajectories(file, format, options)
+        notes += [f"{file.name}: {line}" for line in loaded.summary_lines()]
         trajectories += [
-            replace(trajectory, name=stem + trajectory.name, driver=stem + trajectory.driver)
-            for trajectory in read.trajectories
+            replace(trajectory, name=prefix + trajectory.name, driver=prefix + trajectory.driver)
+            for trajectory in loaded.trajectories
         ]
     for name, value in (filters or {}).items():
         if name not in FILTER_FIELDS:
             raise unknown_name("select", name, FILTER_FIELDS)
-        known = shorten_list(sorted({str(getattr(trajectory, name)) for trajectory in trajectories} - {""})) or "none"
+        values = {str(getattr(trajectory, name)) for trajectory in trajectories} - {""}
         trajectories = [trajectory for trajectory in trajectories if getattr(trajectory, name) == value]
         if not trajectories:
-            raise InputError(f"select: no trajectory has the {name} {value!r}; available: {known}")
+            available = shorten_list(sorted(values)) or "none"
+            raise InputError(f"select: no trajectory has the {name} {value!r}; available: {available}")
     time_step = max(trajectory.time_step for trajectory in trajectories)
     if any(trajectory.time_step != time_step for trajectory in trajectories):
         notes.append(f"trajectories with a shorter time step are interpolated to {time_step:g} s")
@@ -132,17 +138,17 @@ def fit_drivers_from_files(
             for trajectory in trajectories
         ]
     population = fit_drivers(trajectories, settings, on_progress)
-    origin = manifest()
-    # Populations are published: they do not name folders of this machine.
-    origin["command"] = strip_folders(origin["command"])
-    metadata = {"data": [file.name for file in files], "filters": filters or {}, "manifest": origin}
+    run_manifest = manifest()
+    # Populations are published, and must not contain names of folders of this machine.
+    run_manifest["command"] = strip_folders(run_manifest["command"])
+    metadata = {"data": [file.name for file in files], "filters": filters or {}, "manifest": run_manifest}
     return FittedDrivers(replace(population, metadata={**population.metadata, **metadata}), notes)
 
 
 def _name_prefixes(files: Sequence[Path]) -> list[str]:
-    """Return a prefix for the names of drivers in each file, because drivers in different files are different."""
-    for number, file in enumerate(files):
-        if os.path.realpath(file) in map(os.path.realpath, files[:number]):
+    """Return a prefix for the names of drivers in each file, so that names from different files differ."""
+    for index, file in enumerate(files):
+        if os.path.realpath(file) in map(os.path.realpath, files[:index]):
             raise invalid_value("data", str(file), "each file once")
     stems = [file.stem for file in files]
     if len(set(stems)) < len(stems):
@@ -155,10 +161,10 @@ def fit_drivers(
     settings: FitDriversSettings | None = None,
     on_progress: DriverProgress = lambda *done: None,
 ) -> Population:
-    """Calibrate a population with a driver for each driver of `trajectories`.
+    """Calibrate a population with one IDM for each driver of `trajectories`.
 
-    A residual is used only if it reduces the error of simulated gaps for validation drivers. Raise `InputError` if
-    there are too few drivers for it, the time steps differ, or a simulated gap is not finite.
+    The population has a residual only if this reduces the error of simulated gaps for validation drivers. Raise
+    `InputError` if there are too few drivers for a residual, if time steps differ, or if a simulated gap is not finite.
     """
     settings = settings or FitDriversSettings()
     for name in settings.individual:
@@ -167,21 +173,23 @@ def fit_drivers(
     names = list(dict.fromkeys(trajectory.driver for trajectory in trajectories))
     if settings.residual and len(names) < MIN_RESIDUAL_DRIVERS:
         raise invalid_value("drivers", len(names), f">= {MIN_RESIDUAL_DRIVERS} for a residual")
-    fixed = replace(settings.calibration, initial_headway_weight=(0.0, 0.0))  # drivers have their own headways
-    common = calibrate_idm(trajectories, fixed)
-    typical, calibrated = _calibrate_in_rounds(trajectories, names, replace(settings, calibration=fixed), on_progress)
-    for name, each in {"one IDM for all": common, **calibrated}.items():
-        if not np.isfinite(each.gap_error):
+    # The individual time headways replace the dependence on initial headways.
+    calibration = replace(settings.calibration, initial_headway_weight=(0.0, 0.0))
+    common_idm = calibrate_idm(trajectories, calibration)
+    settings_in_rounds = replace(settings, calibration=calibration)
+    typical, individual_idms = _calibrate_in_rounds(trajectories, names, settings_in_rounds, on_progress)
+    for name, calibrated in {"one IDM for all": common_idm, **individual_idms}.items():
+        if not np.isfinite(calibrated.gap_error):
             allowed = "a finite number; are the data in m, m/s and s?"
-            raise invalid_value(f"gap error of {name}", each.gap_error, allowed)
-    residual, facts = _fit_residual(trajectories, calibrated, settings) if settings.residual else (None, {})
+            raise invalid_value(f"gap error of {name}", calibrated.gap_error, allowed)
+    residual, results = _fit_residual(trajectories, individual_idms, settings) if settings.residual else (None, {})
     return Population(
         typical=typical,
-        drivers=tuple(fit.parameters for fit in calibrated.values()),
-        limits=fixed.limits,
+        drivers=tuple(calibrated.parameters for calibrated in individual_idms.values()),
+        limits=calibration.limits,
         residual=residual,
-        details=tuple({"name": name, **_calibration_details(each)} for name, each in calibrated.items()),
-        metadata={"fit": {"settings": asdict(settings), "common": _calibration_details(common), **facts}},
+        details=tuple({"name": name, **_calibration_details(idm)} for name, idm in individual_idms.items()),
+        metadata={"fit": {"settings": asdict(settings), "common": _calibration_details(common_idm), **results}},
     )
 
 
@@ -191,44 +199,48 @@ def _calibrate_in_rounds(
     settings: FitDriversSettings,
     on_progress: DriverProgress,
 ) -> tuple[IDMParameters, dict[str, CalibratedIDM]]:
-    """Return the common IDM and that of each driver, calibrated in turn: one IDM for all reacts too weakly."""
+    """Return typical IDM parameters and the IDM of each driver: calibrate common and individual parameters in turn.
+
+    One IDM for drivers with different parameters would react too weakly to its leader.
+    """
     groups = [[trajectory for trajectory in trajectories if trajectory.driver == name] for name in names]
-    has_own_headways = "time_headway" in settings.individual
-    weights = (0.0, 1.0 if has_own_headways else 0.0)
+    has_individual_headways = "time_headway" in settings.individual
+    weights = (0.0, 1.0 if has_individual_headways else 0.0)
     typical = calibrate_idm(trajectories, replace(settings.calibration, initial_headway_weight=weights)).parameters
-    calibrated: dict[str, CalibratedIDM] = {}
-    for number in range(settings.rounds):
-        if number:
+    individual_idms: dict[str, CalibratedIDM] = {}
+    for round_index in range(settings.rounds):
+        if round_index:
             factors = [
-                calibrated[trajectory.driver].parameters.time_headway / typical.time_headway
+                individual_idms[trajectory.driver].parameters.time_headway / typical.time_headway
                 for trajectory in trajectories
             ]
             typical = calibrate_idm(trajectories, settings.calibration, factors).parameters
         arguments = typical, settings.individual, settings.calibration
-        fits = calibrate_groups(groups, *arguments, lambda done: on_progress(done, len(names)))
-        calibrated = dict(zip(names, fits, strict=True))
-    if has_own_headways:  # until now only the products of common headway and factors mattered
-        (common_fit,) = calibrate_groups([trajectories], typical, ["time_headway"], settings.calibration)
-        typical = common_fit.parameters
-    return typical, calibrated
+        results = calibrate_groups(groups, *arguments, lambda done: on_progress(done, len(names)))
+        individual_idms = dict(zip(names, results, strict=True))
+    if has_individual_headways:  # the rounds have determined only products of common headway and factors
+        (common_idm,) = calibrate_groups([trajectories], typical, ["time_headway"], settings.calibration)
+        typical = common_idm.parameters
+    return typical, individual_idms
 
 
 def _fit_residual(
-    trajectories: Sequence[FollowingTrajectory], calibrated: dict[str, CalibratedIDM], settings: FitDriversSettings
+    trajectories: Sequence[FollowingTrajectory], individual_idms: dict[str, CalibratedIDM], settings: FitDriversSettings
 ) -> tuple[Network | None, dict[str, Any]]:
-    """Return the residual, or None if it does not reduce the gap errors; and facts about the fit."""
+    """Return the residual, or None if it does not reduce the gap errors, and results of the fit for metadata."""
     from unjam.following.networks import CalibratedTrajectories, fit_multi_step  # imports torch, which IDMs do not need
 
     shares = 1.0 - RESIDUAL_VALIDATION_SHARE, RESIDUAL_VALIDATION_SHARE, 0.0
-    split = split_by_driver(trajectories, shares, settings.seed)
-    parts = [select_splits(split, name) for name in ("train", "validation")]
-    drivers = [[calibrated[trajectory.driver].parameters for trajectory in part] for part in parts]
-    training, validation = map(CalibratedTrajectories, parts, drivers)
+    split_trajectories = split_by_driver(trajectories, shares, settings.seed)
+    training, validation = (
+        CalibratedTrajectories(selected, [individual_idms[trajectory.driver].parameters for trajectory in selected])
+        for selected in (select_splits(split_trajectories, name) for name in ("train", "validation"))
+    )
     limits = settings.calibration.limits
     network, errors = fit_multi_step(training, validation, limits, settings.multi_step, settings.seed)
     is_better = min(errors) < errors[0]
-    facts = {"residual_gap_errors": errors, "residual_is_better": is_better}
-    return network.to_numpy_network() if is_better else None, facts
+    results = {"residual_gap_errors": errors, "residual_is_better": is_better}
+    return network.to_numpy_network() if is_better else None, results
 
 
 def _calibration_details(calibrated: CalibratedIDM) -> dict[str, Any]:

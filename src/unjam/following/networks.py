@@ -1,7 +1,7 @@
 """Networks as driver models: alone (`vanilla`), or as a residual added to a base (`knowledge`, Eq. 4 of the paper).
 
-`fit_one_step` fits single accelerations, small errors of which can accumulate; `fit_multi_step` fits the gap in a
-simulation behind the recorded leader, with the gradient through all steps.
+`fit_one_step` fits single accelerations: small errors can accumulate in a simulation. `fit_multi_step` fits gaps in a
+simulation behind recorded leaders, with gradients through all steps.
 """
 
 import itertools
@@ -34,9 +34,9 @@ from unjam.recordings.trajectories import (
 from unjam.scenarios.population import RESIDUAL_INPUTS, residual_inputs
 
 MEAN_SQUARE_OFFSET = 1e-2
-"""constant added to a mean square before its root [m2]: the gradient of a trajectory without error stays finite"""
+"""constant in the root of a mean square [m2], which keeps the gradient finite for trajectories without error"""
 MAX_GRADIENT_NORM = 1.0
-"""norm to which gradients are clipped; through many simulated steps they can become very large"""
+"""norm to which gradients are clipped, because gradients through many simulated steps can be very large"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -49,12 +49,9 @@ class NetworkSettings:
     """number of samples in a gradient step"""
     epochs: PositiveInt = 200
     patience: PositiveInt = 200
-    """number of epochs without a smaller validation error after which the fit ends"""
+    """number of consecutive epochs without a smaller validation error after which the fit ends"""
     authority: Positive = 8.0
     """largest magnitude of the output [m/s2]"""
-
-
-AnyNetworkSettings = NetworkSettings | MultiStepSettings
 
 
 class FollowingNetwork(nn.Module):
@@ -64,7 +61,11 @@ class FollowingNetwork(nn.Module):
     scale: Tensor
 
     def __init__(
-        self, settings: AnyNetworkSettings, samples: FollowingSamples, seed: int, zero_init: bool = False
+        self,
+        settings: NetworkSettings | MultiStepSettings,
+        samples: FollowingSamples,
+        seed: int,
+        zero_init: bool = False,
     ) -> None:
         """Initialize a network with inputs normalized by `samples`; with `zero_init` its initial output is zero."""
         super().__init__()
@@ -113,9 +114,9 @@ class LossHistory(NamedTuple):
     """Mean squared errors of the acceleration in each epoch of a fit [(m/s2)2]."""
 
     training: list[float]
-    """error on the training samples, averaged over the gradient steps of the epoch"""
+    """errors on the training samples, each averaged over the gradient steps of an epoch"""
     validation: list[float]
-    """error on the validation samples at the end of the epoch"""
+    """errors on the validation samples, each at the end of an epoch"""
 
 
 def fit_one_step(
@@ -125,46 +126,47 @@ def fit_one_step(
     settings: NetworkSettings,
     seed: int,
 ) -> tuple[FollowingNetwork, LossHistory]:
-    """Fit a network to the accelerations of single samples, minus those of the base if there is one.
+    """Fit a network to the accelerations of single samples, or to their differences to a base.
 
-    It has the weights of the epoch with the smallest error on `validation`. Raises `UnjamError` if a loss is not
-    finite.
+    The network has the weights of the epoch with the smallest error on `validation`. Raise `UnjamError` if a loss is
+    not finite.
     """
     torch.set_num_threads(1)
     network = FollowingNetwork(settings, samples, seed)
 
-    def to_tensors(data: FollowingSamples) -> tuple[Tensor, Tensor]:
-        targets = data.acceleration - (base(*data.inputs) if base else 0.0)
-        return _to_tensor(residual_inputs(*data.inputs)), _to_tensor(targets)
+    def to_tensors(samples: FollowingSamples) -> tuple[Tensor, Tensor]:
+        targets = samples.acceleration - (base(*samples.inputs) if base else 0.0)
+        return _to_tensor(residual_inputs(*samples.inputs)), _to_tensor(targets)
 
     (inputs, targets), (validation_inputs, validation_targets) = to_tensors(samples), to_tensors(validation)
     optimizer = Adam(network.parameters(), lr=settings.learning_rate, fused=True)
     generator = torch.Generator().manual_seed(seed)
-    losses, best, waited, best_state = LossHistory([], []), float("inf"), 0, deepcopy(network.state_dict())
-    while len(losses.training) < settings.epochs and waited < settings.patience:
-        total = torch.zeros(())
+    losses, best_error, epochs_since_best = LossHistory([], []), float("inf"), 0
+    best_weights = deepcopy(network.state_dict())
+    while len(losses.training) < settings.epochs and epochs_since_best < settings.patience:
+        loss_sum = torch.zeros(())
         for batch in torch.randperm(len(targets), generator=generator).split(settings.batch_size):
             loss = (network(inputs[batch]) - targets[batch]).square().mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-            total += loss.detach() * len(batch)
+            loss_sum += loss.detach() * len(batch)
         with torch.no_grad():
             error = (network(validation_inputs) - validation_targets).square().mean().item()
-        losses.training.append(total.item() / len(targets))
+        losses.training.append(loss_sum.item() / len(targets))
         losses.validation.append(error)
         if not np.isfinite([losses.training[-1], error]).all():
             raise UnjamError(f"following network: the loss of epoch {len(losses.training)} is not finite")
-        waited += 1
-        if error < best:
-            best, waited, best_state = error, 0, deepcopy(network.state_dict())
-    network.load_state_dict(best_state)
+        epochs_since_best += 1
+        if error < best_error:
+            best_error, epochs_since_best, best_weights = error, 0, deepcopy(network.state_dict())
+    network.load_state_dict(best_weights)
     return network, losses
 
 
 @dataclass(frozen=True)
 class CalibratedTrajectories:
-    """Trajectories with the calibrated IDM of each driver, which is the base of a residual."""
+    """Trajectories with the calibrated IDMs of their drivers, which are the base of a residual."""
 
     trajectories: Sequence[FollowingTrajectory]
     drivers: Sequence[IDMParameters]
@@ -173,8 +175,8 @@ class CalibratedTrajectories:
     def model(
         self, trajectory_index: NDArray[np.int64], limits: leader_replay.AccelerationBounds, as_tensors: bool = False
     ) -> leader_replay.DriverModel:
-        """Return the base for segments of the trajectories with these indices, for NumPy arrays or torch tensors."""
-        parameters = stack_idm_parameters([self.drivers[number] for number in trajectory_index])
+        """Return the IDMs for segments with the given indices of trajectories, for NumPy arrays or torch tensors."""
+        parameters = stack_idm_parameters([self.drivers[index] for index in trajectory_index])
         if as_tensors:
             parameters = IDMArrays(*map(_to_tensor, parameters))
         return leader_replay.as_driver_model(leader_replay.idm_function(parameters, limits))
@@ -187,26 +189,26 @@ def fit_multi_step(
     settings: MultiStepSettings,
     seed: int,
 ) -> tuple[FollowingNetwork, list[float]]:
-    """Return a residual for calibrated drivers that reduces the difference between simulated and recorded gaps.
+    """Fit a residual that reduces the difference between simulated and recorded gaps of calibrated drivers.
 
-    It starts at zero, and has the weights with the smallest error on uncut `validation` trajectories. With it come the
-    mean RMS gap errors at each validation [m], first of the base. `limits` are those of the acceleration [m/s2]. Raises
-    `UnjamError` if a loss is not finite.
+    The residual starts at zero, and has the weights with the smallest error on uncut `validation` trajectories. Also
+    return the mean RMS gap error at each validation [m]; the first one is the error of the base. `limits` are the
+    limits of the acceleration [m/s2]. Raise `UnjamError` if a loss is not finite.
     """
     torch.set_num_threads(1)
     network = FollowingNetwork(settings, following_samples(training.trajectories), seed, zero_init=True)
     segments = make_segments(training.trajectories, settings.segment_seconds)
-    whole_segments = make_segments(validation.trajectories)
-    base = validation.model(whole_segments.trajectory_index, limits)
+    validation_segments = make_segments(validation.trajectories)
+    validation_base = validation.model(validation_segments.trajectory_index, limits)
 
     def gap_error() -> float:
-        model = leader_replay.add_residual(base, batched_network(network.to_numpy_network()), limits)
-        return float(np.sqrt(leader_replay.simulate_followers(model, whole_segments).gap_mse).mean())
+        model = leader_replay.add_residual(validation_base, batched_network(network.to_numpy_network()), limits)
+        return float(np.sqrt(leader_replay.simulate_followers(model, validation_segments).gap_mse).mean())
 
     optimizer = Adam(network.parameters(), lr=settings.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, settings.gradient_steps)
     generator = np.random.default_rng(seed)
-    errors, best_state = [gap_error()], deepcopy(network.state_dict())
+    errors, best_weights = [gap_error()], deepcopy(network.state_dict())
     for step in range(1, settings.gradient_steps + 1):
         batch = segments.select(generator.choice(segments.gap.shape[1], settings.batch_size))
         base_model = training.model(batch.trajectory_index, limits, as_tensors=True)
@@ -221,8 +223,8 @@ def fit_multi_step(
         if step % settings.validation_interval == 0:
             errors.append(gap_error())
             if errors[-1] <= min(errors):
-                best_state = deepcopy(network.state_dict())
-    network.load_state_dict(best_state)
+                best_weights = deepcopy(network.state_dict())
+    network.load_state_dict(best_weights)
     return network, errors
 
 
@@ -237,13 +239,16 @@ def _gap_loss(
     is_present = torch.as_tensor(segments.is_present)[1:]
     residuals: list[Tensor] = []
 
-    def recorded_network(inputs: Tensor) -> Tensor:
+    def compute_residual(inputs: Tensor) -> Tensor:
         residuals.append(network(inputs))
         return residuals[-1]
 
-    follow = leader_replay.add_residual(base, recorded_network, limits)(speeds[0], gaps[0])
-    states = list(leader_replay.follow_leader(follow, (speeds[0], gaps[0]), (leader_speeds, paths), segments.time_step))
-    speed, gap = (torch.stack(values) for values in zip(*states, strict=True))
-    squares = (gap - gaps[1:]).square() + (settings.speed_weight * (speed - speeds[1:])).square()
-    gap_part = ((squares * is_present).sum(0) / is_present.sum(0) + MEAN_SQUARE_OFFSET).sqrt().mean()
-    return gap_part + settings.residual_weight * torch.stack(residuals).square()[is_present].mean()
+    initial_state = speeds[0], gaps[0]
+    acceleration_function = leader_replay.add_residual(base, compute_residual, limits)(*initial_state)
+    leader = leader_speeds, paths
+    states = leader_replay.follow_leader(acceleration_function, initial_state, leader, segments.time_step)
+    simulated_speeds, simulated_gaps = (torch.stack(values) for values in zip(*states, strict=True))
+    squares = (simulated_gaps - gaps[1:]).square()
+    squares = squares + (settings.speed_weight * (simulated_speeds - speeds[1:])).square()
+    error = ((squares * is_present).sum(0) / is_present.sum(0) + MEAN_SQUARE_OFFSET).sqrt().mean()
+    return error + settings.residual_weight * torch.stack(residuals).square()[is_present].mean()
