@@ -49,7 +49,7 @@ def onnx_driver(
         graph, table = _read_graph_and_description(path)
     else:
         graph, table = _read_file(path, MAX_MODEL_BYTES), {}
-    with naming(f"driver {path.name}: "):
+    with prefix_errors(f"driver {path.name}: "):
         expert_name = table.pop("expert", Constant.name)
         if not isinstance(expert_name, str) or split_parameters(expert_name)[0] not in DRIVERS:
             raise unknown_name("expert", expert_name, DRIVERS)
@@ -72,7 +72,7 @@ def _read_graph_and_description(path: Path) -> tuple[bytes, dict[str, Any]]:
             raise invalid_value(f"driver {description_file.name}: graph", name, f"{path.name}, which was given")
         return _read_file(path.with_name(name), MAX_MODEL_BYTES), table
     graph = _read_file(path, MAX_MODEL_BYTES)
-    with naming(f"driver {path.name}: "):
+    with prefix_errors(f"driver {path.name}: "):
         metadata = {entry.key: entry.value for entry in parse_model(graph).metadata_props}
     if DESCRIPTION_KEY not in metadata:
         needed = f"{description_file.name}, with the inputs and the output of the graph"

@@ -57,7 +57,7 @@ def policy_driver(
     if hasattr(policy, "predict"):
         _check_model(label, policy)
         metadata = getattr(policy, "unjam", {})  # from `unjam export --sb3`
-        expert_name, action_repeat = one_line(metadata.get("expert", Constant.name)), metadata.get("action_repeat")
+        expert_name, action_repeat = to_one_line(metadata.get("expert", Constant.name)), metadata.get("action_repeat")
         if policy_time_step is None and isinstance(action_repeat, int) and action_repeat > 1:
             policy_time_step = action_repeat * time_step
         if expert is None and expert_name != Constant.name:

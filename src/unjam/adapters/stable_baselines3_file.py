@@ -106,7 +106,7 @@ def read_policy(path: Path) -> SavedPolicy:
         raise
     except Exception as error:  # damaged files cause any error, also in torch
         hint = "allowed: an MlpPolicy of Stable-Baselines3 with a Box of one action; others as Python objects"
-        raise InputError(f"driver {path.name}: {type(error).__name__}: {one_line(error)}; {hint}") from None
+        raise InputError(f"driver {path.name}: {type(error).__name__}: {to_one_line(error)}; {hint}") from None
     return SavedPolicy(observation_space, action_space, layers, activation, is_squashed, metadata)
 
 

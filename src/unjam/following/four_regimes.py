@@ -94,7 +94,7 @@ def make_four_regimes(settings: FourRegimesSettings) -> list[FollowingTrajectory
     for index, columns in enumerate(zip(speeds, leader_speeds, gaps, strict=True)):
         name, kind = str(index), REGIMES[regimes[index]]
         trajectory = FollowingTrajectory(name, name, settings.time_step, *columns, kind=kind)
-        trajectories.append(trajectory.part(0, min(steps, settings.samples - index * steps) + 1))
+        trajectories.append(trajectory.slice(0, min(steps, settings.samples - index * steps) + 1))
     return trajectories
 
 

@@ -122,7 +122,7 @@ class SimulationErrors(NamedTuple):
 
 def simulate_followers(model: DriverModel, segments: Segments) -> SimulationErrors:
     """Return the errors of a driver model that starts behind the leader of each segment at the first sample."""
-    initial_state, is_present, counts = segments.start, segments.is_present, segments.sample_counts
+    initial_state, is_present, counts = segments.initial_state, segments.is_present, segments.sample_counts
     states = follow_leader(model(*initial_state), initial_state, segments.leader, segments.time_step)
     speeds, gaps = map(np.stack, zip(initial_state, *states, strict=True))
     speed_mse = (np.square(speeds - segments.speed) * is_present).sum(0) / counts
