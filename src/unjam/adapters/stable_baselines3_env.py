@@ -80,5 +80,4 @@ class SB3VecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Return False for each of the environments `indices`, because single environments have no wrappers."""
-
         return [False for _ in self._get_indices(indices)]

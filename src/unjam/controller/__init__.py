@@ -78,6 +78,5 @@ def controller_path(driver_name: str) -> Path | None:
 
 def controller_hash(driver_name: str) -> str | None:
     """Return the SHA-256 of the `.unjam` file of a driver's name; None if the driver is not a controller."""
-
     path = controller_path(driver_name)
     return None if path is None else sha256_of(path.read_bytes())

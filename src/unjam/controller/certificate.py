@@ -137,10 +137,7 @@ leaders [m/s2], shape (steps, rows); it returns the states in all steps"""
 
 
 def certify_driver(driver: FilteredDriver, visited_states: LocalState, humans: IDMParameters) -> Certificate:
-    """Return the certificate of a controller with its filter, from simulations that begin in visited states.
-
-    `visited_states` has arrays of shape (T,), and `humans` are the human drivers of the road.
-    """
+    """Return the certificate of a controller with its filter, from simulations that begin in states of shape (T,)."""
     loop_length = float(visited_states.loop_length[0])
     fields = frozenset(name for name, values in visited_states._asdict().items() if values is not None)
     road = RoadInterface("the road of its filter", not np.isnan(loop_length), True, fields, driver.time_step)
@@ -216,11 +213,7 @@ def _measure_comfort(speeds: Floats, step: float) -> Comfort:
 def _search_attacks(
     simulate: FollowingSimulator, states: FollowingState, driver: FilteredDriver
 ) -> tuple[FollowingState, Floats, int]:
-    """Search for accelerations of the leader that make gaps small, by the cross-entropy method.
-
-    Return the simulation of the generation with the smallest gap, the leader's accelerations for this gap, and the
-    number of simulated steps of single vehicles.
-    """
+    """Return the generation with the smallest gap, its worst maneuver, and the number of simulated vehicle steps."""
     size, repeats = round(ATTACK_SECONDS / ATTACK_STEP_SECONDS), max(1, round(ATTACK_STEP_SECONDS / driver.time_step))
     low, high, generator = -driver.safety.leader_braking, MAX_LEADER_ACCELERATION, np.random.default_rng(0)
     mean, std = np.zeros(size), np.full(size, (high - low) / 2.0)

@@ -59,10 +59,7 @@ def control_step_note(name: str, steps: Iterable[float]) -> str:
 
 
 def road_mismatch(manifest: dict[str, Any], road: dict[str, Any]) -> str:
-    """Return how the recipe of a scenario differs from the scenario of a controller's training; empty if it does not.
-
-    A range within the range of the training is not a difference.
-    """
+    """Return how a scenario differs from that of a controller's training; a range within the training's does not."""
     training_road = manifest.get("scenario")
     if not isinstance(training_road, dict):
         return ""

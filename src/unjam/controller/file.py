@@ -264,6 +264,5 @@ def read_sample(part: bytes) -> tuple[LocalState, Floats]:
 
 def replay_states(driver: Driver, states: LocalState, action_limit: float) -> Floats:
     """Return a driver's accelerations within a limit [m/s2] for consecutive states of one CAV, shape (T,)."""
-
     world = RecordedWorld(states.select(np.s_[:, None]), Limits.symmetric(action_limit))
     return drive_world(world, driver).ravel()

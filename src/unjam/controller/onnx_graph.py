@@ -93,10 +93,7 @@ def onnx_graph(driver: Driver, action_limit: float) -> bytes:
 
 
 def describe_graph(part: bytes, driver: Driver, action_limit: float, time_step: float) -> bytes:
-    """Return a graph with units, and with a description in TOML that `unjam.adapters.onnx_driver` reads.
-
-    `time_step` is the control step of the controller [s].
-    """
+    """Return a graph with units, and with a description for `unjam.adapters.onnx_driver`; `time_step` is in seconds."""
     interface, requirements = driver_interface(driver, action_limit), driver.requirements()
     action, memory = interface["action"], {entry["name"]: entry["initial"] for entry in interface["memory"]}
     is_required = {"loop_length": requirements.needs_loop, "route_position": requirements.needs_coordinate}
@@ -122,7 +119,6 @@ def describe_graph(part: bytes, driver: Driver, action_limit: float, time_step: 
 
 def _simplify_graph(model: Any) -> None:
     """Fold constants, and remove file paths; torch's own optimizer breaks graphs with nested clips."""
-
     from onnx_ir.passes import common
     from onnxscript import optimizer
 

@@ -43,10 +43,7 @@ class KeyPair:
 
 
 def make_keys(name: Path) -> KeyPair:
-    """Write a new key pair to `NAME.key`, which only the owner can read, and `NAME.pub`; `InputError` if one exists.
-
-    If the second file cannot be written, remove the first one.
-    """
+    """Write a key pair to the new files `NAME.key`, readable only by its owner, and `NAME.pub`; both or neither."""
     if not name.name:
         raise invalid_value("name", str(name), "the common start of the names of two new files")
     private_file, public_file = (name.with_name(name.name + suffix) for suffix in (".key", ".pub"))

@@ -45,10 +45,7 @@ def operating_speeds(mean_speed: float, humans: IDMParameters) -> list[float]:
 def measure_string_stability(
     driver: FilteredDriver, speeds: Sequence[float], humans: IDMParameters, loop_length: float = np.nan
 ) -> tuple[StringStability, ...]:
-    """Return the response of a CAV at each speed [m/s], with human drivers behind it.
-
-    `loop_length` is the length of a closed road [m], NaN for an open road.
-    """
+    """Return the response of a CAV at each speed [m/s] with human drivers behind it; `loop_length` is NaN if open."""
     frequencies, results = OSCILLATION_FREQUENCIES, list[StringStability]()
     for speed, gains in zip(speeds, string_gains(driver, speeds, humans, loop_length), strict=True):
         amplified = frequencies[gains > 1.0 + GAIN_TOLERANCE]
@@ -120,10 +117,7 @@ def human_gain(frequencies: Floats, speed: float, humans: IDMParameters) -> Floa
 
 
 def _amplitude(speeds: Floats, times: Floats, frequency: float) -> float:
-    """Return the amplitude of speeds [m/s] at a frequency [Hz], over whole periods at the end of the simulation.
-
-    The periods fill at most half of the time after settling, but there is at least one period.
-    """
+    """Return the amplitude at a frequency [Hz] over the last whole periods: at most half of the time, or one period."""
     period = 1.0 / frequency
     duration = max(1, int((times[-1] - SETTLING_SECONDS) / 2.0 / period)) * period
     is_last = times > times[-1] - duration

@@ -236,10 +236,7 @@ def _require_same(part: str, difference: tuple[str, Any, Any] | None) -> None:
 
 
 def _max_error(source: str, actual: Floats, expected: Floats, tolerance: float, location: str) -> float:
-    """Return the largest difference of accelerations [m/s2]; raise `InputError` if it exceeds the tolerance.
-
-    `source` is the source of the actual accelerations, and `location` names the row `{}`, both for the message.
-    """
+    """Return the largest difference of accelerations [m/s2]; raise `InputError` if it exceeds the tolerance."""
     errors = np.abs(actual - expected)
     if not (errors <= tolerance).all():  # also for NaN
         row = int(np.argmax(~(errors <= tolerance)))

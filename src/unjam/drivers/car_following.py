@@ -350,5 +350,4 @@ class AdaptiveACC(IDMParameters, FormulaDriver):
 
     def memory_features(self, memory: Memory) -> Array:
         """Return the scaled mean own speed, and whether the CAV leaves a jam, shape (n, 2)."""
-
         return stack_columns((memory["mean_speed"] / SPEED_SCALE, memory["leaves_jam"]))

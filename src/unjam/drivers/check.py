@@ -59,10 +59,7 @@ def check_driver(
 
 
 def check_row_independence(compute: Callable[[slice], Any], label: str, unit: str = "CAVs") -> None:
-    """Raise `InputError` if rows influence each other: if `compute` returns other rows for a slice than for each row.
-
-    `label` names the function in the message, and `unit` its rows.
-    """
+    """Raise `InputError` if `compute` returns other values for several rows at once than for each row."""
     together = np.asarray(compute(slice(PROBE_ROWS)))
     alone = np.concatenate([compute(slice(row, row + 1)) for row in range(PROBE_ROWS)])
     tolerance = MAX_PROBE_DIFFERENCE * max(1.0, float(np.abs(np.nan_to_num(alone)).max(initial=0.0)))

@@ -42,13 +42,8 @@ def _as_doubles(answer: Any) -> Floats:
     return array.astype(np.float64, copy=False)
 
 
-def as_numbers(
-    answer: Any, label: str, allowed: str = "real numbers", to_array: Callable[[Any], Array] = _as_doubles
-) -> Floats:
-    """Return an answer of the user's code, converted by `to_array`; raise `InputError` unless it is numbers.
-
-    `label` names the answer in the message.
-    """
+def as_numbers(answer: Any, label: str, allowed: str = "", to_array: Callable[[Any], Array] = _as_doubles) -> Floats:
+    """Return an answer of the user's code, converted by `to_array`; raise `InputError` unless it is numbers."""
     try:
         return to_array(answer)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: tensors with a gradient
@@ -67,10 +62,7 @@ def to_answer_array(
 
 
 def batch_commanded_accelerations(command: Command | None, limits: Limits, rows: int, step: int) -> Array:
-    """Return commanded accelerations within the limits [m/s2], shape (rows,).
-
-    Raise `InputError` with `step` in its message unless there is one finite acceleration for each row.
-    """
+    """Return commanded accelerations within the limits [m/s2]; `InputError` unless each row has a finite one."""
     accelerations: Any = () if command is None else command.acceleration
     if np.shape(accelerations) != (rows,) or not bool(namespace(accelerations).isfinite(accelerations).all()):
         allowed = f"{rows} finite numbers, one for each CAV"

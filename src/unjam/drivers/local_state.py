@@ -95,10 +95,7 @@ FIELD_SIZES = {
 
 
 def state_of_ones(names: Sequence[str], make_ones: Callable[..., Any], rows: int = 1) -> LocalState:
-    """Return an example state for drivers: `names` are fields of ones, and the other fields have their defaults.
-
-    `make_ones` makes an array of a shape, as `numpy.ones` does.
-    """
+    """Return an example state with arrays of ones in the fields `names`; `make_ones` is like `numpy.ones`."""
     shapes = {name: (rows, FIELD_SIZES[name]) if name in FIELD_SIZES else (rows,) for name in names}
     return LocalState(**{name: make_ones(shape) for name, shape in shapes.items()})
 
@@ -122,5 +119,4 @@ class ScaledInput(NamedTuple):
 
 def lap_angle(state: LocalState) -> Array:
     """Return the position on a closed road as an angle, from 0 at its start to 2 pi, shape (n,)."""
-
     return 2.0 * pi * state.route_position / state.loop_length

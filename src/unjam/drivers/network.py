@@ -53,10 +53,7 @@ class Network:
         object.__setattr__(self, "_residual_weights", np.ascontiguousarray(last[:, 0]))
 
     def __call__(self, observation: Any) -> Any:
-        """Return the residual acceleration [m/s2], shape (n,); a float for a tuple.
-
-        `observation` is an array or a tensor of shape (n, inputs), or the inputs of a single CAV as a tuple.
-        """
+        """Return residual accelerations [m/s2], shape (n,), for inputs of shape (n, inputs); a float for a tuple."""
         if not isinstance(observation, (tuple, np.ndarray)):
             return self.authority * self._outputs_on_tensors(observation)[:, 0].tanh()
         tanh = math.tanh if isinstance(observation, tuple) else np.tanh

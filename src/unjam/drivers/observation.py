@@ -292,10 +292,7 @@ def feature(network_input: NetworkInput) -> Feature:
 
 
 def load_feature(file: FileReference) -> tuple[Feature, FileReference]:
-    """Return the feature in a user's file, and the reference with the hash of the code.
-
-    Raise `InputError` as `FileReference.load_object_once` does, or if the object is not a valid feature.
-    """
+    """Return the feature in a user's file, and the reference with the hash; `InputError` if one is invalid."""
     function, file = file.load_object_once()
     return _user_feature(UserFunction.from_object(function, "a LocalState", file)), file
 

@@ -154,7 +154,6 @@ class PolicyDriver(ExpertWrapper):
 
     def evaluate(self, observation: Any, memory: Memory) -> tuple[Array, Memory]:
         """Return the numbers of the policy, shape (n,), and its new memory; `InputError` unless numbers are finite."""
-
         rows, xp = len(observation), namespace(observation)
         answer, new_memory = self.policy(observation, memory)
         numbers = np.asarray(answer) if xp is np else xp.as_tensor(answer)

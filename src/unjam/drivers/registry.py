@@ -92,7 +92,6 @@ def is_serializable(driver: Driver) -> bool:
 
 def _is_portable(driver: Driver) -> bool:
     """Return whether other processes have the class of a driver: a registered class of unjam."""
-
     return type(driver) in DRIVER_CLASSES.values() and is_packaged(type(driver))
 
 

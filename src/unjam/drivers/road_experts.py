@@ -329,7 +329,6 @@ class GapMaker(JamAhead):
 
     def time_gaps(self, state: LocalState, memory: Memory) -> Array | None:
         """Return `merge_time_gap` for CAVs that open a gap, else NaN [s]."""
-
         gaps, distance = state.adjacent_gaps, state.distance_to_merge
         if gaps is None or distance is None:
             return None

@@ -151,10 +151,7 @@ class RoadSections:
         return np.concatenate([totals, totals[:, :, 1:].sum(2, keepdims=True)], 2)
 
     def speeds_ahead(self, means: Floats, lanes: NDArray[np.intp], positions: Floats, roads: Any = 0) -> list[Floats]:
-        """Return mean speeds of the sections ahead of n vehicles [m/s], each of shape (n, SECTIONS_AHEAD).
-
-        The first array is for the own lane, the second one for all lanes of the main road.
-        """
+        """Return mean speeds ahead [m/s] on the own lane and on all main lanes, both of shape (n, SECTIONS_AHEAD)."""
         own_sections = (positions // ROAD_SECTION_LENGTH).astype(np.intp).clip(0, self._shape[-1] - 1)
         sections = own_sections[:, None] + np.arange(SECTIONS_AHEAD)
         road_column = np.broadcast_to(roads, lanes.shape)[:, None]

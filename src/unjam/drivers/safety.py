@@ -289,8 +289,8 @@ class SafetyFilter(Subclassable):
 
     def _is_clearly_safe(self, speed: float, leader: float, gap: float, step: float) -> bool:
         """Return whether simple bounds prove that braking from a speed keeps standstill gap and time gap."""
-        # With speed v, braking b and step h, stopping distances are at least v (v / b - h) / 2, and at most b h h / 8
-        # longer.
+        # Stopping distances with braking b and step h are at least v (v / b - h) / 2, and at most b h h / 8 longer.
+
         half, square, leader_square = (leader - speed) * step / 2.0, speed * speed / 2.0, leader * leader / 2.0
         braking, own_braking, error = self.time_gap_braking, self.braking, step * step / 8.0
         final_change = leader_square / self.leader_braking - square / own_braking - half - own_braking * error
@@ -299,10 +299,7 @@ class SafetyFilter(Subclassable):
 
 
 def _steps_to_standstill(speed: Array, speed_change: float) -> int:
-    """Return the number of steps in which the fastest vehicle stops if each step reduces speed by `speed_change` [m/s].
-
-    The result for a traced graph is a constant, for `MAX_TRACED_SPEED`.
-    """
+    """Return the number of steps to standstill of the fastest vehicle, if each step reduces speed by `speed_change`."""
     if type(speed) is not float:
         torch = sys.modules.get("torch")
         is_traced = torch is not None and torch.compiler.is_compiling()
@@ -327,10 +324,7 @@ def actuate(
 
 
 class CAVActuation:
-    """Filters desired accelerations of CAVs, and applies them with delay and lag.
-
-    The actuator states are stored by the id of a CAV, or by one id for several CAVs if states are arrays.
-    """
+    """Filters desired accelerations of CAVs, and applies them with delay and lag; stores actuator states by CAV id."""
 
     def __init__(self, safety: SafetyFilter, actuator: Actuator, step: float) -> None:
         """Set filter and actuator of all CAVs; `step` is the simulation step [s]."""

@@ -48,8 +48,8 @@ class SensorReadings:
     def read_for_filter(self, cav_id: str, state: FollowingState) -> FollowingState:
         """Return the readings of a CAV for its safety filter, once in each simulation step, from its true `state`.
 
-        A missing reading assumes that the leader has braked with its maximum braking since the last reading. The state
-        contains numbers; with one id for several CAVs, it contains arrays.
+        A missing reading assumes that the leader has braked at its maximum since the last reading. `state` has numbers
+        for one CAV, or arrays for all CAVs of a common id.
         """
         sensors, generator, shape = self._sensors, self._filter_generator, np.shape(state.speed)
         leader = state.leader_speed + sensors.speed_error * generator.uniform(-1.0, 1.0, shape)
@@ -65,10 +65,7 @@ class SensorReadings:
         return FollowingState(state.speed, *((leader, gap) if shape else (float(leader), float(gap))))
 
     def read_for_driver(self, cav_ids: Sequence[str], state: LocalState) -> LocalState:
-        """Return the readings of CAVs for their drivers, from their true `state` (plain numbers for a single CAV).
-
-        A CAV with a missing reading uses its last reading.
-        """
+        """Return the readings of CAVs for their drivers, from the true `state`; the last readings for missing ones."""
         sensors, generator = self._sensors, self._driver_generator
         true_values = np.array([state.leader_gap, state.follower_gap, state.leader_speed, state.follower_speed])
         true_values = true_values.reshape(4, len(cav_ids))

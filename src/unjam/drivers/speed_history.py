@@ -102,7 +102,6 @@ def empty_window(n: int, window: float, time_step: float) -> SpeedWindow:
     `window` (n, steps): speeds of the last `window` seconds, zeros before the first speed; a new speed replaces the
     oldest one. `total` (n,): sum of these speeds. `count` (n,): number of speeds since the start.
     """
-
     if window / time_step > MAX_WINDOW_STEPS:
         raise invalid_value("window", window, f"at most {MAX_WINDOW_STEPS:,} steps of {time_step:g} s")
     steps = max(1, round(window / time_step))

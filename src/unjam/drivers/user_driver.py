@@ -62,10 +62,7 @@ class UserFunction:
 
     @classmethod
     def from_object(cls, candidate: Any, argument: str, reference: "FileReference | None" = None) -> "UserFunction":
-        """Return a function of this process, or of the file of `reference`; `InputError` if it is not a function.
-
-        The message says that functions take `argument`.
-        """
+        """Return a function of this process, or of the file of `reference`; `InputError` if it is not a function."""
         label = str(reference or object_label(candidate))
         if not callable(candidate) or inspect.isclass(candidate):
             raise InputError(f"{label}: is not a function of {argument}")
@@ -336,7 +333,6 @@ def as_driver(driver: DriverLike, time_step: float = FileDriver.time_step) -> Dr
 
 def _make_implementation(candidate: Any, time_step: float, label: str, parameters: dict[str, Any] | None = None) -> Any:
     """Return an object with `act` and `initial_memory` for an object, a class with `parameters`, or a function."""
-
     if inspect.isclass(candidate):
         try:
             step_parameter = {"time_step": time_step} if _takes_time_step(candidate) else {}

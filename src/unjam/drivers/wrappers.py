@@ -326,7 +326,6 @@ class QueueFallback(CompositeDriver):
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
         """Return the acceleration of the active driver, and the new memory; the fallback remembers no steps before."""
-
         new_memory = self._update_queue_memory(state, memory)
         gave_up = new_memory["gave_up"]
         if type(gave_up) is float:

@@ -287,10 +287,7 @@ def _group_errors(mean_squares: Floats, segments: Segments, groups: NDArray[np.i
 
 
 def calibrate_human_drivers(recordings: Iterable[LocalState], scenario: Scenario) -> IDMParameters:
-    """Calibrate the IDM to the followers of CAVs; without followers return the human drivers of the scenario.
-
-    Desired speed and minimum gap are those of the scenario, because slow traffic does not determine them.
-    """
+    """Calibrate the IDM to followers of CAVs, if any; slow traffic does not determine desired speed and minimum gap."""
     trajectories = trajectories_behind_cavs(recordings, scenario.control_step, scenario.steps_per_control_step)
     humans = scenario.humans
     if not trajectories:
