@@ -26,7 +26,6 @@ def to_sb3_vec_env(environment: VectorEnv[Any, Any, Any]) -> "SB3VecEnv":
 
     Raises:
         InputError: the environment starts the next episode in the step that ends an episode, or returns tensors.
-
         MissingPartError: Stable-Baselines3 is not installed.
     """
     if not isinstance(environment, VectorEnv):

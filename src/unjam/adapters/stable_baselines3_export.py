@@ -60,7 +60,6 @@ def stable_baselines3_bytes(driver: ResidualDriver, agent: str) -> bytes:
                 log_std_layer = (array[..., 1:] for array in network.layers[-1])
             for parameter, array in zip((actor.log_std.weight, actor.log_std.bias), log_std_layer, strict=True):
                 parameter.copy_(torch.as_tensor(array.T))
-
         if agent == "td3":
             model.actor_target.load_state_dict(actor.state_dict())
     model.unjam = {

@@ -115,5 +115,4 @@ def outside_domain_share(controller: Controller, states: LocalState) -> float:
         domain = build_dataclass(OperatingDomain, values, "certificate: domain")
     except (*UNREADABLE_ERRORS, InputError):  # `unjam verify` reports the error, which must not end a drive
         return 0.0
-
     return float(1.0 - np.mean(domain.contains(states)))

@@ -71,7 +71,6 @@ def string_gains(
 
     The simulation includes filter, limits and actuator of the driver. The CAV starts with the equilibrium gap of human
     drivers. The gain is NaN if it falls behind its leader: the gain of a vehicle that stands would be zero.
-
     """
     if not speeds:
         return np.zeros((0, len(OSCILLATION_FREQUENCIES)))

@@ -43,7 +43,6 @@ class PartCheck:
     status: CheckStatus
     """`checked`: the part is right; `absent`: the controller has no such part; `stated`: only its maker can know the
     part; `not checked`: the part could not be checked on this machine"""
-
     detail: str  # how the part was checked, or why it was not checked
 
 
@@ -242,5 +241,4 @@ def _max_error(source: str, actual: Floats, expected: Floats, tolerance: float, 
         row = int(np.argmax(~(errors <= tolerance)))
         answer_text, allowed = f"{source} answers {actual[row]:.9g} m/s2", f"{expected[row]:.9g} to {tolerance:g}"
         raise InputError(f"controller: {location.format(row)}: {answer_text}; allowed: {allowed}")
-
     return float(errors.max())

@@ -290,7 +290,6 @@ class SafetyFilter(Subclassable):
     def _is_clearly_safe(self, speed: float, leader: float, gap: float, step: float) -> bool:
         """Return whether simple bounds prove that braking from a speed keeps standstill gap and time gap."""
         # Stopping distances with braking b and step h are at least v (v / b - h) / 2, and at most b h h / 8 longer.
-
         half, square, leader_square = (leader - speed) * step / 2.0, speed * speed / 2.0, leader * leader / 2.0
         braking, own_braking, error = self.time_gap_braking, self.braking, step * step / 8.0
         final_change = leader_square / self.leader_braking - square / own_braking - half - own_braking * error
@@ -354,5 +353,4 @@ class CAVActuation:
         command, new_state = actuate(self._safety, actuator, acceleration, state, actuator_state, step)
         if self._has_lag:
             self._states[cav_id] = new_state
-
         return command, new_state.acceleration

@@ -38,7 +38,6 @@ class SensorReadings:
     def __init__(self, sensors: Sensors, leader_braking: float, step: float, seed: np.random.SeedSequence) -> None:
         """Set the maximum braking of leaders [m/s2] and the time between two readings, `step` [s], for all CAVs."""
         self._sensors, self._leader_speed_drop, self._step = sensors, leader_braking * step, step
-
         self._filter_generator, self._driver_generator = (
             np.random.default_rng(child_seed) for child_seed in seed.spawn(2)
         )
