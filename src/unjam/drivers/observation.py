@@ -155,8 +155,8 @@ class PolicyInput:
     optional: bool = False
     """whether the quantity may be NaN on roads without it: only for `loop_length` and `route_position`"""
     tensor: str = ""
-    """name of the ONNX input that has this quantity as its next column; empty: the input with the name of the quantity,
-    or the only input"""
+    """name of the ONNX input that has this quantity as its next column; if empty, the input with the name of the
+    quantity, or the only input"""
 
     def __post_init__(self) -> None:
         if self._field not in STATE_UNITS:
