@@ -42,7 +42,9 @@ def _as_doubles(answer: Any) -> Floats:
     return array.astype(np.float64, copy=False)
 
 
-def as_numbers(answer: Any, label: str, allowed: str = "", to_array: Callable[[Any], Array] = _as_doubles) -> Floats:
+def as_numbers(
+    answer: Any, label: str, allowed: str = "real numbers", to_array: Callable[[Any], Array] = _as_doubles
+) -> Floats:
     """Return an answer of the user's code, converted by `to_array`; raise `InputError` unless it is numbers."""
     try:
         return to_array(answer)
