@@ -219,7 +219,7 @@ def _range_text(values: Sequence[float], digits: int = 2) -> str:
 
 
 def _count_in_text(text: str) -> int:
-    """Return the number whose digits a text contains; 0 without digits."""
+    """Return the number with the digits in a text; 0 without digits."""
     return int("".join(digit for digit in text if digit.isdigit()) or 0)
 
 

@@ -60,7 +60,7 @@ def atomic_write(path: Path, content: bytes | str) -> None:
 
     The file has the permissions of the previous one.
     """
-    name, temporary = path.name or ".", f".{secrets.token_hex(8)}.part"  # nobody can guess it; see `is_leftover`
+    name, temporary = path.name or ".", f".{secrets.token_hex(8)}.part"  # impossible to guess; see `is_leftover`
     with _disk_errors(path), open_folder(path.parent) as folder:
         folder.check_writable(name)
         try:
@@ -178,11 +178,10 @@ def make_folder(path: Path) -> None:
 def claim_folder(folder: Path) -> bool:
     """Make a folder and its parents for this process alone; return False if the folder exists."""
     make_folder(folder.parent)
-    with suppress(OSError):  # the function that writes into it reports the reason
-        try:
-            folder.mkdir()
-        except FileExistsError:
-            return False
+    try:
+        folder.mkdir()
+    except OSError as error:  # the function that writes into the folder reports other reasons
+        return not isinstance(error, FileExistsError)
     return True
 
 

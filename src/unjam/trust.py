@@ -98,7 +98,7 @@ def expect_code(hashes: Mapping[str, str]) -> None:
 
 
 def expected_code_environment() -> dict[str, str]:
-    """Return the environment variable that tells a child the expected files and hashes of code."""
+    """Return the environment variable with the files and hashes of code that a child expects."""
     return {EXPECTED_CODE_VARIABLE: json.dumps([_checked_files, _expected_hashes])}
 
 

@@ -213,7 +213,7 @@ def _stamp(part: StudyPart) -> str:
 
 
 def _describe(value: Any) -> Any:
-    """Return a value whose text is the same in each process, with a hash for each controller."""
+    """Return a value with the same text in each process, and with a hash for each controller."""
     if isinstance(value, str | Path):
         return str(value), controller_hash(str(value))
     if isinstance(value, Mapping):

@@ -116,7 +116,7 @@ def main() -> None:
         if getattr(sys, stream) is None:  # else the next file that is opened replaces a closed stream
             setattr(sys, stream, open(os.devnull, mode))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # characters that the encoding lacks must not end a command
+        if isinstance(stream, TextIOWrapper):  # characters outside of the encoding must not end a command
             stream.reconfigure(errors="replace")
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_LineFormatter())

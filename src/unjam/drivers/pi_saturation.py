@@ -91,7 +91,7 @@ class PISaturation(FormulaDriver):
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class PIFromGap(PISaturation):
-    """PI with saturation whose mean speed starts with the speed of human drivers at its first gap.
+    """PI with saturation; its mean speed starts with the speed of human drivers at its first gap.
 
     `pi` starts slowly, because its mean starts with the speed zero of a stopped vehicle. If human drivers stand at
     equal gaps, the own gap determines the speed at which all vehicles can drive. After a warm-up the mean starts with a

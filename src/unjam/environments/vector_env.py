@@ -250,8 +250,8 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
             super().reset(seed=as_seed(seed)[0])
             return list(range(int(seed), int(seed) + self.num_envs))
         try:
-            seeds_or_none = [None] * self.num_envs if seed is None else seed
-            seeds = [None if seed is None else as_seed(index(seed))[0] for seed in seeds_or_none]
+            values = [None] * self.num_envs if seed is None else seed
+            seeds = [None if value is None else as_seed(index(value))[0] for value in values]
         except TypeError:
             raise invalid_value("seed", seed, "an integer, or one for each environment") from None
         if len(seeds) != self.num_envs:

@@ -162,9 +162,9 @@ class ControllerResult:
         comparisons = (self.difference_to_acc, ACC_BASELINE), (self.effect.travel_time, "the human baseline")
         change, baseline = max(
             comparisons,
-            key=lambda result: (
-                *(result[0].low > 0, result[0].mean >= 0, result[0].low <= 0 <= result[0].high),
-                result[0].half_width,
+            key=lambda comparison: (
+                *(comparison[0].low > 0, comparison[0].mean >= 0, comparison[0].low <= 0 <= comparison[0].high),
+                comparison[0].half_width,
             ),
         )
         seeds = f"with {format_count(change.count, 'test seed')}"

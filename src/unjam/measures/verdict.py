@@ -113,16 +113,14 @@ class Verdict:
 def verdicts(rows_by_driver: RowsByDriver, baseline: str = "") -> list[Verdict]:
     """Return the verdict on each driver but the baseline, empty: human drivers; none without this baseline."""
     reference = baseline or HUMAN_LABEL
-    verdicts = feasibility_by_driver(rows_by_driver) if rows_by_driver.get(reference) else {}
-    return [_verdict(label, rows_by_driver, reference, verdicts[label]) for label in verdicts if label != reference]
+    feasibility = feasibility_by_driver(rows_by_driver) if rows_by_driver.get(reference) else {}
+    others = [label for label in feasibility if label != reference]
+    return [_verdict(label, rows_by_driver, reference, feasibility[label]) for label in others]
 
 
 def _verdict(label: str, rows_by_driver: RowsByDriver, reference: str, feasible: str) -> Verdict:
-    rows, reference_rows, names = (
-        rows_by_driver[label],
-        rows_by_driver[reference],
-        road_metrics(rows_by_driver).compared,
-    )
+    rows, reference_rows = rows_by_driver[label], rows_by_driver[reference]
+    names = road_metrics(rows_by_driver).compared
     name_of_others = "human drivers" if reference == HUMAN_LABEL else reference
     checked = (*names, FUEL_METRIC) if names[0] == POWER_FUEL_METRIC else names
     differences = {name: paired_difference(rows, reference_rows, name) for name in checked}

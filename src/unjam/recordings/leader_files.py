@@ -25,7 +25,7 @@ VEHICLE_NAMES = {"pair", "id", "vehicle", "veh", "track", "car", "driver", "trip
 VEHICLE_NAMES |= {f"{name}id" for name in VEHICLE_NAMES}
 """columns of a table of speeds that identify its vehicles or drives, as `alphanumeric` returns them"""
 I24_COLUMNS = ("Time", "Velocity", "SpaceGap", "DrivingDir")
-"""columns of drives of the CIRCLES experiment on I-24, whose speeds are in km/h"""
+"""columns of drives of the CIRCLES experiment on I-24, with speeds in km/h"""
 MIN_SECONDS = 20.0
 """minimum duration of a recording [s]"""
 MAX_ACCELERATION = 8.0

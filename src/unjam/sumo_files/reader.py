@@ -19,7 +19,7 @@ OUTPUT_ELEMENTS = {"edgeData", "laneData", "vTypeProbe", "timedEvent", "instantI
 """elements that only write files"""
 DETECTOR_SUFFIXES = ("Detector", "inductionLoop", "routeProbe", "detector")
 """suffixes of elements that are detectors of traffic lights and calibrators; in copies, they write no file"""
-EXTERNAL_ELEMENTS = ("calibrator", "variableSpeedSign")  # elements whose content may be in another file: `file`
+EXTERNAL_ELEMENTS = ("calibrator", "variableSpeedSign")  # elements that may name a file with their content: `file`
 _ELEMENTS = """
 routes route-alternatives additional add data meandata detectors tlLogics taz tazs types stops connections edges
 include param vType vTypeDistribution type route routeDistribution vehicle trip flow stop interval edge lane

@@ -83,7 +83,7 @@ def check_file_hashes(stored: dict[str, Any], current: dict[str, Any], command: 
 
 
 def _check_tables(stored: Any, command: str) -> None:
-    """Raise `InputError` if a stored value lacks the tables of a fingerprint."""
+    """Raise `InputError` unless a stored value has the tables of a fingerprint."""
     tables = ("settings", "files", "packages", "kernels")
     has_tables = isinstance(stored, dict) and all(isinstance(stored.get(name), dict) for name in tables)
     if not has_tables or not all(isinstance(sha256, str) for sha256 in stored["files"].values()):

@@ -282,7 +282,7 @@ def _random_outcome(rows: slice, vehicles: int = 6, cavs: int = 2) -> Outcome:
     speeds, accelerations = generator.uniform(0, 20, (PROBE_ROWS, vehicles)), generator.normal(size=(PROBE_ROWS, cavs))
     time_gaps, crashed = generator.uniform(0.5, 3, (PROBE_ROWS, cavs)), np.arange(PROBE_ROWS) == 1
     numbers = speeds, accelerations, time_gaps, crashed, 10 * speeds[:, 0], speeds[:, :cavs]
-    return Outcome(*(number[rows] for number in numbers))
+    return Outcome(*(values[rows] for values in numbers))
 
 
 def episode_reward_terms(

@@ -154,7 +154,7 @@ def _edge_attributes(edge: Edge, default_speed_limit: float) -> XMLAttributes:
 
 
 def xml_document(root: str, tag: str, elements: Iterable[XMLAttributes]) -> str:
-    """Return an XML document whose elements all have one tag."""
+    """Return an XML document of elements with one tag."""
     return "\n".join([f"<{root}>", *(xml_element(tag, **attributes) for attributes in elements), f"</{root}>"])
 
 

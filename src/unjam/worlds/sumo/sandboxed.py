@@ -69,7 +69,7 @@ def _process_starter(process: int) -> ThreadPoolExecutor:
 
 
 _process_starter_lock = Lock()
-"""prevents a second such thread, whose processes would end with its executor"""
+"""prevents a second such thread: its processes would end with its executor"""
 
 
 class SandboxedSimulation(AbstractContextManager["SandboxedSimulation"]):

@@ -251,7 +251,7 @@ class MotorwayBatch:
     def _exact_state(self) -> LocalState:
         traffic, vehicles = self._traffic, self._traffic.vehicles
         rows, geometry = self._cav_rows(), traffic.geometry
-        roads, _, lane, position, speed = (vehicle[rows] for vehicle in vehicles[:5])
+        roads, _, lane, position, speed = (column[rows] for column in vehicles[:5])
         motion = vehicles.position, vehicles.speed, np.broadcast_to(geometry.vehicle_length, vehicles.speed.shape)
         own, left, right = (observe_lane(traffic.neighbors, rows, lane + offset, *motion) for offset in (0, 1, -1))
         limit = geometry.speed_limits(lane, geometry.sections(lane, position))

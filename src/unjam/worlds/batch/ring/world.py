@@ -82,7 +82,7 @@ class RingBatch:
         draws all noise, or each road that of SUMO's episode. `human_model` replaces SUMO's IDM away from junctions.
         """
         scenario = self.scenario = scenarios[0]
-        drawn = [column.draw_from_seed(seed) for column, seed in zip(scenarios, seeds, strict=True)]
+        drawn = [ring.draw_from_seed(seed) for ring, seed in zip(scenarios, seeds, strict=True)]
         roads, generator_seeds = [cast(OrderedRoad, road) for road, _ in drawn], [others for _, others in drawn]
         self._scenarios, self._seeds, self._keep_record, self._to_array = scenarios, seeds, keep_record, to_array
         self.roads, self._is_controlled = roads, False
