@@ -144,22 +144,22 @@ def mandatory_lane_changes(
     rows = np.arange(len(position))[is_urgent]
     if len(rows) == 0:
         return vehicles, is_urgent, is_asked
-    own_advice_after, cooperative = vehicles.own_advice.copy(), vehicles.cooperative_advice.copy()
+    advice_after, cooperative = vehicles.lane_change_advice.copy(), vehicles.cooperative_advice.copy()
     bias = vehicles.speed_bias.copy()
     merging = _MergingVehicles(vehicles, context, geometry, rows)
     leader, follower = merging.leader, merging.follower
-    planned, own_advice, overtakes = merging.plan_with_leader()
+    planned, lane_change_advice, overtakes = merging.plan_with_leader()
     is_blocked = merging.is_leader_blocking & leader.is_present
     bias[leader.row[is_blocked]] = 1.0
     overtakes_leader = is_blocked & overtakes
     np.minimum.at(cooperative, leader.row[overtakes_leader], 0.0 * merging.speed[overtakes_leader])
     is_request, speeds, more_advice, asks_for_change = merging.request_from_follower(planned, ~overtakes_leader)
-    own_advice_after[rows] = np.minimum(own_advice, more_advice)
+    advice_after[rows] = np.minimum(lane_change_advice, more_advice)
     np.minimum.at(cooperative, follower.row[is_request], (speeds - follower.speed)[is_request] / step)
     is_asked[follower.row[asks_for_change]] = True
     stuck_rows = rows[np.logical_or(merging.is_leader_blocking, merging.is_follower_blocking)]
     bias[stuck_rows] = 1.0
-    vehicles = vehicles._replace(own_advice=own_advice_after, cooperative_advice=cooperative, speed_bias=bias)
+    vehicles = vehicles._replace(lane_change_advice=advice_after, cooperative_advice=cooperative, speed_bias=bias)
     return _yield_to_stuck(vehicles, context, geometry, stuck_rows), is_urgent, is_asked
 
 
@@ -237,10 +237,10 @@ class _MergingVehicles:
         way = clamp_min(way + self._drivers.secure_gap(planned_speed, passing), 0.0)
         own_speed = np.maximum(passing - way / seconds, speed - step * self._braking)
         is_blocked = may_ask & self.is_follower_blocking
-        own_advice = np.where(is_blocked & is_passed, (own_speed - speed) / step, NO_ADVICE)
+        lane_change_advice = np.where(is_blocked & is_passed, (own_speed - speed) / step, NO_ADVICE)
         keeps_gap = may_ask & ~self.is_follower_blocking & self.is_leader_blocking
         keeping = follower_speed(planned_speed - follower_speed(planned_speed))
-        return is_blocked | keeps_gap, np.where(is_blocked, requested, keeping), own_advice, is_blocked
+        return is_blocked | keeps_gap, np.where(is_blocked, requested, keeping), lane_change_advice, is_blocked
 
 
 def _yield_to_stuck(

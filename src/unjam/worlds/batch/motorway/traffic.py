@@ -265,7 +265,7 @@ class BatchMotorways:
         )
         desired = np.where(vehicles.is_eidm, desired, highest)
         patched, is_advised = desired, speed < 0.0
-        for advice in (vehicles.own_advice, vehicles.cooperative_advice, vehicles.adjacent_advice):
+        for advice in (vehicles.lane_change_advice, vehicles.cooperative_advice, vehicles.adjacent_advice):
             advised = speed + advice * step
             is_possible = (advised >= lowest) & (advised <= highest)
             patched = np.where(is_possible, np.minimum(advised, patched), patched)

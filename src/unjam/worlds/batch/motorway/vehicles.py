@@ -19,7 +19,7 @@ from unjam.worlds.lane_neighbors import NO_VEHICLE
 NUMBERS_PER_ROAD = 100_000
 """more than the vehicles that enter a road in an episode"""
 NO_ADVICE = 1e6
-ADVICE_FIELDS = ("own_advice", "cooperative_advice", "adjacent_advice")
+ADVICE_FIELDS = ("lane_change_advice", "cooperative_advice", "adjacent_advice")
 MIN_IDM_STOP_DISTANCE = 0.01
 """distance below which an IDM stands [m]"""
 
@@ -65,7 +65,7 @@ class MotorwayVehicles(NamedTuple):
     """accumulated obligation to keep right, negative"""
     look_ahead_speed: Array
     """smoothed speed that determines the look-ahead distance of mandatory changes"""
-    own_advice: Array
+    lane_change_advice: Array
     """acceleration that helps the own change [m/s2]; `NO_ADVICE`: none"""
     cooperative_advice: Array
     adjacent_advice: Array
