@@ -35,29 +35,29 @@ class TrafficLog:
     def __init__(self) -> None:
         self.names: list[str] = []
         self.snapshot_stride = 1
-        self._vehicle_numbers: dict[str, int] = {}
-        self._current_numbers: NDArray[np.int32] = np.zeros(0, np.int32)
-        self._numbers_by_moment: list[NDArray[np.int32]] = []
+        self._vehicle_indices: dict[str, int] = {}
+        self._current_indices: NDArray[np.int32] = np.zeros(0, np.int32)
+        self._indices_by_moment: list[NDArray[np.int32]] = []
         self._speeds: list[Floats] = []
         self._snapshots: dict[int, dict[str, Any]] = {}
         self._snapshot_vehicle_count = 0
 
     def __len__(self) -> int:
-        return len(self._numbers_by_moment)
+        return len(self._indices_by_moment)
 
     @property
     def vehicle_ids(self) -> tuple[str, ...]:
         """All vehicles, in order of entry."""
-        return tuple(self._vehicle_numbers)
+        return tuple(self._vehicle_indices)
 
     def add(self, names: Sequence[str], speeds: Any) -> None:
         """Add a moment: the vehicles on the road, and their speeds [m/s]."""
         if names != self.names:  # rarely: otherwise both moments share an array
             self.names = list(names)
             for name in names:
-                self._vehicle_numbers.setdefault(name, len(self._vehicle_numbers))
-            self._current_numbers = np.array(list(map(self._vehicle_numbers.__getitem__, names)), np.int32)
-        self._numbers_by_moment.append(self._current_numbers)
+                self._vehicle_indices.setdefault(name, len(self._vehicle_indices))
+            self._current_indices = np.array(list(map(self._vehicle_indices.__getitem__, names)), np.int32)
+        self._indices_by_moment.append(self._current_indices)
         self._speeds.append(np.array(speeds, np.float64))
 
     @property
@@ -74,14 +74,14 @@ class TrafficLog:
             self._snapshots = {
                 time: snapshot for time, snapshot in self._snapshots.items() if time % self.snapshot_stride == 0
             }
-            self._snapshot_vehicle_count = sum(len(self._numbers_by_moment[time]) for time in self._snapshots)
+            self._snapshot_vehicle_count = sum(len(self._indices_by_moment[time]) for time in self._snapshots)
 
     def columns(self, groups: Sequence[Hashable]) -> NDArray[np.intp]:
         """Return a column for each vehicle, given the groups of vehicles that may share columns, in order of entry."""
         if len(self) * len(groups) <= MAX_UNSHARED_CELLS:
             return np.arange(len(groups))
         first, last = np.full(len(groups), len(self)), np.zeros(len(groups), int)
-        for time, row in enumerate(self._numbers_by_moment):
+        for time, row in enumerate(self._indices_by_moment):
             first[row], last[row] = np.minimum(first[row], time), time
         return assign_columns(first, last, groups, max(self.snapshot_stride, len(self) // SHARED_COLUMN_FRAMES))
 
@@ -97,7 +97,7 @@ class TrafficLog:
         shape = next((np.shape(values)[1:] for values in values_by_moment.values()), ())
         table = np.full((len(values_by_moment), int(columns.max(initial=-1)) + 1, *shape), np.nan)
         for row, (time, values) in enumerate(values_by_moment.items()):
-            table[row, columns[self._numbers_by_moment[time]]] = values
+            table[row, columns[self._indices_by_moment[time]]] = values
         return table
 
 

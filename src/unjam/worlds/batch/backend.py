@@ -11,7 +11,7 @@ from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import WorldOptions, check_support
-from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD
+from unjam.worlds.batch.motorway.vehicles import KEYS_PER_ROAD
 from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.ring.recorded import RecordedBatch
 from unjam.worlds.batch.ring.world import RingBatch
@@ -95,7 +95,7 @@ class SingleMotorway(_SingleRoad, MotorwayBatch):
     @property
     def cav_ids(self) -> list[str]:
         """The CAVs on the road now, in order of entry."""
-        return [self.road.entries[number % NUMBERS_PER_ROAD].name for number in self._cav_numbers.tolist()]
+        return [self.road.entries[key % KEYS_PER_ROAD].name for key in self._cav_keys.tolist()]
 
     @property
     def speeds(self) -> Floats:

@@ -14,7 +14,7 @@ from unjam.physics.arrays import Floats
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.worlds import audit, record
-from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, MotorwayVehicles
+from unjam.worlds.batch.motorway.vehicles import KEYS_PER_ROAD, MotorwayVehicles
 from unjam.worlds.world import DriverLog
 
 Integers = NDArray[np.intp]
@@ -45,7 +45,7 @@ class MotorwayLog:
         self.end_steps = np.full(len(roads), NO_END_STEP)
         """control step after which vehicles touched on each road, or `NO_END_STEP`"""
         self._placements, self.states = list[_Placements](), list[LocalState]()
-        self.backlogs, self._cav_numbers = list[Integers](), list[Integers]()
+        self.backlogs, self._cav_keys = list[Integers](), list[Integers]()
         self._arrivals, self._braking = np.zeros(len(roads), np.intp), audit.BrakingLog(1.0)
         shape = len(roads), max(len(road.entries) for road in roads)
         self._leader, self._leader_since = np.full((2, *shape), -1)
@@ -83,13 +83,13 @@ class MotorwayLog:
         self._braking.add(vehicles.acceleration[counted], driver)
 
     def record_control_step(
-        self, vehicles: MotorwayVehicles, gaps: Floats, backlog: Integers, cav_numbers: Integers, states: LocalState
+        self, vehicles: MotorwayVehicles, gaps: Floats, backlog: Integers, cav_keys: Integers, states: LocalState
     ) -> None:
         """Record the positions of all vehicles after a control step, and what the CAVs observe."""
         step_index = np.full(len(gaps), len(self._placements))
         self._placements.append(_Placements(step_index, *vehicles[:5], gaps))
         self.backlogs.append(backlog)
-        self._cav_numbers.append(cav_numbers)
+        self._cav_keys.append(cav_keys)
         self.states.append(states)
 
     def make_episodes(self, driver_log: DriverLog, seeds: Sequence[Sequence[int]]) -> tuple[record.Episode, ...]:
@@ -111,17 +111,17 @@ class MotorwayLog:
 
     def _trips(self, driver_log: DriverLog) -> list[list[record.Trajectory]]:
         """Return the trips of the CAVs on each road that last at least one control step, in order of entry."""
-        counts = [len(cav_number) for cav_number in self._cav_numbers]
+        counts = list(map(len, self._cav_keys))
         step_index = np.repeat(np.arange(len(counts)), counts)
         row = np.concatenate([np.arange(count) for count in counts])
-        numbers = np.concatenate(self._cav_numbers)
-        order = np.argsort(numbers, kind="stable")
-        groups = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1) if len(order) else []
+        keys = np.concatenate(self._cav_keys)
+        order = np.argsort(keys, kind="stable")
+        groups = np.split(order, np.flatnonzero(np.diff(keys[order])) + 1) if len(order) else []
         first, *others = self.states
         states = first.map(lambda *values: np.concatenate(values), *others)
         trips: list[list[record.Trajectory]] = [[] for _ in self._roads]
         for entry_number, rows in enumerate(sorted(groups, key=lambda group: group[0])):
-            road, entry = divmod(int(numbers[rows[0]]), NUMBERS_PER_ROAD)
+            road, entry = divmod(int(keys[rows[0]]), KEYS_PER_ROAD)
             end = self.end_steps[road]
             rows = rows[step_index[rows] <= end]
             if len(rows) < 2:

@@ -16,8 +16,8 @@ from unjam.worlds.batch.motorway import eidm
 from unjam.worlds.batch.motorway.eidm import DesiredSpeed, DriverErrors, LeaderMotion
 from unjam.worlds.lane_neighbors import NO_VEHICLE
 
-NUMBERS_PER_ROAD = 100_000
-"""more than the vehicles that enter a road in an episode"""
+KEYS_PER_ROAD = 100_000
+"""number of keys for the vehicles of one road: more than enter it in an episode"""
 NO_ADVICE = 1e6
 ADVICE_FIELDS = ("lane_change_advice", "cooperative_advice", "adjacent_advice")
 MIN_IDM_STOP_DISTANCE = 0.01
@@ -184,19 +184,19 @@ def _idm_stop_speed(speed: Array, distance: Array, parameters: IDMArrays, step: 
     return _idm_follow_speed(speed, distance, 0.0 * speed, near, step) * (distance >= MIN_IDM_STOP_DISTANCE)
 
 
-def vehicle_numbers(vehicles: MotorwayVehicles, rows: Any = slice(None)) -> Array:
-    """Return road and entry of vehicles as one number, by default of all."""
-    return vehicles.road[rows] * NUMBERS_PER_ROAD + vehicles.entry[rows]
+def vehicle_keys(vehicles: MotorwayVehicles, rows: Any = slice(None)) -> Array:
+    """Return a key for each vehicle in `rows`: the index of its road and that of its entry as one integer."""
+    return vehicles.road[rows] * KEYS_PER_ROAD + vehicles.entry[rows]
 
 
-def find_rows(numbers: Array, vehicles: MotorwayVehicles, candidates: Array) -> Array:
-    """Return the rows of the vehicles with these numbers among rows; `NO_VEHICLE` for those that are not there."""
+def find_rows(keys: Array, vehicles: MotorwayVehicles, candidates: Array) -> Array:
+    """Return the row of the vehicle with each key among the rows `candidates`; `NO_VEHICLE` if it is not there."""
     if not len(candidates):
-        return 0 * numbers + NO_VEHICLE
-    keys = vehicle_numbers(vehicles, candidates)
-    order = keys.argsort()
-    rows = order[np.searchsorted(keys[order], numbers).clip(0, len(keys) - 1)]
-    return np.where(keys[rows] == numbers, candidates[rows], NO_VEHICLE)
+        return 0 * keys + NO_VEHICLE
+    candidate_keys = vehicle_keys(vehicles, candidates)
+    order = candidate_keys.argsort()
+    rows = order[np.searchsorted(candidate_keys[order], keys).clip(0, len(order) - 1)]
+    return np.where(candidate_keys[rows] == keys, candidates[rows], NO_VEHICLE)
 
 
 def sorted_rows(vehicles: MotorwayVehicles) -> Array:

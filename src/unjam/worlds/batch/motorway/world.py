@@ -17,7 +17,7 @@ from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.worlds.batch.human_idm import CONTACT_GAP
 from unjam.worlds.batch.motorway.record import NO_END_STEP, MotorwayLog
 from unjam.worlds.batch.motorway.traffic import NO_SPEED_CAP, BatchMotorways, LearnedCorrection, enable_acc
-from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD, find_rows, vehicle_numbers
+from unjam.worlds.batch.motorway.vehicles import KEYS_PER_ROAD, find_rows, vehicle_keys
 from unjam.worlds.batch.noise import ArrayFactory, DrawNormal
 from unjam.worlds.lane_neighbors import neighbors_on_lane, observe_lane
 from unjam.worlds.record import Episode
@@ -81,8 +81,8 @@ class MotorwayBatch:
         self._messages = RoadsideMessages(first.roadside, control_step, self._human_generators[0])
         self.limits, self.control_steps = scenario.acceleration_limits, 0
         self.entered_count, self.cav_count = 0, 0
-        self._cav_numbers: NDArray[np.intp] = np.zeros(0, np.intp)
-        """road and entry of each CAV as one number, in order of entry"""
+        self._cav_keys: NDArray[np.intp] = np.zeros(0, np.intp)
+        """key of each CAV on a road, in order of entry; see `vehicle_keys`"""
         self._cav_entry_counts = np.zeros(len(seeds))
         self._start_steps = np.zeros(len(seeds), np.intp)
         """number of control steps of the batch before the episode of each road"""
@@ -118,7 +118,7 @@ class MotorwayBatch:
     @property
     def cav_roads(self) -> NDArray[np.intp]:
         """The index of the road of each CAV, shape (CAVs,)."""
-        return self._cav_numbers // NUMBERS_PER_ROAD
+        return self._cav_keys // KEYS_PER_ROAD
 
     def values_of_cavs(self, values: Array) -> Array:
         """Return for each CAV the value of its road; values have the shape (W,)."""
@@ -157,7 +157,7 @@ class MotorwayBatch:
         Both keep no record and have the same scenario, without detectors, whose intervals are those of the batch.
         """
         rows = np.flatnonzero(~np.isin(self.cav_roads, roads))
-        self._cav_numbers, self.cav_count = self._cav_numbers[rows], len(rows)
+        self._cav_keys, self.cav_count = self._cav_keys[rows], len(rows)
         self._local_state = self._local_state.select(rows).as_read_only()
         for own, other in zip(roads, source_roads, strict=True):
             self.roads[own] = source.roads[other]
@@ -198,13 +198,13 @@ class MotorwayBatch:
     def _cav_rows(self) -> NDArray[np.intp]:
         """Return the rows of the CAVs among the vehicles; `NO_VEHICLE` for those that have left."""
         vehicles = self._traffic.vehicles
-        return find_rows(self._cav_numbers, vehicles, np.flatnonzero(self._is_cav[vehicles.road, vehicles.entry]))
+        return find_rows(self._cav_keys, vehicles, np.flatnonzero(self._is_cav[vehicles.road, vehicles.entry]))
 
     def _set_time_gaps(self, command: Command | None) -> None:
         """Set the time gaps of the CAVs' ACCs from the first command of one on, by default that of the scenario."""
         self._has_time_gap_commands |= command is not None and command.time_gap is not None
         if self._has_time_gap_commands:
-            names = [str(number) for number in self._cav_numbers]
+            names = [str(key) for key in self._cav_keys]
             time_gaps = commanded_time_gaps(command, self.scenario.cruise.time_gap, names, self.control_steps)
             rows = self._cav_rows()
             self._traffic.vehicles = self._traffic.vehicles.replace_rows(rows, time_headway=time_gaps)
@@ -227,12 +227,12 @@ class MotorwayBatch:
         traffic, vehicles = self._traffic, self._traffic.vehicles
         is_cav = self._is_cav[vehicles.road, vehicles.entry]
         cav_rows = np.flatnonzero(is_cav)
-        remains = find_rows(self._cav_numbers, vehicles, cav_rows) >= 0
-        new = cav_rows[~np.isin(vehicle_numbers(vehicles, cav_rows), self._cav_numbers)]
-        new = new[np.argsort(vehicle_numbers(vehicles, new), kind="stable")]
+        remains = find_rows(self._cav_keys, vehicles, cav_rows) >= 0
+        new = cav_rows[~np.isin(vehicle_keys(vehicles, cav_rows), self._cav_keys)]
+        new = new[np.argsort(vehicle_keys(vehicles, new), kind="stable")]
         self.remaining_rows = np.flatnonzero(remains).tolist() if len(new) or not remains.all() else None
-        self._cav_numbers = np.concatenate([self._cav_numbers[remains], vehicle_numbers(vehicles, new)])
-        self.entered_count, self.cav_count = self.entered_count + len(new), len(self._cav_numbers)
+        self._cav_keys = np.concatenate([self._cav_keys[remains], vehicle_keys(vehicles, new)])
+        self.entered_count, self.cav_count = self.entered_count + len(new), len(self._cav_keys)
         if self._is_controlled and len(new):
             vehicles = traffic.vehicles = enable_acc(vehicles, new, self.scenario.cruise)
         self._cav_entry_counts += np.bincount(vehicles.road[new], minlength=len(self.roads))
@@ -246,7 +246,7 @@ class MotorwayBatch:
         self._log.end_steps[touching] = np.minimum(self._log.end_steps[touching], self.control_steps)
         self.backlogs = traffic.insertion_queue.backlog(traffic.time - self.scenario.simulation_step)
         if self._keep_record:
-            self._log.record_control_step(vehicles, gaps, self.backlogs, self._cav_numbers, self._local_state)
+            self._log.record_control_step(vehicles, gaps, self.backlogs, self._cav_keys, self._local_state)
 
     def _exact_state(self) -> LocalState:
         traffic, vehicles = self._traffic, self._traffic.vehicles
