@@ -32,7 +32,7 @@ class BatchKind:
     """How batches simulate the scenarios of one class."""
 
     world: type[RingBatch] | type[MotorwayBatch]
-    reason: Callable[[Any], str]
+    unsupported_reason: Callable[[Any], str]
     """returns why a batch cannot simulate a scenario of this class; empty if it can"""
     is_exact: bool = False
     """whether episodes equal SUMO's except for rounding; otherwise they do in distribution"""
@@ -56,7 +56,7 @@ def statistically_unsupported_reason(scenario: Scenario) -> str:
     on-ramps, all vehicles change lanes at once, and drivers' errors are other draws.
     """
     if kind := batch_kind(scenario):
-        return kind.reason(scenario)
+        return kind.unsupported_reason(scenario)
     base = next((base for base in BATCH_KINDS if isinstance(scenario, base)), None)
     return unread_reason(scenario, base or Ring, [field.name for field in fields(scenario)])
 
