@@ -174,7 +174,7 @@ def run_batches(
     for index, task in enumerate(tasks):
         size = support.required_batch_kind(task.scenario).max_roads
         suitable = (
-            batch for batch in batches if len(batch) < size and _can_share_batch(task, next(iter(batch.values())))
+            batch for batch in batches if len(batch) < size and _tasks_can_share_batch(task, next(iter(batch.values())))
         )
         batch = next(suitable, None)
         if batch is None:
@@ -183,7 +183,7 @@ def run_batches(
     episodes: dict[int, Episode] = {}
     for batch in batches:
         batch_tasks = list(batch.values())
-        later = [task for task in upcoming if _can_share_batch(task, batch_tasks[0])]
+        later = [task for task in upcoming if _tasks_can_share_batch(task, batch_tasks[0])]
         episodes |= zip(batch, run_batch(batch_tasks, upcoming=later, allow_statistical=allow_statistical), strict=True)
     return [episodes[index] for index in range(len(tasks))]
 
@@ -211,7 +211,7 @@ def _shared_settings(task: EpisodeTask) -> tuple[object, ...]:
     return task.driver if is_indivisible else None, task.reward, explore
 
 
-def _can_share_batch(first: EpisodeTask, second: EpisodeTask) -> bool:
+def _tasks_can_share_batch(first: EpisodeTask, second: EpisodeTask) -> bool:
     has_equal_drivers = support.required_batch_kind(first.scenario).has_own_drivers or first.driver == second.driver
     has_equal_settings = _shared_settings(first) == _shared_settings(second)
-    return has_equal_drivers and has_equal_settings and support.differ_only_in_size(first.scenario, second.scenario)
+    return has_equal_drivers and has_equal_settings and support.can_share_batch(first.scenario, second.scenario)

@@ -138,10 +138,10 @@ def required_batch_kind(scenario: Scenario) -> BatchKind:
     return kind
 
 
-def differ_only_in_size(first: Scenario, second: Scenario) -> bool:
-    """Return whether scenarios differ at most in the size of their roads, so that they can share a batch."""
-    size = getattr(first, "size_parameter", "")
-    shared = (field.name for field in fields(first) if field.name != size)
+def can_share_batch(first: Scenario, second: Scenario) -> bool:
+    """Return whether two scenarios can share a batch: they differ at most in the size of their roads."""
+    size_parameter = getattr(first, "size_parameter", "")
+    shared = (field.name for field in fields(first) if field.name != size_parameter)
     return type(first) is type(second) and all(getattr(first, name) == getattr(second, name) for name in shared)
 
 
@@ -151,5 +151,5 @@ def check_batch_scenarios(scenarios: Sequence[Scenario], allow_statistical: bool
     for scenario in scenarios:
         if reason := reason_of(scenario):
             raise InputError(f"batch: {reason}")
-        if not differ_only_in_size(scenario, scenarios[0]):
+        if not can_share_batch(scenario, scenarios[0]):
             raise InputError("batch: the scenarios differ in more than their lengths")
