@@ -59,10 +59,9 @@ class CheckedWorld:
 
     def __init__(self, world: Any, label: str, scenario: Scenario) -> None:
         self._world, self._label, self._scenario = world, label, scenario
-        undefined = {"loop_length"} if not scenario.is_closed else set[str]()
-        self._finite_fields = (
-            set(COMMON_FIELDS) - undefined - (set() if scenario.has_coordinate else {"route_position"})
-        )
+        may_be_nan = set[str]() if scenario.is_closed else {"loop_length"}
+        may_be_nan |= set() if scenario.has_coordinate else {"route_position"}
+        self._finite_fields = set(COMMON_FIELDS) - may_be_nan
         self._step_count = 0
 
     def __getattr__(self, name: str) -> Any:
