@@ -65,7 +65,7 @@ def loop_state(
         loop_length if type(position) is float else np.full(position.shape, loop_length),
     )
     if loop_length == inf:
-        state = without_loop(state)
+        state = as_open_road_state(state)
     if penetration_rate is not None:
         state = state._replace(penetration_rate=speed * 0.0 + penetration_rate)
     if not crossings:
@@ -75,11 +75,11 @@ def loop_state(
     return state._replace(distance_to_crossing=nearest)
 
 
-def without_loop(state: LocalState) -> LocalState:
+def as_open_road_state(state: LocalState) -> LocalState:
     """Return a state computed on an infinite loop as a state on a road with ends."""
     speed, gap = state.speed, state.follower_gap
-    follower = observe_neighbor(gap < inf, gap, state.follower_speed, speed)
-    return state._replace(follower_speed=follower[0], follower_gap=follower[1], loop_length=speed * nan)
+    follower_speed, follower_gap = observe_neighbor(gap < inf, gap, state.follower_speed, speed)
+    return state._replace(follower_speed=follower_speed, follower_gap=follower_gap, loop_length=speed * nan)
 
 
 def poses_along(outline: Floats, positions: Floats, loop_length: float) -> Floats:

@@ -180,7 +180,7 @@ class _Worker:
         return process
 
     def run(self, task: EpisodeTask, code: dict[str, str], on_progress: Callable[[int], object]) -> Episode:
-        """Return the episode of a task with these hashes of its code; raise `_WorkerLostError` if the process is lost."""
+        """Return the episode of a task, given hashes of its code; raise `_WorkerLostError` if the process is lost."""
         was_sandboxed, self._is_sandboxed = self._is_sandboxed, task.scenario.reads_user_files
         if was_sandboxed and not self._is_sandboxed:  # a process cannot leave its sandbox
             self._kill()

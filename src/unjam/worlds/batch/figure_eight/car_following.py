@@ -10,7 +10,7 @@ from unjam.physics.arrays import Array, clamp_max, clamp_min, namespace, square_
 from unjam.physics.idm import IDMArrays, IDMParameters, fast_power, idm_acceleration
 from unjam.physics.kinematics import HALTING_SPEED, max_speed_to_stop, next_speed, stopping_distance
 from unjam.scenarios.scenario import MIN_CAV_GAP, SUMO_ACCELERATION, Scenario
-from unjam.worlds.batch.human_idm import EMERGENCY_BRAKING, SUMO_MIN_GAP, look_ahead_distance, without_minimum_gap
+from unjam.worlds.batch.human_idm import EMERGENCY_BRAKING, SUMO_MIN_GAP, look_ahead_distance, set_zero_minimum_gap
 from unjam.worlds.batch.noise import ArrayFactory
 
 COMMANDED_HUMAN_BRAKING = 4.5
@@ -34,7 +34,7 @@ class CarFollowingModels:
             exponent=scenario.humans.exponent,
             minimum_gap=1e-9,
         )
-        self._humans_before_stop = without_minimum_gap(self._humans)
+        self._humans_before_stop = set_zero_minimum_gap(self._humans)
 
         def make_column(human: float, cav: float) -> Array:
             column = np.full((vehicle_count, 1), human)
