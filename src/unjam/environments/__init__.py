@@ -15,11 +15,12 @@ ENVIRONMENT_ARGUMENTS = {
         f"unjam/{name}-v1": {"scenario": f"{FAMILY_PREFIX}{name}"} | ({"cavs": 1} if "cavs" in road.options else {})
         for name, road in FAMILY.items()
     },
-}  # arguments of `RoadEnv`, by the Gymnasium id of the environment; closed roads of benchmarks have one CAV there
+}
+"""arguments of `RoadEnv` by Gymnasium id; closed benchmark roads have one CAV"""
 
 
 def register_environments() -> None:
-    """Register the environments with Gymnasium; their module is imported when one is made."""
+    """Register the environments with Gymnasium, which imports their module when it makes the first environment."""
     for name, arguments in ENVIRONMENT_ARGUMENTS.items():
         if name not in registry:
             vector = "unjam.environments.slotted_vector_env:make_vector_env"

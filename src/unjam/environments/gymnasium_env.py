@@ -1,4 +1,4 @@
-"""A scenario with external actions, and with one CAV as a Gymnasium environment."""
+"""A Gymnasium environment of a scenario with one CAV, and the steps of scenarios for all environments."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -47,17 +47,17 @@ T = TypeVar("T")
 
 
 class CopyableLock:
-    """A reentrant lock; copies of its owner get their own."""
+    """A reentrant lock; a copy of its owner gets a new lock."""
 
     def __init__(self) -> None:
-        self.held = RLock()
+        self.rlock = RLock()
 
     def __reduce__(self) -> tuple[type[Self], tuple[()]]:
         return type(self), ()
 
 
 class CopiedWhole:
-    """An object of which shallow copies are deep: two environments never share a simulation."""
+    """A base class whose shallow copies are deep copies, because environments must not share a simulation."""
 
     def __copy__(self) -> Self:
         """Return an independent copy, as `copy.deepcopy` does."""
@@ -65,32 +65,32 @@ class CopiedWhole:
 
 
 def synchronized(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
-    """Return a method of an environment in which a second thread waits until the first has returned."""
+    """Decorate a method of an environment: a second thread waits until the first thread has returned."""
 
     @wraps(method)
     def call(self: S, /, *arguments: P.args, **keywords: P.kwargs) -> T:
-        with self._road.lock.held:  # pyright: ignore[reportAttributeAccessIssue]
+        with self._road.lock.rlock:  # pyright: ignore[reportAttributeAccessIssue]
             return method(self, *arguments, **keywords)
 
     return call
 
 
 def as_action(action: Any, name: str) -> float:
-    """Return the action of one CAV as a number [m/s2]; raise `InputError` unless it is a single finite one."""
-    allowed, is_ready = "one finite number", type(action) is np.ndarray and action.dtype.kind == "f"
-    values = action if is_ready else as_numbers(action, f"step: {name}", allowed)
+    """Return the action of one CAV as a float [m/s2]; raise `InputError` unless it is one finite number."""
+    allowed, is_float_array = "one finite number", type(action) is np.ndarray and action.dtype.kind == "f"
+    values = action if is_float_array else as_numbers(action, f"step: {name}", allowed)
     if values.size != 1 or not isfinite(number := values.item()):
         raise InputError(f"step: {name}: {to_one_line(repr(action), 60)} is not allowed; allowed: {allowed}")
     return number
 
 
 def episode_seed(seed: int, episode_count: int) -> tuple[int, ...]:
-    """Return the seed of an episode of an environment, after so many others since the one of `seed`."""
+    """Return the seed of the episode of an environment that follows `episode_count` episodes since `seed`."""
     return (seed, episode_count) if episode_count else (seed,)
 
 
 def no_cav_error(scenario: Scenario, episode: str = "") -> EpisodeError:
-    """Return the error for an episode without a control step that a driver could decide; `episode` says which one."""
+    """Return the error for an episode without a control step of a CAV; `episode` is the name in the message."""
     allowed = f"a horizon of more than {scenario.horizon} control steps, or more CAVs"
     return EpisodeError(f"reset: {episode}no CAV enters the road before the episode ends; allowed: {allowed}")
 
@@ -102,7 +102,7 @@ def check_single_cav(scenario: Scenario) -> None:
 
 
 class RoadStepResult(NamedTuple):
-    """The result of one control step, with the CAVs that are on the road now."""
+    """The result of one control step, with the CAVs on the road after it."""
 
     cav_ids: list[str]
     observations: Observations  # shape (CAVs, numbers)
@@ -110,11 +110,11 @@ class RoadStepResult(NamedTuple):
     reward: float
     reward_terms: dict[str, float]
     terminated: bool
-    truncated: bool  # whether the horizon is reached, or no CAV will be on the road again
+    truncated: bool  # whether the horizon is reached, or no further CAV will be on the road
 
 
 class RoadStepper:
-    """A scenario with external accelerations of its CAVs, one control step at a time."""
+    """Simulates a scenario one control step at a time, with given accelerations of its CAVs."""
 
     def __init__(
         self,
@@ -126,29 +126,30 @@ class RoadStepper:
         backend: BackendLike = "sumo",
         has_single_cav: bool = False,
     ) -> None:
-        """Prepare a scenario, with arguments as `RoadEnv`; one CAV may replace a penetration rate."""
-        made = make_scenario(scenario, changes)
-        if has_single_cav and getattr(made, "cavs", 1) is None:
+        """Prepare a scenario with arguments as `RoadEnv`; `has_single_cav` replaces a penetration rate by one CAV."""
+        self.scenario = make_scenario(scenario, changes)
+        if has_single_cav and getattr(self.scenario, "cavs", 1) is None:
             changes = {**changes, "cavs": 1}
-            made = make_scenario(scenario, changes)
-        self._base, self._changes = scenario, changes
-        self.scenario = self.episode_scenario = made
-        """scenario of the constructor; `episode_scenario` is the scenario of the last reset, with its options"""
-        self._watch = watch_files([made], scenario, backend)
+            self.scenario = make_scenario(scenario, changes)
+        self._scenario_name, self._changes = scenario, changes
+        self.episode_scenario = self.scenario
+        """scenario of the last reset, with its options"""
+        self._watch = watch_files([self.scenario], scenario, backend)
         reward = reward or self.scenario.reward
         self.reward, self.has_user_reward = make_reward(reward), not is_packaged_reward(reward)
         driver = make_expert(expert, self.scenario.control_step) if expert else Constant()
         inputs = as_features(features)
-        if not expert and (useless := [name for name in ("expert_acceleration", "expert_memory") if name in inputs]):
-            raise InputError(f"features: {useless[0]!r} is not allowed; allowed: with an expert, like 'pi'")
-        if "expert_memory" in inputs and not memory_size(driver):  # no error: exported policies may name it
+        for name in ("expert_acceleration", "expert_memory"):
+            if not expert and name in inputs:
+                raise InputError(f"features: {name!r} is not allowed; allowed: with an expert, like 'pi'")
+        if "expert_memory" in inputs and not memory_size(driver):  # no error, because exported policies may contain it
             text = f"features: 'expert_memory' adds no numbers: the expert {driver.describe()} has no memory features"
             warnings.warn(text, stacklevel=3)
         self._driver = ExternalDriver(driver, inputs, self.scenario.acceleration_limits)
         self._backend = backend
-        with open_backend(backend) as opened:
-            self._check_scenario(self.scenario, opened)
-        self._opened: Backend | None = None
+        with open_backend(backend) as checked_backend:
+            self._check_scenario(self.scenario, checked_backend)
+        self._open_backend: Backend | None = None
         self._world: RoadWorld | None = None
         self._backend_context, self._world_context = ExitStack(), ExitStack()
         bound = np.full(observation_size(self._driver.features, driver), MAX_OBSERVATION, np.float32)
@@ -156,7 +157,7 @@ class RoadStepper:
         low, high = (np.full(1, limit, np.float32) for limit in self.scenario.acceleration_limits)
         self.action_space = spaces.Box(low, high, dtype=np.float32)  # action space of one CAV: an acceleration [m/s2]
         self._seed: int | None = None
-        self._episode_count = 0  # episodes since that seed
+        self._episode_count = 0  # number of episodes since this seed
         self.lock = CopyableLock()  # held during calls of the environment
 
     def __getstate__(self) -> dict[str, Any]:
@@ -170,53 +171,55 @@ class RoadStepper:
         check_policy_inputs(self._driver.features, scenario, "features")
         check_support(backend, scenario)
 
-    def _with_options(self, options: dict[str, Any], backend: Backend) -> Scenario:
-        """Return the scenario with other parameters for one episode; raise `InputError` if they are not allowed."""
+    def _change_scenario(self, options: dict[str, Any], backend: Backend) -> Scenario:
+        """Return the scenario with `options` for one episode; raise `InputError` if they are not allowed."""
         if not isinstance(options, dict):
             raise invalid_value("reset: options", options, "a dict of parameters of the scenario")
-        scenario = make_scenario(self._base, merge_changes(nest_keys(self._changes), nest_keys(options)))
+        scenario = make_scenario(self._scenario_name, merge_changes(nest_keys(self._changes), nest_keys(options)))
         for name in ("cavs", "action_limit"):
-            if (value := getattr(scenario, name, None)) != (fixed := getattr(self.scenario, name, None)):
-                raise invalid_value(f"reset: options: {name}", value, f"{fixed}, as in the constructor")
+            value, allowed = getattr(scenario, name, None), getattr(self.scenario, name, None)
+            if value != allowed:
+                raise invalid_value(f"reset: options: {name}", value, f"{allowed}, as in the constructor")
         self._check_scenario(scenario, backend)
         return scenario
 
     def reset(self, seed: int | None, generator: np.random.Generator, options: ResetOptions = None) -> Observations:
         """Start an episode, run its warm-up, and return the first observations.
 
-        It is that of `seed`, or the next after the last seed, at first one from `generator`. `options` change
-        parameters of the scenario in this episode alone. Raise `InputError` if a file of the scenario has changed.
+        The episode is that of `seed`; without a seed, it is the next episode after the last seed, or has a seed of
+        `generator`. `options` change the scenario for this episode only. Raise `InputError` if a file of the scenario
+        has changed.
         """
         seed = None if seed is None else check_integer("seed", seed, 0)
         warn_of_reserved_seed(seed)
         self._watch.check()
-        if self._opened is None:
-            self._opened = self._backend_context.enter_context(open_backend(self._backend))
-        scenario = self.scenario if options is None else self._with_options(options, self._opened)
+        if self._open_backend is None:
+            self._open_backend = self._backend_context.enter_context(open_backend(self._backend))
+        scenario = self.scenario if options is None else self._change_scenario(options, self._open_backend)
         if seed is not None:
             self._seed, self._episode_count = seed, 0
         if self._seed is None:
             self._seed = int(generator.integers(2**31))
-        numbers = episode_seed(self._seed, self._episode_count)
+        world_seed = episode_seed(self._seed, self._episode_count)
         self._episode_count += 1
-        self.end_episode()  # also if the next one cannot be opened
+        self.end_episode()  # even if the next episode cannot start
         self.episode_scenario = scenario
-        needs = self._driver.requirements(scenario.interface)
-        world_options = WorldOptions(needs.measured_fields, accepts_floats=not needs.needs_arrays)
-        opening = open_world(self._opened, scenario, numbers, world_options)
-        self._world = world = self._world_context.enter_context(opening)
+        requirements = self._driver.requirements(scenario.interface)
+        world_options = WorldOptions(requirements.measured_fields, accepts_floats=not requirements.needs_arrays)
+        world_context = open_world(self._open_backend, scenario, world_seed, world_options)
+        self._world = world = self._world_context.enter_context(world_context)
         self._drive_loop = DriveLoop(world, self._driver)
         self._control_steps = iter(self._drive_loop)
         self._steps, self._return = 0, 0.0
         self._metric_means = StepMetricMeans() if isinstance(world.road, OrderedRoad) else None
         self._wait_for_cav()
-        if not world.cav_ids or world.has_ended:  # there is no control step that a driver could decide
+        if not world.cav_ids or world.has_ended:  # there is no control step of a CAV
             self.end_episode()
             raise no_cav_error(scenario)
         return self._observe()
 
     def step(self, actions: Any) -> RoadStepResult:
-        """Advance one control step with `actions` [m/s2], (CAVs,), and on without CAVs until the next one enters."""
+        """Simulate one control step with `actions` [m/s2], (CAVs,), and further steps until a CAV is on the road."""
         world, previous_ids, last_observations = self.world, list(self.world.cav_ids), self._observations
         self._driver.actions = float(actions[0]) if world.is_scalar else np.asarray(actions, np.float64)
         if next(self._control_steps, None) is None:
@@ -225,25 +228,25 @@ class RoadStepper:
         departed = {}
         if rows is not None:
             accelerations = accelerations[list(rows)]
-            departed = {name: last_observations[row] for row, name in enumerate(previous_ids) if row not in rows}
+            departed = {cav_id: last_observations[row] for row, cav_id in enumerate(previous_ids) if row not in rows}
         time_gaps, speed = time_gap(state.leader_gap, state.speed), state.speed
         if not world.is_scalar:
             time_gaps, speed = time_gaps[: len(accelerations)], np.array(speed[: len(accelerations)])
-            accelerations = np.array(accelerations)  # a backend may write into its own arrays later
-        ends = bool(world.has_crashed), float(world.backlog)
-        outcome = Outcome(np.array(world.speeds), accelerations, time_gaps, *ends, speed)
+            accelerations = np.array(accelerations)  # a backend may change its arrays later
+        crash_and_backlog = bool(world.has_crashed), float(world.backlog)
+        outcome = Outcome(np.array(world.speeds), accelerations, time_gaps, *crash_and_backlog, speed)
         terms = step_reward_terms(self.reward, outcome, world.control_steps - 1, self.has_user_reward)
         terminated, reward = world.has_crashed, sum(terms.values())
         self._steps, self._return = self._steps + 1, self._return + reward
         if self._metric_means is not None:
             self._metric_means.add(outcome)
         if not world.cav_ids:
-            self._wait_for_cav()  # a crash of human drivers in the meantime ends the episode, but no CAV has caused it
+            self._wait_for_cav()  # no termination if human drivers crash now, because no CAV has caused it
         truncated = not terminated and (world.has_ended or not world.cav_ids)
         return RoadStepResult(list(world.cav_ids), self._observe(), departed, reward, terms, terminated, truncated)
 
     def step_info(self, result: RoadStepResult, has_ended: bool) -> dict[str, Any]:
-        """Return `reward_terms` and, at the end, `episode_metrics`; where vehicles enter only `return` and `steps`."""
+        """Return `reward_terms` and, at the end, `episode_metrics`: on open roads only `return` and `steps`."""
         if not has_ended:
             return {"reward_terms": result.reward_terms}
         means = {} if self._metric_means is None else self._metric_means.means()
@@ -254,7 +257,7 @@ class RoadStepper:
         return {"reward_terms": result.reward_terms, "episode_metrics": metrics}
 
     def _wait_for_cav(self) -> None:
-        """Continue the simulation until a CAV is on the road, or none will enter before the episode ends."""
+        """Continue the simulation until a CAV is on the road, or no CAV can enter before the episode ends."""
         world = self.world
         while world.expects_cavs and not (world.cav_ids or world.has_ended):
             next(self._control_steps)
@@ -265,18 +268,18 @@ class RoadStepper:
 
     @property
     def world(self) -> RoadWorld:
-        """The world of the running episode; raise `UnjamError` if there is none."""
+        """World of the running episode; raise `UnjamError` without one."""
         if self._world is None:
             raise UnjamError("no episode is running: call reset first")
         return self._world
 
     def _observe(self) -> Observations:
-        observed = self._drive_loop.observe()
+        observation = self._drive_loop.observe()
         low, high = -MAX_OBSERVATION, MAX_OBSERVATION
-        if self.world.is_scalar:  # a call of NumPy would take longer than those for the floats
-            self._observations = np.array([[clip(value, low, high) for value in observed]], np.float32)
+        if self.world.is_scalar:  # faster than a call of NumPy
+            self._observations = np.array([[clip(value, low, high) for value in observation]], np.float32)
         else:
-            self._observations = clip(observed, low, high).astype(np.float32)
+            self._observations = clip(observation, low, high).astype(np.float32)
         return self._observations
 
     def end_episode(self) -> None:
@@ -285,9 +288,9 @@ class RoadStepper:
         self._world_context.close()
 
     def close(self) -> None:
-        """Close the backend; may be called twice."""
+        """Close the backend; further calls have no effect."""
         self.end_episode()
-        self._opened = None
+        self._open_backend = None
         self._backend_context.close()
 
 
@@ -319,8 +322,8 @@ class RoadEnv(CopiedWhole, gymnasium.Env[Observations, NDArray[Any]]):
     Time step    one control step: 0.1 s, on the merge 1 s
     ===========  ===================================================================================================
 
-    libsumo can run one simulation per process: if other code or another environment uses it, SUMO runs in a separate
-    process, several times slower, with a warning. A second thread waits until the first has returned.
+    libsumo can run one simulation per process. If other code or another environment uses it, SUMO runs in a separate
+    process, several times slower, with a warning. A second thread waits until the first thread has returned.
     Many environments at once, without SUMO: `RoadVectorEnv`; in SUMO:
     ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4, vectorization_mode="async")``.
     """
@@ -344,11 +347,11 @@ class RoadEnv(CopiedWhole, gymnasium.Env[Observations, NDArray[Any]]):
             reward: a name, `path.py:name`, or a function of an `Outcome`; empty: that of the scenario.
             expert: a driver to which actions are added: a name as in `unjam drive --driver`, a driver, a class or an
                 object with `act` and `initial_memory`, or a function of a `LocalState`.
-            features: the observed features: names such as `local`, `expert_acceleration`, `expert_memory`, or
+            features: observed features: names such as `local`, `expert_acceleration`, `expert_memory`, or
                 functions of a `LocalState`. Functions run in the process of the environment.
             render_mode: `rgb_array`, or `human` for SUMO's own window.
             backend: the simulator: `sumo`, `batch`, `path.py:name`, or an object.
-            changes: to the parameters of the scenario.
+            changes: other values for parameters of the scenario.
 
         Raises:
             InputError: an argument is wrong, or the scenario has several CAVs.
@@ -360,8 +363,8 @@ class RoadEnv(CopiedWhole, gymnasium.Env[Observations, NDArray[Any]]):
             raise MissingPartError("render_mode: 'human' needs a display; without one: 'rgb_array'")
         for name in ("slots", "num_envs"):
             if name in changes:
-                others = "gymnasium.make_vec and, with slots, unjam.parallel_env"
-                raise InputError(f"{name}: it is not allowed in a single environment of one CAV; allowed in: {others}")
+                allowed = "gymnasium.make_vec and, with slots, unjam.parallel_env"
+                raise InputError(f"{name}: it is not allowed in a single environment of one CAV; allowed in: {allowed}")
         self.render_mode, self._spec = render_mode, None
         if render_mode == "human" and backend != "sumo":
             raise invalid_value("render_mode", render_mode, "rgb_array, except with backend='sumo'")
@@ -373,10 +376,10 @@ class RoadEnv(CopiedWhole, gymnasium.Env[Observations, NDArray[Any]]):
 
     @synchronized
     def reset(self, *, seed: int | None = None, options: ResetOptions = None) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode: that of `seed`; without one, the next after that of the last seed.
+        """Start the episode of `seed`; without a seed, start the next episode after the last seed.
 
-        `options` are changes to the parameters of the scenario, as `changes` of the constructor, for this episode only:
-        `reset(options={"length": 230})`. The number of CAVs and the action limit stay.
+        `options` change parameters of the scenario for this episode only, as `changes` of the constructor do:
+        `reset(options={"length": 230})`. They cannot change the number of CAVs and the action limit.
         """
         observations = self._road.reset(seed, self.np_random, options)
         super().reset(seed=None if seed is None else int(seed))  # Gymnasium takes no integers of NumPy
@@ -394,9 +397,9 @@ class RoadEnv(CopiedWhole, gymnasium.Env[Observations, NDArray[Any]]):
 
     @property
     def spec(self) -> EnvSpec | None:
-        """The specification of `gymnasium.make`, whose `max_episode_steps` is the horizon of the constructor.
+        """Specification of `gymnasium.make`; its `max_episode_steps` is the horizon of the constructor.
 
-        It is not registered: the `TimeLimit` that Gymnasium then adds would end episodes with a longer horizon early.
+        The number of steps is not registered, because Gymnasium would then end episodes with a longer horizon early.
         """
         return self._spec
 
@@ -408,17 +411,17 @@ class RoadEnv(CopiedWhole, gymnasium.Env[Observations, NDArray[Any]]):
 
     @synchronized
     def render(self) -> Any:
-        """Return an image of the current state, shape (640, 640, 3); None for SUMO's own window."""
+        """Return an image of the current state, shape (640, 640, 3); None in other render modes."""
         if self.render_mode != "rgb_array":
             return None
         from unjam.reports.video import draw_road
 
         world = self._road.world
-        limit = world.road.limit_speed  # unknown on user networks
-        max_speed = 2.0 * limit if np.isfinite(limit) else self._road.episode_scenario.top_speed
+        limit_speed = world.road.limit_speed  # unknown on user networks
+        max_speed = 2.0 * limit_speed if np.isfinite(limit_speed) else self._road.episode_scenario.top_speed
         return np.asarray(draw_road(world.scene(), max_speed, f"mean {np.mean(world.speeds):.1f} m/s"))
 
     @synchronized
     def close(self) -> None:
-        """Close SUMO; may be called twice."""
+        """Close SUMO; further calls have no effect."""
         self._road.close()

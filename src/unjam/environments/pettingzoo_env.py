@@ -14,16 +14,16 @@ from unjam.text import format_count
 from unjam.worlds.backend import BackendLike
 from unjam.worlds.reward import RewardLike
 
-API_TEST_OPTIONS = {"options": 1}  # options without a meaning with which PettingZoo's `parallel_api_test` calls `reset`
+API_TEST_OPTIONS = {"options": 1}  # meaningless options of `reset` in PettingZoo's `parallel_api_test`
 
 
 class ParallelRoadEnv(RoadAgents):
-    """Several CAVs among human drivers, with a common reward.
+    """Several CAVs among human drivers, which share one reward.
 
-    Action and observation of each CAV are those of `RoadEnv`. On open roads `agents` changes: a CAV becomes an agent at
-    the first control step after its entry, and is truncated when it leaves the road. While there are no CAVs, the
-    simulation continues until the next one enters. On a user network the agents are cav_0, cav_1, ... in the order of
-    entry, at most `cavs` of them.
+    Actions and observations of each CAV are those of `RoadEnv`. On open roads `agents` changes: a CAV becomes an agent
+    at the first control step after its entry, and is truncated when it leaves the road. Without CAVs, the simulation
+    continues until the next CAV enters. On a user network the agents are cav_0, cav_1, ... in the order of entry, up
+    to `cavs` agents.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "unjam_road_v0", "render_modes": []}  # pyright: ignore
@@ -41,17 +41,17 @@ class ParallelRoadEnv(RoadAgents):
         road = RoadStepper(scenario, changes, reward, expert, features, backend)
         super().__init__(road, road.scenario.possible_cav_ids())
         self._agent_by_vehicle: dict[str, str] = {}
-        self._departed_agents: set[str] = set()  # whose vehicle has left; if it returns, only the expert drives it
+        self._departed_agents: set[str] = set()  # their vehicles have left, and are driven by the expert if they return
 
     @synchronized
     def reset(self, seed: int | None = None, options: ResetOptions = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode as `RoadEnv.reset`; raise `InputError` if the road can then have other CAVs."""
+        """Start an episode as `RoadEnv.reset` does; raise `InputError` if `options` allow other CAVs."""
         options = None if options == API_TEST_OPTIONS else options
         observations = self._road.reset(seed, np.random.default_rng(), options)
-        if options and (others := {*self._road.episode_scenario.possible_cav_ids()}.difference(self.possible_agents)):
+        if options and (added := {*self._road.episode_scenario.possible_cav_ids()}.difference(self.possible_agents)):
             self._road.end_episode()
-            more, allowed = format_count(len(others), "more CAV"), "as many CAVs as in the constructor, or fewer"
-            raise InputError(f"reset: options: {more} cannot be there; allowed: {allowed}")
+            count, allowed = format_count(len(added), "more CAV"), "as many CAVs as in the constructor, or fewer"
+            raise InputError(f"reset: options: {count} cannot be there; allowed: {allowed}")
         self._agent_by_vehicle.clear()
         self._departed_agents.clear()
         self.agents = self._assign_agents(self._road.world.cav_ids)
@@ -70,13 +70,13 @@ class ParallelRoadEnv(RoadAgents):
         result = self._road.step([0.0 if agent in departed else as_action(actions[agent], agent) for agent in agents])
         has_ended = result.terminated or result.truncated
         leaving, present = (
-            {agent: each for agent, each in zip(self._assign_agents(ids), rows, strict=True) if agent not in departed}
+            {agent: row for agent, row in zip(self._assign_agents(ids), rows, strict=True) if agent not in departed}
             for ids, rows in ((result.departed, result.departed.values()), (result.cav_ids, result.observations))
         )
         departed.update(leaving)
         # A vehicle that enters in the last control step does not become an agent.
-        shown = leaving | present
-        observations = {agent: shown[agent] for agent in shown if agent in previous or not has_ended}
+        observed = leaving | present
+        observations = {agent: row for agent, row in observed.items() if agent in previous or not has_ended}
         self.agents = [] if has_ended else list(present)
         info = self._road.step_info(result, has_ended)
         return (
@@ -87,14 +87,14 @@ class ParallelRoadEnv(RoadAgents):
             {agent: dict(info) for agent in observations},
         )
 
-    def _assign_agents(self, vehicles: Iterable[str]) -> list[str]:
-        """Return the agents of vehicles; a new vehicle gets the agent with its name, else the first free one."""
-        for name in vehicles:
-            if name not in self._agent_by_vehicle:
-                taken = self._agent_by_vehicle.values()
-                free = [agent for agent in self.possible_agents if agent not in taken]
-                self._agent_by_vehicle[name] = name if name in free else free[0]
-        return [self._agent_by_vehicle[name] for name in vehicles]
+    def _assign_agents(self, vehicle_ids: Iterable[str]) -> list[str]:
+        """Return the agents of vehicles; a new vehicle gets the agent with its id, else the first free agent."""
+        for vehicle_id in vehicle_ids:
+            if vehicle_id not in self._agent_by_vehicle:
+                assigned = self._agent_by_vehicle.values()
+                free = [agent for agent in self.possible_agents if agent not in assigned]
+                self._agent_by_vehicle[vehicle_id] = vehicle_id if vehicle_id in free else free[0]
+        return [self._agent_by_vehicle[vehicle_id] for vehicle_id in vehicle_ids]
 
 
 @overload
@@ -110,7 +110,7 @@ def parallel_env(
 ) -> ParallelRoadEnv | SlottedRoadEnv:
     """Return the PettingZoo environment of a scenario; the arguments are those of `RoadEnv`.
 
-    With `slots`, CAVs that come and go are mapped to so many agents that stay for the whole episode: `SlottedRoadEnv`.
+    With `slots`, CAVs that enter and leave are mapped to this number of constant agents: `SlottedRoadEnv`.
     """
     environment = ParallelRoadEnv(scenario, **arguments)
     return environment if slots is None else SlottedRoadEnv(environment, slots)

@@ -24,65 +24,66 @@ from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.support import required_batch_kind
 from unjam.worlds.reward import Outcome, RewardLike
 
-NO_SLOT = -1  # slot of CAVs that find no slot free
+NO_SLOT = -1  # slot of a CAV that got no free slot
 
 
 class SlottedEpisodes(Episodes):
-    """Episodes on W motorways, the driver of their CAVs, and the slots of these, S on each road."""
+    """Running episodes on W motorways, with the driver of their CAVs and S slots for CAVs on each road."""
 
     def __init__(self, world: MotorwayBatch, driver: ExternalDriver, slots: int) -> None:
         self._shape = len(world.roads), slots
-        self._slots = np.zeros(0, np.intp)  # slot of each CAV on a road, or `NO_SLOT`
+        self._slots = np.zeros(0, np.intp)  # slot of each CAV, or `NO_SLOT`
         self._departed: tuple[NDArray[Any], ...] = *np.zeros((2, 0), np.intp), np.zeros((0, 1))
         """road, slot and last observation of the CAVs that left their slots in the last control step"""
         super().__init__(world, driver, np.asarray)
 
     def advance(self, actions: Array) -> Outcome:
-        """Advance one control step with actions of shape (W, S), and return its outcome."""
+        """Simulate one control step with actions of shape (W, S), and return its outcome."""
         roads, slots = self.world.cav_roads, self._slots
         outcome = super().advance(np.where(slots == NO_SLOT, 0.0, actions[roads, slots]))
         remaining = self.world.remaining_rows
         rows = np.arange(len(slots)) if remaining is None else np.array(remaining, np.intp)
-        left = np.setdiff1d(np.flatnonzero(slots != NO_SLOT), rows)
-        self._departed = roads[left], slots[left], self._row_observations[left]
+        left_rows = np.setdiff1d(np.flatnonzero(slots != NO_SLOT), rows)
+        self._departed = roads[left_rows], slots[left_rows], self._row_observations[left_rows]
         self._update_rows(rows)
         return outcome
 
     def _update_rows(self, rows: NDArray[np.intp]) -> None:
-        """Keep some rows of the CAVs; those that have entered since, behind them, get the first free slots."""
+        """Keep `rows` of the CAVs, and give the first free slots to the CAVs that have entered."""
         new_roads, is_free = self.world.cav_roads[len(rows) :].tolist(), ~self.is_occupied
         slots = self._slots[rows].tolist()
         for road in new_roads:
             free = np.flatnonzero(is_free[road])[:1]
             is_free[road, free] = False
             slots += free.tolist() or [NO_SLOT]
-        self._slots, new = np.array(slots, np.intp), len(new_roads)
-        self._memory = carry_over_memory(self._memory, rows, self._driver.initial_memory(new), new)
+        self._slots, new_count = np.array(slots, np.intp), len(new_roads)
+        initial_memory = self._driver.initial_memory(new_count)
+        self._memory = carry_over_memory(self._memory, rows, initial_memory, new_count)
 
     def observe(self) -> None:
-        """Let the driver observe the current state, once in each control step."""
+        """Compute the observations of the current state; call it once in each control step."""
         super().observe()
         has_slot = self._slots != NO_SLOT
-        own, departed = (self.world.cav_roads[has_slot], self._slots[has_slot]), self._departed[:2]
-        rows: Floats = self.observations
-        self._row_observations = rows
+        occupied, departed = (self.world.cav_roads[has_slot], self._slots[has_slot]), self._departed[:2]
+        row_observations: Floats = self.observations
+        self._row_observations = row_observations
         self.is_occupied, self.has_left = np.zeros((2, *self._shape), bool)
-        self.is_occupied[own], self.has_left[departed] = True, True
-        self.observations = np.zeros((*self._shape, rows.shape[1]))
-        self.observations[own], self.observations[departed] = rows[has_slot], self._departed[2]
+        self.is_occupied[occupied], self.has_left[departed] = True, True
+        self.observations = np.zeros((*self._shape, row_observations.shape[1]))
+        self.observations[occupied], self.observations[departed] = row_observations[has_slot], self._departed[2]
 
     def replace(self, rows: list[int], source: Any, source_rows: list[int]) -> None:
-        """Go on in some rows with episodes that have just been started."""
-        stays = np.flatnonzero(~np.isin(self.world.cav_roads, rows))
-        self._slots, self._memory = self._slots[stays], carry_over_memory(self._memory, stays, {}, 0)
-        is_shown = ~np.isin(self._departed[0], rows)
-        self._departed = tuple(values[is_shown] for values in self._departed)
+        """Continue in `rows` with `source_rows` of episodes that have just been started."""
+        remaining = np.flatnonzero(~np.isin(self.world.cav_roads, rows))
+        self._slots, self._memory = self._slots[remaining], carry_over_memory(self._memory, remaining, {}, 0)
+        is_remaining = ~np.isin(self._departed[0], rows)
+        self._departed = tuple(values[is_remaining] for values in self._departed)
         self.world.replace_roads(rows, source.world, source_rows)
         self.observe()
 
 
 class SlottedRoadVectorEnv(RoadVectorEnv):
-    """W motorways with S slots each for CAVs that come and go, simulated together without SUMO.
+    """W motorways with S slots each for CAVs that enter and leave, simulated together without SUMO.
 
     ``gymnasium.make_vec("unjam/OnRamp-v0", num_envs=64, slots=8)``. Slots are those of `SlottedRoadEnv`, seeds and
     restarts those of `RoadVectorEnv`. Episodes have the same distribution as SUMO's. With ``exact=False`` the errors of
@@ -115,7 +116,7 @@ class SlottedRoadVectorEnv(RoadVectorEnv):
         features: Sequence[FeatureLike] = ("local",),
         **changes: Any,
     ) -> None:
-        """Prepare the environments with `slots` on each road; other arguments as of `RoadVectorEnv`."""
+        """Prepare the environments with `slots` on each road; other arguments are those of `RoadVectorEnv`."""
         slots = check_integer("slots", slots, 1)
         if "device" in changes:
             raise InputError("device: is not an option of motorways; they are NumPy's")
@@ -144,19 +145,19 @@ class SlottedRoadVectorEnv(RoadVectorEnv):
                 raise no_cav_error(world.scenario, episode)
         return SlottedEpisodes(world, self._road.copy_driver(), self._slots)
 
-    def _without_ignored(self, actions: Array) -> Array:
+    def _clear_ignored_actions(self, actions: Array) -> Array:
         is_occupied = cast(SlottedEpisodes, self._running_episodes).is_occupied
-        return np.where(is_occupied, super()._without_ignored(actions), 0.0)
+        return np.where(is_occupied, super()._clear_ignored_actions(actions), 0.0)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start episodes, as `RoadVectorEnv.reset`."""
+        """Start episodes as `RoadVectorEnv.reset` does."""
         observations, info = super().reset(seed=seed, options=options)
         return observations, info | self._slot_info()
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Advance one control step with actions of shape (W, S, 1) [m/s2]; restart episodes that ended before it."""
+        """Simulate one control step with actions of shape (W, S, 1) [m/s2]; restart episodes that ended before."""
         has_acted = cast(SlottedEpisodes, self._running_episodes).is_occupied
         *values, rewards, terminated, truncated, info = super().step(actions)
         slot_rewards = np.where(has_acted, rewards[:, None], 0.0)

@@ -38,18 +38,18 @@ from unjam.worlds.batch.support import required_batch_kind, statistically_unsupp
 from unjam.worlds.episode import as_seed
 from unjam.worlds.reward import MAX_REWARD_TERM, Outcome, RewardLike, check_tensor_terms, validate_reward_terms
 
-EXPERT_CHECK_STEPS = 3  # random steps in which an expert must drive each row by itself, without a state of its own
-MAX_ENVIRONMENTS = 1_000_000  # maximum number of environments, of which each takes 2 kB or more
-OTHER_MODE = "allowed: vectorization_mode='async', which simulates in SUMO"
+EXPERT_CHECK_STEPS = 3  # number of random steps in which an expert must drive rows independently, without own state
+MAX_ENVIRONMENTS = 1_000_000  # each environment takes at least 2 kB
+ASYNC_MODE = "allowed: vectorization_mode='async', which simulates in SUMO"
 
 
 class _ArrayKind(NamedTuple):
-    """Library and precision of the arrays of an environment, and its noise."""
+    """Array library, precision and noise of an environment."""
 
     to_array: ArrayFactory
-    draw: DrawNormal | None  # draws the noise of all roads; None: each road has that of SUMO's episode
+    draw: DrawNormal | None  # draws the noise of all roads; None if each road has the noise of SUMO's episode
     to_single: Callable[[Array], Array]  # returns an array in single precision
-    no_gradient: Callable[[], AbstractContextManager[object]]
+    no_gradient: Callable[[], AbstractContextManager[object]]  # returns a context without gradients
 
 
 def _numpy_kind(is_exact: bool, seed: Sequence[int]) -> _ArrayKind:
@@ -67,19 +67,19 @@ def _torch_kind(is_exact: bool, seed: Sequence[int], device: str) -> _ArrayKind:
 
 
 def with_masks(values: dict[str, Any], mask: Array) -> dict[str, Any]:
-    """Return values of environments together with Gymnasium's masks, which say for which of them they are."""
+    """Return values by name, and with `_` before each name Gymnasium's mask of the environments that have them."""
     return values | {f"_{name}": mask for name in values}
 
 
 class Episodes:
-    """Episodes on the roads of a batch, and the driver of their CAVs."""
+    """Running episodes on the roads of a batch, with the driver of their CAVs."""
 
     def __init__(self, world: Any, driver: ExternalDriver, to_array: ArrayFactory) -> None:
         self.world, self._driver, self._memory = world, driver, start_batch_drive(world, driver, to_array).memory
         self.observe()
 
     def advance(self, actions: Array) -> Outcome:
-        """Advance one control step with actions of shape (W,), and return its outcome, which must not be changed."""
+        """Simulate one control step with actions of shape (W,), and return its outcome, which must not be changed."""
         self._driver.actions = actions
         decision, world = self._driver.decide(self._state, self._memory), self.world
         self._memory = decision.memory
@@ -87,30 +87,30 @@ class Episodes:
         return world.last_outcome()
 
     def observe(self) -> None:
-        """Let the driver observe the current state, once in each control step."""
+        """Compute the observations of the current state; call it once in each control step."""
         self._state = self.world.local_state()
         observation = self._driver.observation(self._state, self._memory)
         self.observations = clip(observation, -MAX_OBSERVATION, MAX_OBSERVATION)
 
     def detach(self) -> None:
-        """Let no gradients flow through earlier steps."""
+        """Detach the state, so that no gradients flow through earlier steps."""
         self.world.detach_state()
         self._memory = map_leaves(lambda values: values.detach(), self._memory)
-        self.observe()  # the driver keeps what it computes
+        self.observe()  # the driver stores its acceleration
 
     def replace(self, rows: list[int], source: Any, source_rows: list[int]) -> None:
-        """Go on in some rows with episodes that have just been started."""
+        """Continue in `rows` with `source_rows` of episodes that have just been started."""
         self.world.replace_roads(rows, source.world, source_rows)
         self._driver.replace_rows(rows, source._driver, source_rows)
         self.observations = replace_entries(self.observations, rows, source.observations, source_rows)
 
 
 class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
-    """W environments as `RoadEnv`, simulated together without SUMO.
+    """W environments like `RoadEnv`, simulated together without SUMO.
 
     ``gymnasium.make_vec("unjam/Ring-v0", num_envs=4096)``, with the arguments of `RoadEnv`. Spaces, observations,
-    rewards and ends are those of `RoadEnv`. With the same seeds, so are the episodes: on rings and recorded roads they
-    equal SUMO's except for rounding, on figure eights they have the same distribution.
+    rewards and ends are those of `RoadEnv`. With the same seeds, episodes on rings and recorded roads equal SUMO's
+    except for rounding, and episodes on figure eights have the same distribution.
 
     ================  ==============================================================================================
     Roads             rings, figure eights, recorded roads
@@ -129,8 +129,8 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         "render_modes": [],
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
-    _alternative = OTHER_MODE  # end of the message that refuses a scenario
-    _step_sums = staticmethod(step_metrics)  # returns what is summed over control steps, by name, shape (W,)
+    _alternative = ASYNC_MODE  # end of the message for a scenario that is not possible
+    _step_sums = staticmethod(step_metrics)  # returns values by name that are summed over control steps, shape (W,)
 
     def __init__(
         self,
@@ -143,15 +143,15 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         device: str = "",
         **changes: Any,
     ) -> None:
-        """Prepare the environments; arguments as of `RoadEnv`, or as follows.
+        """Prepare the environments; arguments are those of `RoadEnv`, or as follows.
 
         Args:
             num_envs: number of environments, W.
             exact: whether each episode equals that of `RoadEnv` with its seed, in double precision. Otherwise episodes
                 have the same distribution: all roads share a fast noise generator, human drivers follow only the
                 vehicle ahead, and numbers have single precision.
-            device: `cpu`, `cuda` or another device of torch: actions, and all that `reset` and `step` return, are then
-                tensors on it, through which gradients flow unless `torch.no_grad` is set. Empty: NumPy arrays.
+            device: `cpu`, `cuda` or another device of torch for actions and all values that `reset` and `step` return;
+                gradients flow through these tensors unless `torch.no_grad` is set. Empty: NumPy arrays.
 
         Raises:
             InputError: an argument is wrong, or a batch cannot simulate the scenario.
@@ -159,19 +159,19 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         """
         for name in ("backend", "render_mode"):
             if changes.pop(name, None):
-                raise InputError(f"{name}: is not an option of batches; {OTHER_MODE}")
+                raise InputError(f"{name}: is not an option of batches; {ASYNC_MODE}")
         num_envs = check_integer("num_envs", num_envs, 1, MAX_ENVIRONMENTS)
         if not isinstance(exact, bool):
             raise invalid_value("exact", exact, "True or False")
-        made = make_scenario(scenario, changes)
-        if reason := statistically_unsupported_reason(made) or self._unsupported_reason(made):
-            raise InputError(f"scenario: {made.title} is not possible in a batch ({reason}); {self._alternative}")
+        checked = make_scenario(scenario, changes)
+        if reason := statistically_unsupported_reason(checked) or self._unsupported_reason(checked):
+            raise InputError(f"scenario: {checked.title} is not possible in a batch ({reason}); {self._alternative}")
         self._road = RoadStepper(scenario, changes, reward, expert, features, "batch")
-        made_expert = self._road.copy_driver().expert
-        if device and made_expert.requirements().needs_numpy:
+        expert_driver = self._road.copy_driver().expert
+        if device and expert_driver.requirements().needs_numpy:
             raise invalid_value("expert", expert, "one that takes tensors, like 'pi'; or device='', NumPy")
         if expert and not device:
-            check_driver(made_expert, steps=EXPERT_CHECK_STEPS)
+            check_driver(expert_driver, steps=EXPERT_CHECK_STEPS)
         self._make_kind = partial(_torch_kind, device=device) if device else _numpy_kind
         self._exact, self.device, self._is_numpy, self.num_envs = exact, device, not device, num_envs
         self._kind = self._make_array_kind((0,))
@@ -181,15 +181,15 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._seeds: list[int | None] = [None] * num_envs
-        self._episode_counts = [0] * num_envs  # episodes of each environment since that seed, prepared ones included
+        self._episode_counts = [0] * num_envs  # including prepared episodes
         self._episodes: Episodes | None = None
-        self._prepared: dict[int, tuple[Episodes, int]] = {}  # next episode by environment: a row of started episodes
-        self._motions = deque[Array](maxlen=made.max_episode_steps + 1)
-        """motion in the last control steps, on recorded roads alone"""
+        self._prepared: dict[int, tuple[Episodes, int]] = {}  # next episode of environments, and its row
+        self._motions = deque[Array](maxlen=checked.max_episode_steps + 1)
+        """motion in the last control steps on recorded roads; empty on other roads"""
         self._ended_rows: list[int] = []  # environments whose episode ended in the last step
 
     def _unsupported_reason(self, scenario: Scenario) -> str:
-        """Return why this class has no environment of a scenario that batches simulate; empty if it has one."""
+        """Return why this class does not support a scenario that batches can simulate; empty if it does."""
         if not issubclass(required_batch_kind(scenario).world, RingBatch):
             return "vehicles enter and leave: slots are required, for instance slots=8"
         check_single_cav(scenario)
@@ -202,7 +202,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
     def _make_array_kind(self, seed: Sequence[int]) -> _ArrayKind:
         try:
             return self._make_kind(self._exact, seed)
-        except (RuntimeError, AssertionError, TypeError):  # of torch
+        except (RuntimeError, AssertionError, TypeError):  # errors of torch
             message = f"device: {self.device!r} is not available to torch; allowed: 'cpu', or '' for NumPy"
             raise MissingPartError(message) from None
 
@@ -260,7 +260,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         return seeds
 
     def make_batch(self, rows: Sequence[int]) -> Any:
-        """Return a batch of the next episodes of some environments, which has not been started."""
+        """Return a batch with the next episodes of some environments, which have not been started."""
         seeds = [episode_seed(self._seeds[row] or 0, self._episode_counts[row]) for row in rows]
         for row in rows:
             self._episode_counts[row] += 1
@@ -274,22 +274,22 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         return Episodes(self.make_batch(rows), self._road.copy_driver(), self._kind.to_array)
 
     def _restart(self, rows: list[int]) -> None:
-        """Go on in some environments with their next episodes, prepared for all at once as warm-ups are."""
+        """Continue in some environments with their next episodes, which are prepared for all environments at once."""
         if not self._prepared.keys() >= set(rows):
             missing = [row for row in range(self.num_envs) if row not in self._prepared]
-            started = self._start_episodes(missing)
-            self._prepared |= {row: (started, index) for index, row in enumerate(missing)}
+            episodes = self._start_episodes(missing)
+            self._prepared |= {row: (episodes, index) for index, row in enumerate(missing)}
         groups = defaultdict[Episodes, list[tuple[int, int]]](list)
         for row in rows:
             source, source_row = self._prepared.pop(row)
             groups[source].append((row, source_row))
         for source, pairs in groups.items():
-            own, others = map(list, zip(*pairs, strict=True))
-            self._running_episodes.replace(own, source, others)
+            target_rows, source_rows = map(list, zip(*pairs, strict=True))
+            self._running_episodes.replace(target_rows, source, source_rows)
         for name, total in self._totals.items():
             self._totals[name] = replace_entries(total, rows, self._zeros, rows)
         if self._motions:
-            self._motions.pop()  # the new episodes start now
+            self._motions.pop()  # replaced by the start of the new episodes
             self._record_motion()
 
     def _record_motion(self) -> None:
@@ -299,7 +299,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
 
     def _check_open(self) -> None:
         if self.closed:
-            raise ClosedEnvironmentError("the environments are closed; allowed: new ones, of gymnasium.make_vec")
+            raise ClosedEnvironmentError("the environments are closed; allowed: new environments of gymnasium.make_vec")
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the episodes; `step` and `reset` then raise `ClosedEnvironmentError`."""
@@ -313,7 +313,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         return self._episodes
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Advance one control step with actions of shape (W, 1) [m/s2]; restart episodes that ended in the last one."""
+        """Simulate one control step with actions of shape (W, 1) [m/s2]; restart episodes that ended before."""
         episodes, restarted = self._running_episodes, self._ended_rows
         outcome = episodes.advance(self._as_actions(actions))
         episodes.observe()
@@ -338,7 +338,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         return self._kind.to_single(episodes.observations), rewards, terminated, truncated, info
 
     def detach(self) -> Array:
-        """Let no gradients flow to earlier steps from here on, and return the last observations without them, too.
+        """Detach the state, so that no gradients flow through earlier steps, and return the detached observations.
 
         Raise `InputError` without `device`: NumPy arrays have no gradients.
         """
@@ -353,21 +353,21 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         values = as_numbers(actions, "step: actions", allowed, self._kind.to_array)
         if tuple(values.shape) not in (shape, shape[:-1]):
             raise InputError(f"step: actions of shape {tuple(values.shape)} are not allowed; allowed: {shape}")
-        values = self._without_ignored(values.reshape(shape[:-1]))
+        values = self._clear_ignored_actions(values.reshape(shape[:-1]))
         if not bool((is_finite := namespace(values).isfinite(values)).all()):
             index = tuple(np.argwhere(as_numpy(is_finite) == 0.0)[0])
             reason = f"{float(values[index])} of environment {index[0]} is not allowed"
             raise InputError(f"step: actions: {reason}; allowed: {allowed}")
         return values
 
-    def _without_ignored(self, actions: Array) -> Array:
-        """Return actions with zeros in place of those that are ignored: those of episodes that have ended."""
+    def _clear_ignored_actions(self, actions: Array) -> Array:
+        """Return actions with zeros for episodes that have ended, where they are ignored."""
         rows = self._ended_rows
         return replace_entries(actions, rows, namespace(actions).zeros_like(actions), rows) if rows else actions
 
     def _reward_terms(self, outcome: Outcome) -> dict[str, Array]:
         reward = self._road.reward
-        if self._road.has_user_reward:  # it may write into the arrays
+        if self._road.has_user_reward:  # the user's function may change its arguments
             outcome = Outcome(*map(copy_array, outcome))
             if self._is_numpy:
                 return dict(validate_reward_terms(reward, outcome, row_name="environment"))
@@ -380,7 +380,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         return {name: self._kind.to_array(values) for name, values in terms.items()}
 
     def _metrics(self, outcome: Outcome, ended: Array) -> dict[str, Array]:
-        """Return the metrics of the episodes that have ended, zeros for others."""
+        """Return the metrics of the episodes that have ended, and zeros for other episodes."""
         steps = self._running_episodes.world.control_step_counts
         sums = {name: total for name, total in self._totals.items() if name != "return"}
         metrics = {"return": self._totals["return"], "steps": steps, **self._episode_metrics(sums, outcome, steps)}
@@ -389,11 +389,11 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         return {name: namespace(values).where(ended, values, 0.0) for name, values in metrics.items()}
 
     def _episode_metrics(self, sums: dict[str, Array], outcome: Outcome, steps: Array) -> dict[str, Array]:
-        """Return metrics of episodes, given the sums over their control steps, and the outcome of the last one."""
+        """Return metrics of episodes from sums over their control steps, and the outcome of the last step."""
         return {name: total / steps for name, total in sums.items()}
 
     def _recorded_road_metrics(self, rows: list[int]) -> dict[str, Array]:
-        """Return the metrics of episodes that have ended behind recorded vehicles, zeros for others."""
+        """Return the metrics of ended episodes on recorded roads, and zeros for other episodes."""
         world, values = self._running_episodes.world, np.zeros((len(RECORDED_ROAD_METRICS), self.num_envs))
         for row in rows:
             motions = [motion[row] for motion in [*self._motions][-1 - int(world.control_step_counts[row]) :]]
@@ -402,7 +402,7 @@ class RoadVectorEnv(CopiedWhole, VectorEnv[Any, Any, Any]):
         return dict(zip(RECORDED_ROAD_METRICS, map(self._kind.to_array, values), strict=True))
 
     def _mask(self, rows: list[int]) -> Array:
-        """Return which environments are among `rows`, shape (W,)."""
+        """Return a mask of the environments `rows`, shape (W,)."""
         return replace_entries(self._zeros > 0.0, rows, self._zeros == 0.0, rows)
 
     def _start_info(self, rows: list[int]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from unjam.physics.arrays import Floats
 from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.motorway_road import MotorwayRoad
 from unjam.worlds.batch.motorway import traffic
-from unjam.worlds.batch.motorway.vehicles import MotorwayVehicles, find_rows, vehicle_numbers
+from unjam.worlds.batch.motorway.vehicles import MotorwayVehicles, find_rows, vehicle_keys
 from unjam.worlds.lane_neighbors import find_road_neighbors, neighbors_on_lane
 from unjam.worlds.record import Episode
 
@@ -126,7 +126,7 @@ def _speeds_after_step(
     for _ in range(scenario.steps_per_control_step):
         batch.step()
     after = batch.vehicles
-    row = find_rows(vehicle_numbers(vehicles), after, np.arange(len(after.road)))
+    row = find_rows(vehicle_keys(vehicles), after, np.arange(len(after.road)))
     keeps_lane = (row >= 0) & (after.lane[row] == vehicles.lane)
     return np.where(keeps_lane, after.speed[row], np.nan)
 

@@ -1,1 +1,1 @@
-"""Formulas of car following: pure, batched, SI units, on NumPy arrays and torch tensors alike."""
+"""Formulas of car following as pure functions of NumPy arrays, torch tensors and floats, in SI units."""

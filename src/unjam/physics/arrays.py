@@ -1,7 +1,7 @@
-"""One formula for three kinds of numbers: NumPy arrays in workers, torch tensors in learned models, Python floats.
+"""Array functions for three kinds of numbers: NumPy arrays in workers, torch tensors in learned models, and floats.
 
-Floats are for single vehicles: between two steps of SUMO the processor's caches are cold, and a NumPy call on one
-number then takes some 3 us against 0.1 us. (`array_api_compat` supports arrays only, and each call takes 2 us.)
+Floats are for single vehicles: between two steps of SUMO, a NumPy call on one number takes about 3 us, because the
+caches are cold, and a float operation 0.1 us. (`array_api_compat` supports arrays only, and a call takes 2 us.)
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array: TypeAlias = Any
-"""A NumPy array, a torch tensor or a float; workers run without torch, so it cannot be named here."""
+"""a NumPy array, a torch tensor or a float; the type cannot be named here, because workers run without torch"""
 Floats = NDArray[np.float64]
 
 
@@ -26,7 +26,7 @@ _FLOAT_NAMESPACE = SimpleNamespace(
 
 
 def namespace(array: Array) -> Any:
-    """Return `numpy`, `torch` or a namespace for floats, with `where` and the functions of `_FLOAT_NAMESPACE`."""
+    """Return `numpy`, `torch`, or `_FLOAT_NAMESPACE` for floats; all have the functions of `_FLOAT_NAMESPACE`."""
     if type(array) is float:
         return _FLOAT_NAMESPACE
     if isinstance(array, (np.ndarray, np.generic)):
@@ -46,7 +46,7 @@ def clamp_min(array: Array, low: Array) -> Array:
     if type(array) is float:
         return low if array < low else array
     if isinstance(array, (np.ndarray, np.generic)):
-        return np.maximum(array, low)  # what `clip` does in the end, in a third of the time on few rows
+        return np.maximum(array, low)  # on few rows in a third of the time of `clip`
     return array.clip(low, None)
 
 
@@ -65,17 +65,17 @@ def square_root(array: Array) -> Array:
         return math.sqrt(array)
     if isinstance(array, (np.ndarray, np.generic)):
         return np.sqrt(array)
-    # torch takes square roots from MKL, which differ between processor models: see `unjam.kernels`.
+    # Square roots of MKL, which torch calls, differ between processor models: see `unjam.kernels`.
     return array.rsqrt().reciprocal()
 
 
 def as_indices(values: Array) -> Array:
-    """Return whole numbers as indices of arrays, through which no gradient flows."""
+    """Return whole numbers as integers, without gradients, for indexing."""
     return values.astype(np.int64) if isinstance(values, np.ndarray) else values.detach().long()
 
 
 def copy_array(values: Array) -> Array:
-    """Return a copy with the same order in memory, in which sums are fast, through which gradients flow."""
+    """Return a copy with the same order in memory, on which the speed of sums depends; gradients flow through it."""
     return values.copy("K") if isinstance(values, np.ndarray) else values.clone()
 
 
@@ -87,34 +87,37 @@ def replace_entries(values: Array, index: Any, source: Array, source_index: Any)
 
 
 def replace_columns(values: Any, columns: Any, source: Any, source_columns: Any) -> Any:
-    """Return arrays, also in tuples and lists, with columns of `source` in place of some along the last axis."""
+    """Return arrays, also nested in tuples and lists, with `source_columns` of `source` in place of `columns`.
+
+    Columns are entries along the last axis.
+    """
     if isinstance(values, tuple | list):
         pairs = zip(values, source, strict=True)
-        parts = [replace_columns(target, columns, other, source_columns) for target, other in pairs]
-        return type(values)(*parts) if hasattr(values, "_fields") else type(values)(parts)
+        items = [replace_columns(item, columns, source_item, source_columns) for item, source_item in pairs]
+        return type(values)(*items) if hasattr(values, "_fields") else type(values)(items)
     if not hasattr(values, "shape"):
         return values
     return replace_entries(values, np.s_[..., columns], source, np.s_[..., source_columns])
 
 
 def replace_padded_rows(values: Any, rows: Any, source: Any, source_rows: Any, padding: Any) -> Any:
-    """Return an array (..., n, m) with rows of `source` (..., k, l) in place of some; the shorter gets `padding`."""
+    """Return an array (..., n, m) with rows of `source` (..., k, l) in place of `rows`; `padding` fills short rows."""
     width = max(values.shape[-1], source.shape[-1])
-    found, other = (
+    padded_values, padded_source = (
         np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, width - array.shape[-1])], constant_values=padding)
         for array in (values, source)
     )
-    found[..., rows, :] = other[..., source_rows, :]
-    return found
+    padded_values[..., rows, :] = padded_source[..., source_rows, :]
+    return padded_values
 
 
 def as_column(array: Array) -> Array:
-    """Return an array of shape (n,) as (n, 1); a float as a tuple of one."""
+    """Return an array of shape (n,) with shape (n, 1), or a float as a tuple."""
     return (array,) if type(array) is float else array[..., None]
 
 
 def stack_columns(columns: tuple[Array, ...]) -> Array:
-    """Return arrays of shape (n,) as the columns of (n, m); floats stay a tuple of floats."""
+    """Return m arrays of shape (n,) as columns of one array (n, m); return a tuple of floats unchanged."""
     first = columns[0]
     if type(first) is float:
         return columns
@@ -124,7 +127,7 @@ def stack_columns(columns: tuple[Array, ...]) -> Array:
 
 
 def join_columns(blocks: list[Array]) -> Array:
-    """Return blocks of shape (n, m) concatenated along the columns; tuples of floats as one tuple."""
+    """Concatenate blocks of shape (n, m) along their columns, or tuples of floats to one tuple."""
     first = blocks[0]
     if len(blocks) == 1:
         return first

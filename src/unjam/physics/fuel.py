@@ -1,7 +1,7 @@
-"""Fuel of a car from the power at its wheels: a model without maps of an engine, with a realistic idle rate.
+"""Fuel rate of a car from the power at its wheels, without an engine map, with a realistic rate at idle.
 
 Source: Treiber and Kesting 2013, Traffic Flow Dynamics, section 20.4: F = m a + c_r m g + 1/2 c_d rho A v^2,
-power P_0 + v F, 300 ml/kWh, and no fuel while the car brakes with its engine. Numbers of a mid-size petrol car.
+power P_0 + v F, 300 ml/kWh, and no fuel during engine braking. The numbers are those of a mid-size petrol car.
 """
 
 from typing import NamedTuple
@@ -13,7 +13,7 @@ JOULES_PER_KWH = 3.6e6
 
 
 class Car(NamedTuple):
-    """What the fuel of a car depends on."""
+    """Parameters of a car that determine its fuel rate."""
 
     mass: float = 1500.0  # mass with driver [kg]
     rolling_resistance: float = 0.015
@@ -26,7 +26,7 @@ MID_SIZE_CAR = Car()
 
 
 def fuel_rate(speed: Array, acceleration: Array, car: Car = MID_SIZE_CAR) -> Array:
-    """Return the fuel rate [ml/s] at a speed [m/s] and an acceleration [m/s2] on a level road, of their shape."""
+    """Return the fuel rate [ml/s] on a level road for speeds [m/s] and accelerations [m/s2] of the same shape."""
     drag = 0.5 * AIR_DENSITY * car.drag_area * speed * speed
     force = car.mass * (acceleration + car.rolling_resistance * GRAVITY) + drag
     return clamp_min(car.base_power + speed * force, 0.0) * (car.consumption / JOULES_PER_KWH)

@@ -25,13 +25,13 @@ class IDMParameters(Subclassable):
     comfortable_deceleration: Positive = 1.5
     """b [m/s2]"""
     exponent: Annotated[float, Field(ge=0.1)] = 4.0
-    """delta; with much smaller ones no equilibrium can be computed"""
+    """delta; smaller values allow no computation of equilibria"""
     minimum_gap: Positive = 2.0
-    """s0 [m], bumper to bumper at standstill"""
+    """s0 [m], bumper-to-bumper gap at standstill"""
 
     @cached_property
     def interaction_scale(self) -> float:
-        """2 sqrt(a b) of Eq. 6 [m/s2]; cached, because a simulator needs it in every step."""
+        """2 sqrt(a b) of Eq. 6 [m/s2], cached for use in every step of a simulator."""
         return 2.0 * square_root(self.max_acceleration * self.comfortable_deceleration)
 
 
@@ -53,7 +53,7 @@ class IDMArrays(NamedTuple):
 
 PAPER_IDM = IDMParameters()
 IDM_PARAMETER_NAMES = IDMArrays._fields
-BISECTION_STEPS = 60  # bisections for an equilibrium speed that is exact to the last bit
+BISECTION_STEPS = 60  # number of bisections that make an equilibrium speed exact to the last bit
 
 
 def stack_idm_parameters(drivers: Sequence[IDMParameters]) -> IDMArrays:
@@ -62,13 +62,13 @@ def stack_idm_parameters(drivers: Sequence[IDMParameters]) -> IDMArrays:
 
 
 def desired_gap(speed: Array, approach_rate: Array, parameters: IDMParameters | IDMArrays = PAPER_IDM) -> Array:
-    """Return the desired gap s* [m] (Eq. 6), bumper to bumper; the approach rate is relative to the leader [m/s]."""
+    """Return the desired bumper-to-bumper gap s* [m] (Eq. 6); `approach_rate` is speed minus leader speed [m/s]."""
     p = parameters
     return p.minimum_gap + clamp_min(speed * p.time_headway + speed * approach_rate / p.interaction_scale, 0.0)
 
 
 def fast_power(base: Array, exponent: Array) -> Array:
-    """Return `base` to the power of `exponent`; the fourth power is 50 times faster than `pow`, up to rounding."""
+    """Return `base` to the power of `exponent`; fourth powers are 50 times faster than `pow`, up to rounding."""
     if type(exponent) is float and exponent == 4.0:
         square = base * base
         return square * square
@@ -84,8 +84,8 @@ def idm_acceleration(
 ) -> Array:
     """Return the acceleration of a driver behind a leader [m/s2] (Eq. 5), unbounded below as the gap closes.
 
-    Speeds [m/s] and bumper-to-bumper gap [m], which must be positive, have the same shape. The parameters are those of
-    one driver, or of each row's; `power` computes powers: `pow`, or `fast_power`.
+    Speeds [m/s] and bumper-to-bumper gaps [m], which must be positive, have the same shape. `parameters` are those of
+    one driver or of each row. `power` computes powers: `pow` or `fast_power`.
     """
     p = parameters
     free_road = power(speed / p.desired_speed, p.exponent)
@@ -96,7 +96,7 @@ def idm_acceleration(
 def desired_speed_from_acceleration(
     acceleration: Array, speed: Array, parameters: IDMParameters | IDMArrays = PAPER_IDM
 ) -> Array:
-    """Return the desired speed [m/s] of a driver without a leader with this acceleration (Eq. 5)."""
+    """Return the desired speed [m/s] of a driver without a leader, given the acceleration (Eq. 5)."""
     return speed / (1.0 - acceleration / parameters.max_acceleration) ** (1.0 / parameters.exponent)
 
 
@@ -109,11 +109,11 @@ def equilibrium_gap(speed: float, parameters: IDMParameters = PAPER_IDM) -> floa
 
 
 def equilibrium_speed(gap: float, parameters: IDMParameters = PAPER_IDM) -> float:
-    """Return the inverse of `equilibrium_gap` [m/s]; 0 where the gap is not above the standstill gap."""
+    """Return the inverse of `equilibrium_gap` [m/s]; 0 if the gap is not above the minimum gap."""
     if gap <= parameters.minimum_gap:
         return 0.0
     low, high = 0.0, parameters.desired_speed
-    # Own bisection: importing the root finder of scipy would add half a second to the start of a worker.
+    # Importing a root finder of scipy would add half a second to the start of a worker.
     for _ in range(BISECTION_STEPS):
         middle = (low + high) / 2.0
         if equilibrium_gap(middle, parameters) < gap:

@@ -1,4 +1,4 @@
-"""Motion of a vehicle in one step and until standstill, exactly as by SUMO's Euler update.
+"""Motion of a vehicle in one step and until standstill, exactly as in SUMO's Euler update.
 
 Arguments have any shapes, which broadcast together; units are m, s, m/s and m/s2.
 Source: https://sumo.dlr.de/docs/Simulation/Basic_Definition.html
@@ -11,12 +11,12 @@ HALTING_SPEED = 0.1
 
 
 def next_speed(speed: Array, acceleration: Array, time_step: float) -> Array:
-    """Return the speed one step later, v' = max(0, v + a dt): vehicles do not drive backwards."""
+    """Return the speed after a step, v' = max(0, v + a dt); vehicles do not drive backwards."""
     return clamp_min(speed + acceleration * time_step, 0.0)
 
 
 def next_position(position: Array, new_speed: Array, time_step: float) -> Array:
-    """Return the position one step later, x' = x + v' dt, with the speed *after* the step."""
+    """Return the position after a step, x' = x + v' dt, with the speed *after* the step."""
     return position + new_speed * time_step
 
 
@@ -33,8 +33,8 @@ def gap_on_loop(position: Array, leader_position: Array, loop_length: Array, lea
 def stopping_distance(speed: Array, braking: Array, time_step: float) -> Array:
     """Return the distance that a vehicle drives if it brakes with `braking` from the next step on [m].
 
-    With v_j = max(0, v - j b h) after j steps of length h it is h (v_1 + v_2 + ...). The first
-    n = floor(v / (b h)) terms are not zero, so the sum is h (n v - b h n (n + 1) / 2).
+    With v_j = max(0, v - j b h) after j steps of length h, the distance is h (v_1 + v_2 + ...). Its first
+    n = floor(v / (b h)) terms are not zero, so that the sum is h (n v - b h n (n + 1) / 2).
     """
     change = braking * time_step
     steps = namespace(speed).floor(speed / change)
@@ -44,7 +44,7 @@ def stopping_distance(speed: Array, braking: Array, time_step: float) -> Array:
 def max_speed_to_stop(distance: Array, braking: float, time_step: float) -> Array:
     """Return the highest speed after this step from which a vehicle still stops within `distance` [m/s].
 
-    The result v solves v h + `stopping_distance`(v) = `distance`, piecewise linear in v; zero if it is not positive.
+    The speed v solves v h + `stopping_distance`(v) = `distance`, which is piecewise linear in v. It is at least zero.
     """
     change = braking * time_step
     room = clamp_min(distance, 0.0) / time_step

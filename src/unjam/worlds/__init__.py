@@ -1,1 +1,1 @@
-"""Where drivers drive: the actual simulator and every view of it, behind one contract."""
+"""Worlds in which drivers drive CAVs, in SUMO or in batches, with the records and rewards of their episodes."""

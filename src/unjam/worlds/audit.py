@@ -11,37 +11,37 @@ from unjam.drivers.safety import FollowingState
 from unjam.physics.arrays import Floats
 
 BRAKING_THRESHOLDS = (3.5, 4.5, 9.0)
-"""braking that is counted [m/s2]: limit of ISO 15622 above 20 m/s, hard braking, and the limit on dry asphalt"""
+"""thresholds of braking [m/s2]: limit of ISO 15622 above 20 m/s, hard braking, and the limit on dry asphalt"""
 BRAKING_TOLERANCE = 1e-6
-"""tolerance of a braking threshold [m/s2]"""
+"""rounding tolerance of these thresholds [m/s2]"""
 OVERRIDE_TOLERANCE = 1e-4
-"""change of a command that is no override [m/s2]: a few micrometers near the minimum gap, where SUMO stops creeping"""
+"""largest change of a command that does not count as an override [m/s2]: SUMO stops creeping at the minimum gap"""
 MIN_TIME_GAP_SPEED = 1.0
-"""speed above which time gaps matter for safety [m/s]"""
+"""speed above which time gaps are evaluated [m/s]"""
 SHORT_TIME_GAP = 1.0
 """time gap below which a step counts as short [s]"""
 HUMAN_DRIVER, CAV_DRIVER, CAV_AFTER_CUT_IN = 0, 1, 2
-"""driver kinds of a braking vehicle; the last one is a CAV just after another vehicle cut in"""
+"""kinds of drivers with separate braking statistics; the last kind is a CAV just after another vehicle cut in"""
 CUT_IN_SECONDS = 3.0
 """time after a change of leader in which braking is counted separately [s]"""
 STEADY_FOLLOWING_SECONDS = 5.0
 """time behind the same leader in which car following is not yet counted [s]"""
 BRAKING_BLOCK_STEPS = 1000
-"""steps that are counted together: counting each step would take longer than simulating it"""
+"""number of steps that are counted together, because counting each step would take longer than simulating it"""
 
 
 @dataclass(frozen=True)
 class BrakingStatistics:
-    """Statistics of the braking of some vehicles; a sample is one vehicle in one simulation step."""
+    """Statistics of the braking of several vehicles; a sample is one vehicle in one simulation step."""
 
     max_braking: float = 0.0
     """maximum braking [m/s2]; zero without braking"""
     exceedances: tuple[int, ...] = (0,) * len(BRAKING_THRESHOLDS)
-    """samples beyond each of `BRAKING_THRESHOLDS`"""
+    """number of samples beyond each of `BRAKING_THRESHOLDS`"""
     samples: int = 0
 
     def __add__(self, other: "BrakingStatistics") -> "BrakingStatistics":
-        exceedances = tuple(sum(both) for both in zip(self.exceedances, other.exceedances, strict=True))
+        exceedances = tuple(sum(pair) for pair in zip(self.exceedances, other.exceedances, strict=True))
         return BrakingStatistics(max(self.max_braking, other.max_braking), exceedances, self.samples + other.samples)
 
 
@@ -52,7 +52,7 @@ class FollowingStatistics:
     min_time_gap: float = np.inf
     """minimum time gap above 1 m/s, without recovery after cut-ins [s]"""
     min_time_to_collision: float = np.inf
-    """minimum of gap over closing speed [s]"""
+    """minimum time to collision: gap over closing speed [s]"""
     max_required_braking: float = 0.0
     """maximum deceleration rate to avoid a crash: closing speed squared over twice the gap [m/s2]"""
     share_short_time_gap: float = 0.0
@@ -67,7 +67,7 @@ class FollowingStatistics:
 
 @dataclass(frozen=True)
 class Audit:
-    """The physics of an episode."""
+    """Braking of all vehicles and car following of the CAVs in an episode."""
 
     human_braking: BrakingStatistics = field(default_factory=BrakingStatistics)
     cav_braking: BrakingStatistics = field(default_factory=BrakingStatistics)
@@ -75,7 +75,7 @@ class Audit:
     required_time_gap: float = 0.0
     """time gap that CAVs must keep [s]"""
     has_lanes: bool = False
-    """whether vehicles can cut in: then `following` only contains steady car following"""
+    """whether vehicles can cut in; `following` then contains steady car following only"""
     cut_in_braking: BrakingStatistics = field(default_factory=BrakingStatistics)
     """braking of CAVs just after another vehicle cut in; not part of `cav_braking`"""
 
@@ -91,7 +91,7 @@ def braking_statistics(accelerations: Any) -> BrakingStatistics:
 
 
 class BrakingLog:
-    """Counts the braking of several kinds of drivers, step by step, with constant memory."""
+    """Counts the braking of each kind of driver step by step, with constant memory."""
 
     def __init__(self, step: float) -> None:
         self._step, self._statistics = step, defaultdict[int, BrakingStatistics](BrakingStatistics)
@@ -111,7 +111,7 @@ class BrakingLog:
     def _count_block(self) -> None:
         if self._block:
             speed_changes, kinds = (np.concatenate(parts) for parts in zip(*self._block, strict=True))
-            order = np.argsort(kinds, kind="stable")  # by one pass for each byte of small integers
+            order = np.argsort(kinds, kind="stable")  # a radix sort, fast for small integers
             present, starts = np.unique(kinds[order], return_index=True)
             for kind, changes in zip(present.tolist(), np.split(speed_changes[order], starts[1:]), strict=False):
                 self._statistics[kind] += braking_statistics(changes / self._step)
@@ -119,15 +119,15 @@ class BrakingLog:
 
 
 def is_recovering(was_recovering: Any, seconds: Any, previous: FollowingState, current: FollowingState) -> Any:
-    """Return whether a CAV still recovers from a change of its leader: a short time gap that opens.
+    """Return whether a CAV still recovers from a change of its leader: its time gap is short, but increases.
 
-    It opens in each step after the first 5 s, or the leader is faster; recovery that has ended does not begin again.
-    `was_recovering` and `previous` are those of the previous step behind this leader; they do not matter in the first
-    one, where `seconds` behind it are zero. Source: UN Regulation No. 157, 5.2.3.3.
+    In each step after the first 5 s, the time gap must increase, or the leader must be faster; a recovery that has
+    ended does not start again. `seconds` is the time behind this leader; at zero, the values of the previous step,
+    `was_recovering` and `previous`, are ignored. Source: UN Regulation No. 157, 5.2.3.3.
     """
     is_short = (current.speed > MIN_TIME_GAP_SPEED) & (current.gap < SHORT_TIME_GAP * current.speed)
-    opens = (current.leader_speed > current.speed) | (current.gap * previous.speed > previous.gap * current.speed)
-    return is_short & ((seconds <= 0.0) | (was_recovering & (opens | (seconds <= STEADY_FOLLOWING_SECONDS))))
+    increases = (current.leader_speed > current.speed) | (current.gap * previous.speed > previous.gap * current.speed)
+    return is_short & ((seconds <= 0.0) | (was_recovering & (increases | (seconds <= STEADY_FOLLOWING_SECONDS))))
 
 
 def following_statistics(
@@ -141,26 +141,26 @@ def following_statistics(
 ) -> FollowingStatistics:
     """Return statistics of speeds [m/s] and gaps [m]: shape (steps, CAVs), one `step` [s] apart, NaN without a CAV.
 
-    `is_overridden` are the commands that SUMO changed, `is_yielding` those near a crossing; `in_recovery` moments do
-    not count for time gaps. Sources: TTC after Hayward 1972; DRAC after Almqvist et al. 1991; SAE J2944.
+    `is_overridden` marks commands that SUMO changed, `is_yielding` those near a crossing. Time gaps `in_recovery` are
+    not counted. Sources: TTC after Hayward 1972; DRAC after Almqvist et al. 1991; SAE J2944.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         is_moving, closing = speed > MIN_TIME_GAP_SPEED, speed - leader_speed
         time_gaps = (gap / speed)[is_moving & ~np.asarray(in_recovery, bool)]
         is_closing = (closing > 0) & (gap > 0)
-        times, required = (gap / closing)[is_closing], (closing**2 / (2.0 * gap))[is_closing]
+        times_to_collision, required_braking = (gap / closing)[is_closing], (closing**2 / (2.0 * gap))[is_closing]
         jerks = np.abs(np.diff(speed, 2, axis=0)) / step**2
     overridden, yielding = np.asarray(is_overridden, bool), np.asarray(is_yielding, bool)
     return FollowingStatistics(
         min_time_gap=float(time_gaps.min(initial=np.inf)),
-        min_time_to_collision=0.0 if (gap <= 0).any() else float(times.min(initial=np.inf)),
-        max_required_braking=float(required.max(initial=0.0)),
-        share_short_time_gap=_share(time_gaps < SHORT_TIME_GAP),
+        min_time_to_collision=0.0 if (gap <= 0).any() else float(times_to_collision.min(initial=np.inf)),
+        max_required_braking=float(required_braking.max(initial=0.0)),
+        share_short_time_gap=_true_share(time_gaps < SHORT_TIME_GAP),
         max_jerk=float(np.nanmax(jerks, initial=0.0)),
-        override_share=_share(overridden & ~yielding),
-        yield_share=_share(overridden & yielding),
+        override_share=_true_share(overridden & ~yielding),
+        yield_share=_true_share(overridden & yielding),
     )
 
 
-def _share(flags: NDArray[np.bool_]) -> float:
+def _true_share(flags: NDArray[np.bool_]) -> float:
     return float(flags.mean()) if flags.size else 0.0

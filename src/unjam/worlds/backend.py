@@ -1,4 +1,4 @@
-"""Backends: simulators that make worlds of scenarios. SUMO and the batch are two of them; users bring their own."""
+"""Backends: simulators that make worlds of scenarios. the package has SUMO and the batch, and users can add others."""
 
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
@@ -19,16 +19,16 @@ TEXT_MEMBERS = frozenset({"title", "reward", "description", "limit_description",
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """What a driver, and the user of an episode, want of a world; a backend may ignore what it does not have."""
+    """Requests of a driver and of the user of an episode to a world; a backend may ignore those it does not support."""
 
     measured_fields: Collection[str] = ()
     """names of the optional fields of `LocalState` that the driver reads, such as `lane_speeds`; a world may leave the
-    others None, as measuring them takes time"""
+    others None, because measuring them takes time"""
     record_details: bool = False
     """whether fuel and, on roads with ends, positions (x, y) are recorded"""
     accepts_floats: bool = False
     """whether a world with a single CAV may give states as floats instead of arrays of shape (1,), which is faster;
-    it then says so in `World.is_scalar`"""
+    its `is_scalar` is then True"""
     stop_at_contact: bool = True
     """whether contact of a CAV ends an episode on a user's network; on built-in roads it always does"""
 
@@ -37,13 +37,13 @@ DEFAULT_OPTIONS = WorldOptions()
 
 
 class Backend(Protocol):
-    """A simulator, which carries out or refuses all settings of a scenario and all that the user's own class replaces.
+    """A simulator that applies or refuses each setting of a scenario, and each member that a user's class replaces.
 
-    One that holds resources is a context manager, too, which releases them.
+    A backend with resources to release must be a context manager, too.
     """
 
     def supports(self, scenario: Scenario) -> str:
-        """Return why it cannot simulate a scenario; empty if it can. `unread_reason` refuses unknown settings."""
+        """Return why the backend cannot simulate a scenario; empty if it can. `unread_reason` finds unread settings."""
         ...
 
     def open(
@@ -54,25 +54,25 @@ class Backend(Protocol):
 
 
 BackendLike = str | Backend | type[Backend]
-"""a backend, its class, or its name: `sumo`, `sumo-gui` with SUMO's window, `batch`, or `path.py:name` of either"""
+"""a backend, its class, or a name: `sumo`, `sumo-gui` with SUMO's window, `batch`, or `path.py:name` of one of these"""
 
 
 @contextmanager
 def open_backend(backend: BackendLike) -> Iterator[Backend]:
-    """Yield a given backend, which stays open, or one by name or class, which is closed at the end."""
+    """Yield a backend; a given object stays open, a backend made from a name or a class is closed at the end."""
     if not isinstance(backend, str | type):
         yield check_backend(backend, type(backend).__name__)
         return
-    made = _make_backend(backend)
-    with made if isinstance(made, AbstractContextManager) else nullcontext(made):
-        yield made
+    new_backend = _make_backend(backend)
+    with new_backend if isinstance(new_backend, AbstractContextManager) else nullcontext(new_backend):
+        yield new_backend
 
 
 def _make_backend(backend: str | type[Backend]) -> Backend:
     name = backend if isinstance(backend, str) else backend.__name__
     if isinstance(backend, type) or is_file_reference(name):
-        loaded = backend if isinstance(backend, type) else FileReference.parse(name).load_object()
-        return check_backend(call_backend(name, loaded) if isinstance(loaded, type) else loaded, name)
+        source = backend if isinstance(backend, type) else FileReference.parse(name).load_object()
+        return check_backend(call_backend(name, source) if isinstance(source, type) else source, name)
     if check_backend_name(name) == "batch":
         from unjam.worlds.batch.backend import BatchBackend
 
@@ -83,17 +83,17 @@ def _make_backend(backend: str | type[Backend]) -> Backend:
 
 
 def check_backend_name(name: str) -> str:
-    """Return the name of a backend; raise `InputError` for an unknown one, without reading a file."""
+    """Return the name of a backend; raise `InputError` for an unknown name. No file is read."""
     if name not in BACKEND_NAMES and not is_file_reference(name):
         raise unknown_name("backend", name, [*BACKEND_NAMES, "path.py:name"])
     return name
 
 
 def check_backend(backend: Backend, label: str) -> Backend:
-    """Return a backend; raise `InputError` if it does not have a method of the protocol."""
-    missing = [name for name in ("supports", "open") if not callable(getattr(backend, name, None))]
+    """Return a backend; raise `InputError` if a method of the protocol is missing."""
+    missing = [method for method in ("supports", "open") if not callable(getattr(backend, method, None))]
     if missing:
-        raise InputError(f"backend: {label} has no {' and no '.join(f'{name}()' for name in missing)}")
+        raise InputError(f"backend: {label} has no {' and no '.join(f'{method}()' for method in missing)}")
     return backend
 
 
@@ -101,8 +101,8 @@ def check_backend(backend: Backend, label: str) -> Backend:
 def open_world(
     backend: Backend, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions
 ) -> Iterator[RoadWorld]:
-    """Yield the world of an episode; one of a user's backend is checked, and raises `InputError` if it is faulty."""
-    if is_packaged(type(backend)):  # tested, and their speed matters
+    """Yield the world of an episode; the world of a user's backend raises `InputError` for invalid values."""
+    if is_packaged(type(backend)):  # tested; checks would slow them down
         with backend.open(scenario, seed, options) as world:
             yield world
         return
@@ -117,7 +117,7 @@ def open_world(
 
 
 def backend_notes(backend: BackendLike, scenario: Scenario) -> list[str]:
-    """Return which simulator made the results of a scenario, and how they compare with SUMO's; nothing for SUMO."""
+    """Return a note on the simulator of a scenario, and how its results compare with SUMO's; no note for SUMO."""
     label = backend_label(backend)
     if label in ("sumo", "sumo-gui"):
         return []
@@ -130,10 +130,10 @@ def backend_notes(backend: BackendLike, scenario: Scenario) -> list[str]:
 
 
 def unread_reason(scenario: Scenario, kind: type[Scenario], names: Collection[str]) -> str:
-    """Return why a backend for one `kind` of road, which reads only the members `names`, cannot simulate a scenario.
+    """Return why a backend that reads only the members `names` of a class `kind` cannot simulate a scenario.
 
-    Empty if it can. `SimulatedRoad` calls `draw`, which reads the settings of the road and `population`, and itself
-    reads `simulation_step`, `horizon`, `action_limit`, `safety`, `actuator` and `sensors`.
+    Empty if it can. A `SimulatedRoad` reads `simulation_step`, `horizon`, `action_limit`, `safety`, `actuator` and
+    `sensors`, and calls `draw`, which reads the settings of the road and `population`.
     """
     if not isinstance(scenario, kind):
         return f"{scenario.title} is not a {kind.title}"
@@ -149,12 +149,12 @@ def unread_reason(scenario: Scenario, kind: type[Scenario], names: Collection[st
 
 
 def check_support(backend: Backend, *scenarios: Scenario) -> None:
-    """Raise `InputError` with the reason if a backend cannot simulate one of the scenarios."""
+    """Raise `InputError` with the reason of a backend that cannot simulate one of the scenarios."""
     label = backend_label(backend)
     for scenario in scenarios:
         reason = call_backend(label, backend.supports, scenario)
         if not isinstance(reason, str):
-            allowed = "a reason why not as text, else ''"
+            allowed = "a reason as text, or '' if the scenario is supported"
             raise InputError(f"backend: {label}: supports() returns {reason!r}; allowed: {allowed}")
         if reason:
             raise InputError(f"scenario: {reason}")

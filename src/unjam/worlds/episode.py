@@ -30,7 +30,7 @@ from unjam.worlds.world import ProgressCallback
 
 _generators_lock = threading.Lock()
 _generator_states: list[tuple[Any, Any, Any]] = []
-"""states of the global generators before the first of the running blocks of `seeded_generators`, for each of them"""
+"""for each running block of `seeded_generators`, the states of the global generators before the first block"""
 
 
 @dataclass(frozen=True)
@@ -64,18 +64,18 @@ def run_episode(
     """Run one episode and return its record.
 
     The result depends only on scenario, driver, seed, reward, `explore`, backend and `stop_at_contact`, not on the
-    process, earlier episodes in it, or the clock. For the user's code the global generators are seeded meanwhile.
+    process, its earlier episodes, or the clock. The global random generators are seeded for the user's code.
 
     Args:
         scenario: road, traffic and horizon: a `Scenario`, its class or its name, as in `unjam.make_scenario`.
-        driver: of every CAV: a driver, an object with `act` and `initial_memory`, a class of them, or a function of the
-            state.
-        seed: an integer or several; all random numbers come from them.
+        driver: drives each CAV: a driver, an object with `act` and `initial_memory`, the class of one, or a function
+            of the state.
+        seed: one integer or several, from which all random numbers come.
         reward: a name, `path.py:name`, or a function of an `Outcome`; empty: the scenario's own.
-        explore: factor of a residual driver's exploration noise: 1, -1 for the opposite sign, or 0.
+        explore: factor of the exploration noise of a residual driver: 1, -1 for the opposite sign, or 0.
         record_details: whether fuel and, on roads with ends, positions (x, y) are recorded (10 % slower).
         backend: the simulator: `sumo`, `batch`, `path.py:name`, or an object, which stays open for other episodes.
-        on_progress: called now and then with the number of control steps made.
+        on_progress: called regularly with the number of control steps so far.
         stop_at_contact: whether contact of a CAV ends an episode on a user's network, as in training. Otherwise the
             traffic goes on as in plain SUMO, and the contact is recorded.
 
@@ -89,11 +89,12 @@ def run_episode(
     """
     scenario, seed = make_scenario(scenario), as_seed(seed)
     with seeded_generators(seed):
-        driver = as_driver(driver, scenario.control_step)  # makes an object of a class
+        driver = as_driver(driver, scenario.control_step)  # may call a class of the user
     check_can_drive(driver, scenario)
     reward_function = make_reward(reward or scenario.reward)
-    needs = driver.requirements(scenario.interface)
-    options = WorldOptions(needs.measured_fields, record_details, not needs.needs_arrays, stop_at_contact)
+    requirements = driver.requirements(scenario.interface)
+    accepts_floats = not requirements.needs_arrays
+    options = WorldOptions(requirements.measured_fields, record_details, accepts_floats, stop_at_contact)
     with seeded_generators(seed), open_backend(backend) as simulator:
         check_support(simulator, scenario)
         with open_world(simulator, scenario, seed, options) as world:
@@ -106,18 +107,18 @@ def run_episode(
 def seeded_generators(seed: Sequence[int]) -> Iterator[None]:
     """Seed the global generators of Python, NumPy and torch (on the CPU) for code of the user.
 
-    torch is seeded when the code imports it. The generators are restored when the last of several blocks ends; other
-    threads must not draw from them meanwhile.
+    torch is seeded at the latest when it is imported. The generators are restored when the last of several blocks
+    ends; until then, other threads must not draw from them.
     """
-    numbers, torch = np.random.SeedSequence(seed).generate_state(4), sys.modules.get("torch")
-    torch_seeder = _TorchSeeder(int(numbers[0]))
+    seed_words, torch = np.random.SeedSequence(seed).generate_state(4), sys.modules.get("torch")
+    torch_seeder = _TorchSeeder(int(seed_words[0]))
     with _generators_lock:
         states = random.getstate(), np.random.get_state(), torch and torch.get_rng_state()
         _generator_states.append(_generator_states[0] if _generator_states else states)
-        random.seed(numbers.tobytes())
-        np.random.seed(numbers)
+        random.seed(seed_words.tobytes())
+        np.random.seed(seed_words)
         if torch:
-            torch.default_generator.manual_seed(int(numbers[0]))
+            torch.default_generator.manual_seed(int(seed_words[0]))
         else:
             sys.meta_path.insert(0, torch_seeder)
     try:
@@ -136,7 +137,7 @@ def seeded_generators(seed: Sequence[int]) -> Iterator[None]:
 
 
 class _TorchSeeder(MetaPathFinder):
-    """Seeds torch's generator right after its first import."""
+    """An import hook that seeds the generator of torch right after the first import of torch."""
 
     def __init__(self, seed: int) -> None:
         self._seed = seed
@@ -163,18 +164,18 @@ class _TorchSeeder(MetaPathFinder):
 
 
 def as_seed(seed: SupportsIndex | Sequence[int]) -> tuple[int, ...]:
-    """Return a seed's integers; raise `InputError` if one is negative or no integer."""
-    numbers: Any = seed if isinstance(seed, Sequence | np.ndarray) else [seed]
-    return tuple(check_integer("seed", number, 0) for number in numbers)
+    """Return a seed as a tuple of integers; raise `InputError` for negative numbers and other values."""
+    values: Any = seed if isinstance(seed, Sequence | np.ndarray) else [seed]
+    return tuple(check_integer("seed", value, 0) for value in values)
 
 
 def check_can_drive(driver: Driver, scenario: Scenario, label: str = "driver: it") -> None:
-    """Raise `InputError` if a scenario does not meet the requirements of a driver, which is called `label`."""
+    """Raise `InputError`, which starts with `label`, if a scenario does not meet the requirements of a driver."""
     _check_requirements(driver.requirements(scenario.interface), scenario, label)
 
 
 def check_policy_inputs(features: Sequence[NetworkInput], scenario: Scenario, context: str) -> None:
-    """Raise `InputError` if a scenario does not meet the requirements of a feature."""
+    """Raise `InputError`, which starts with `context`, if a scenario does not meet the requirements of a feature."""
     for name in features:
         _check_requirements(feature(name).requirements, scenario, f"{context}: {name!r}")
 
@@ -185,14 +186,14 @@ def _check_requirements(requirements: Requirements, scenario: Scenario, label: s
 
 
 def check_has_cavs(episode: Episode, driver: Driver) -> None:
-    """Raise `NoCavError` if a driver had no CAV."""
+    """Raise `NoCavError` if a driver that must control CAVs had none in an episode."""
     if not episode.cav_ids and not driver.is_driven_by_simulator:
         steps = format_count(episode.control_steps, "control step")
         raise NoCavError(f"no CAV was on the road in {steps}: make more vehicles CAVs")
 
 
 def can_drive(driver: Driver, scenario: Scenario) -> bool:
-    """Return whether a driver can drive a scenario, if its time step is right: some need a loop, or a ramp."""
+    """Return whether a scenario meets the requirements of a driver, such as a loop or a ramp, except time steps."""
     road = scenario.interface
     return not driver.requirements(road)._replace(time_steps=frozenset()).unmet_reason(road)
 

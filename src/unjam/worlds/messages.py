@@ -1,4 +1,4 @@
-"""Messages between processes over pipes: frames of JSON and arrays. Nothing is ever unpickled."""
+"""Messages between processes over pipes: JSON and arrays, without pickle."""
 
 import json
 import os
@@ -23,7 +23,7 @@ ARRAY_KINDS = "biuf"
 
 
 def start_child(module: str, stderr: IO[bytes] | None = None, **environment: str) -> subprocess.Popen[bytes]:
-    """Start `python -m module`, a process that answers requests, with changes to its environment."""
+    """Start `python -m module`, a process that answers requests; `environment` has additional variables."""
     return subprocess.Popen(
         python_command("-m", module),
         stdin=subprocess.PIPE,
@@ -35,23 +35,23 @@ def start_child(module: str, stderr: IO[bytes] | None = None, **environment: str
 
 
 def open_answer_pipe() -> IO[bytes]:
-    """Return the pipe for the answers of this process, which from now on prints to its standard error."""
+    """Return the pipe for the answers of this process, and redirect its standard output to its standard error."""
     exit_with_parent(signal.SIGKILL)
     isolate_matplotlib()
     output = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # SUMO and user code may print: not into the answers
+    os.dup2(2, 1)  # what SUMO and user code print must not mix with the answers
     return output
 
 
 def answer_requests(answer: Callable[[dict[str, Any], Arrays], None]) -> None:
-    """Call `answer` with each request from standard input until the parent closes it, or one of the pipes."""
+    """Call `answer` with each request from standard input until the parent closes a pipe."""
     with suppress(BrokenPipeError, EOFError):
         while True:
             answer(*read_message(sys.stdin.buffer))
 
 
 def write_message(pipe: IO[bytes], content: dict[str, Any], arrays: Arrays | None = None) -> None:
-    """Write `content` as JSON, and named arrays, which are removed once written: they may be hours of traffic."""
+    """Write `content` as JSON, then `arrays` by name; each is removed when written, because arrays may be large."""
     unwritten = {} if arrays is None else arrays
     for name, array in unwritten.items():
         unwritten[name] = array = np.asarray(array, order="C")
@@ -66,12 +66,12 @@ def write_message(pipe: IO[bytes], content: dict[str, Any], arrays: Arrays | Non
 
 
 def read_message(pipe: IO[bytes]) -> tuple[dict[str, Any], Arrays]:
-    """Return the next message; raise `EOFError` if the other side has closed the pipe."""
+    """Return content and arrays of the next message; raise `EOFError` if the other process has closed the pipe."""
     lengths = _LENGTHS.unpack(_read_exactly(pipe, _LENGTHS.size))
     content, shapes = (json.loads(_read_exactly(pipe, length)) for length in lengths)
     arrays: Arrays = {}
-    for name, kind, shape in shapes:
-        dtype = np.dtype(kind)
+    for name, type_text, shape in shapes:
+        dtype = np.dtype(type_text)
         if dtype.kind not in ARRAY_KINDS:
             raise ValueError(f"{name}: an array of {dtype} is not allowed")
         arrays[name] = np.empty(shape, dtype)
@@ -80,7 +80,7 @@ def read_message(pipe: IO[bytes]) -> tuple[dict[str, Any], Arrays]:
 
 
 def has_message(pipe: IO[bytes], seconds: float) -> bool:
-    """Return whether an answer or the end arrives within a time; True at once where pipes cannot be polled."""
+    """Return whether a message or the end of the pipe arrives in time; True where pipes cannot be polled."""
     if not hasattr(select, "poll"):
         return True
     poller = select.poll()
@@ -89,7 +89,7 @@ def has_message(pipe: IO[bytes], seconds: float) -> bool:
 
 
 def _array_bytes(array: np.ndarray) -> memoryview:
-    return array.reshape(-1).view(np.uint8).data  # shares its memory
+    return array.reshape(-1).view(np.uint8).data  # shares the memory of the array
 
 
 def _read_exactly(pipe: IO[bytes], length: int) -> bytes:
@@ -102,5 +102,5 @@ def _read_into(pipe: Any, buffer: memoryview) -> None:
     while buffer:
         count = pipe.readinto(buffer)
         if not count:
-            raise EOFError("the other side closed the pipe")
+            raise EOFError("the other process has closed the pipe")
         buffer = buffer[count:]

@@ -1,7 +1,6 @@
-"""The log of an episode on a road with ends, and the fields of the record made from it.
+"""The log of an episode on a road with ends, and the fields of its record.
 
-Each of thousands of vehicles is on the road for a small part of the time: in large tables, those of different times
-share a column.
+Thousands of vehicles are each on the road for a short time; in large tables, vehicles of different times share columns.
 """
 
 from array import array
@@ -21,43 +20,44 @@ from unjam.worlds.world import DriverLog
 
 TRIPS_PER_PROGRESS = 500
 MAX_SNAPSHOT_VEHICLES = 600_000
-"""total number of vehicles in all snapshots: beyond it, only every second moment is kept, then every fourth, ..."""
+"""maximum number of vehicles in all snapshots; beyond it, only snapshots of every second, fourth, ... moment remain"""
 MAX_UNSHARED_CELLS = 2_000_000
-"""cells of a table with one column per vehicle; in larger tables columns are shared"""
+"""maximum number of cells of a table with one column per vehicle; in larger tables vehicles share columns"""
 
 TrackedLeader = tuple[str, FollowingState]
-"""the leader of a CAV, empty without a leader within range, and the state of the CAV behind it"""
+"""id of the leader of a CAV, empty without a leader within range, and the state of the CAV behind the leader"""
 
 
 class TrafficLog:
-    """The vehicles on the road at each moment with their speeds, and snapshots at some moments."""
+    """Ids and speeds of the vehicles on the road at each moment, and snapshots of other quantities at some moments."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
+        """ids of the vehicles on the road at the last moment"""
         self.snapshot_stride = 1
-        self._vehicle_numbers: dict[str, int] = {}
-        self._current_numbers: NDArray[np.int32] = np.zeros(0, np.int32)
-        self._numbers_by_moment: list[NDArray[np.int32]] = []
+        self._vehicle_indices: dict[str, int] = {}
+        self._current_indices: NDArray[np.int32] = np.zeros(0, np.int32)
+        self._indices_by_moment: list[NDArray[np.int32]] = []
         self._speeds: list[Floats] = []
         self._snapshots: dict[int, dict[str, Any]] = {}
         self._snapshot_vehicle_count = 0
 
     def __len__(self) -> int:
-        return len(self._numbers_by_moment)
+        return len(self._indices_by_moment)
 
     @property
     def vehicle_ids(self) -> tuple[str, ...]:
-        """All vehicles, in order of entry."""
-        return tuple(self._vehicle_numbers)
+        """Ids of all vehicles so far, in order of entry."""
+        return tuple(self._vehicle_indices)
 
     def add(self, names: Sequence[str], speeds: Any) -> None:
-        """Add a moment: the vehicles on the road, and their speeds [m/s]."""
-        if names != self.names:  # rarely: otherwise both moments share an array
+        """Add a moment: ids of the vehicles on the road, and their speeds [m/s]."""
+        if names != self.names:  # otherwise both moments share an array
             self.names = list(names)
-            for name in names:
-                self._vehicle_numbers.setdefault(name, len(self._vehicle_numbers))
-            self._current_numbers = np.array(list(map(self._vehicle_numbers.__getitem__, names)), np.int32)
-        self._numbers_by_moment.append(self._current_numbers)
+            for vehicle_id in names:
+                self._vehicle_indices.setdefault(vehicle_id, len(self._vehicle_indices))
+            self._current_indices = np.array(list(map(self._vehicle_indices.__getitem__, names)), np.int32)
+        self._indices_by_moment.append(self._current_indices)
         self._speeds.append(np.array(speeds, np.float64))
 
     @property
@@ -66,84 +66,84 @@ class TrafficLog:
         return (len(self) - 1) % self.snapshot_stride == 0
 
     def add_snapshot(self, quantities: dict[str, Any]) -> None:
-        """Add the snapshot of the last moment: quantities by name, each with values in the order of `names`."""
+        """Add the snapshot of the last moment: values of each quantity in the order of `names`."""
         self._snapshots[len(self) - 1] = quantities
         self._snapshot_vehicle_count += len(self.names)
         while self._snapshot_vehicle_count > MAX_SNAPSHOT_VEHICLES and len(self._snapshots) > 2:
             self.snapshot_stride *= 2
             self._snapshots = {
-                time: snapshot for time, snapshot in self._snapshots.items() if time % self.snapshot_stride == 0
+                moment: snapshot for moment, snapshot in self._snapshots.items() if moment % self.snapshot_stride == 0
             }
-            self._snapshot_vehicle_count = sum(len(self._numbers_by_moment[time]) for time in self._snapshots)
+            self._snapshot_vehicle_count = sum(len(self._indices_by_moment[moment]) for moment in self._snapshots)
 
     def columns(self, groups: Sequence[Hashable]) -> NDArray[np.intp]:
-        """Return a column for each vehicle, given the groups of vehicles that may share columns, in order of entry."""
+        """Return the column of each vehicle, given its group; vehicles of the same group may share columns."""
         if len(self) * len(groups) <= MAX_UNSHARED_CELLS:
             return np.arange(len(groups))
         first, last = np.full(len(groups), len(self)), np.zeros(len(groups), int)
-        for time, row in enumerate(self._numbers_by_moment):
-            first[row], last[row] = np.minimum(first[row], time), time
+        for moment, vehicles in enumerate(self._indices_by_moment):
+            first[vehicles], last[vehicles] = np.minimum(first[vehicles], moment), moment
         return assign_columns(first, last, groups, max(self.snapshot_stride, len(self) // SHARED_COLUMN_FRAMES))
 
     def speeds(self, columns: NDArray[np.intp]) -> Floats:
-        """Return all speeds [m/s], shape (moments, columns); NaN without a vehicle."""
-        return self._table(dict(enumerate(self._speeds)), columns)
+        """Return the speeds at all moments [m/s], shape (moments, columns); NaN without a vehicle."""
+        return self._make_table(dict(enumerate(self._speeds)), columns)
 
     def snapshots(self, name: str, columns: NDArray[np.intp]) -> Floats:
-        """Return a quantity of all snapshots, shape (snapshots, columns, ...); NaN without a vehicle."""
-        return self._table({time: snapshot[name] for time, snapshot in self._snapshots.items()}, columns)
+        """Return a quantity in all snapshots, shape (snapshots, columns, ...); NaN without a vehicle."""
+        return self._make_table({moment: snapshot[name] for moment, snapshot in self._snapshots.items()}, columns)
 
-    def _table(self, values_by_moment: dict[int, Any], columns: NDArray[np.intp]) -> Floats:
+    def _make_table(self, values_by_moment: dict[int, Any], columns: NDArray[np.intp]) -> Floats:
         shape = next((np.shape(values)[1:] for values in values_by_moment.values()), ())
         table = np.full((len(values_by_moment), int(columns.max(initial=-1)) + 1, *shape), np.nan)
-        for row, (time, values) in enumerate(values_by_moment.items()):
-            table[row, columns[self._numbers_by_moment[time]]] = values
+        for row, (moment, values) in enumerate(values_by_moment.items()):
+            table[row, columns[self._indices_by_moment[moment]]] = values
         return table
 
 
 class TripLog:
-    """The CAVs on the road at each moment, their states, and their commands in the control step that follows."""
+    """The CAVs on the road at each moment, their states, and their commands in the next control step."""
 
     def __init__(self) -> None:
         self.cav_ids: list[Sequence[str]] = []
         self.states: list[LocalState] = []
         self.applied_accelerations: list[list[float]] = []
         self.filter_brakings: list[list[float]] = []
-        """reductions by the safety filter"""
+        """reductions of accelerations by the safety filter"""
         self.shield_brakings: list[list[float]] = []
-        """braking that SUMO added; these three lists [m/s2] have one entry per control step"""
+        """braking that SUMO added; this list and the two above have one entry per control step [m/s2]"""
 
     def trajectories(
         self, driver_log: DriverLog, has_crashed: bool, on_progress: Callable[[], object]
     ) -> tuple[Trajectory, ...]:
-        """Return the trips of at least one control step, in order of entry, after an episode that may have crashed."""
+        """Return the trips that last at least one control step, in order of entry; call `on_progress` regularly."""
         trips = list[tuple[str, list[tuple[int, int]]]]()
-        """vehicle, and its moments and rows; a teleported vehicle that is reinserted starts another trip"""
-        latest = dict[str, list[tuple[int, int]]]()
-        for time, names in enumerate(self.cav_ids):
-            for row, name in enumerate(names):
-                if name not in latest or latest[name][-1][0] < time - 1:
-                    latest[name] = list[tuple[int, int]]()
-                    trips.append((name, latest[name]))
-                latest[name].append((time, row))
+        """vehicle, and its (moment, row) pairs; a teleported vehicle that is reinserted starts another trip"""
+        latest_trips = dict[str, list[tuple[int, int]]]()
+        for moment, cav_ids in enumerate(self.cav_ids):
+            for row, cav_id in enumerate(cav_ids):
+                if cav_id not in latest_trips or latest_trips[cav_id][-1][0] < moment - 1:
+                    latest_trips[cav_id] = list[tuple[int, int]]()
+                    trips.append((cav_id, latest_trips[cav_id]))
+                latest_trips[cav_id].append((moment, row))
         states, trajectories = list(zip(*self.states, strict=True)), list[Trajectory]()
         commands = self.applied_accelerations, self.filter_brakings, self.shield_brakings
-        for number, (name, entries) in enumerate(trips):
-            if number % TRIPS_PER_PROGRESS == 0:
+        for trip_index, (cav_id, entries) in enumerate(trips):
+            if trip_index % TRIPS_PER_PROGRESS == 0:
                 on_progress()
             if len(entries) > 1:
                 start, rows = entries[0][0], np.array([row for _, row in entries])
                 state = LocalState(*(_trip_values(values, entries) for values in states))
                 values = (_trip_values(command, entries[:-1]) for command in commands)
                 terminated = has_crashed and entries[-1][0] == len(self.applied_accelerations)
-                trip = name, number, start, rows, state
+                trip = cav_id, trip_index, start, rows, state
                 trajectories.append(make_trajectory(*trip, *values, terminated=terminated, driver_log=driver_log))
         return tuple(trajectories)
 
 
 def _trip_values(values: Sequence[Any], entries: Sequence[tuple[int, int]]) -> Any:
-    """Return a CAV's values of one quantity at its moments and rows; None if the road does not provide it."""
-    return None if values[0] is None else np.array([values[time][row] for time, row in entries])
+    """Return one quantity of a CAV at its (moment, row) pairs; None if the road does not provide the quantity."""
+    return None if values[0] is None else np.array([values[moment][row] for moment, row in entries])
 
 
 class OpenRoadLog:
@@ -160,15 +160,15 @@ class OpenRoadLog:
         self._kinds = np.zeros(len(names), np.uint8)
 
     def add_step(self, names: Sequence[str], speeds: Floats, cav_ids: Sequence[str]) -> None:
-        """Add the speeds of all vehicles after a simulation step [m/s]; `cav_ids` are those of the driver."""
-        last, is_same = self._speeds, names == self._names
-        if not is_same:  # in few steps, so that the others are fast
-            previous = dict(zip(self._names, last.tolist(), strict=True))
-            last = np.array(list(map(previous.get, names, speeds.tolist())), np.float64)
-        if not is_same or cav_ids is not self._cav_ids:
+        """Add the speeds of all vehicles after a simulation step [m/s]; `cav_ids` are the CAVs with a driver."""
+        last_speeds, has_same_vehicles = self._speeds, names == self._names
+        if not has_same_vehicles:  # rarely
+            speed_by_vehicle = dict(zip(self._names, last_speeds.tolist(), strict=True))
+            last_speeds = np.array(list(map(speed_by_vehicle.get, names, speeds.tolist())), np.float64)
+        if not has_same_vehicles or cav_ids is not self._cav_ids:
             self._kinds = np.array(list(map(set(cav_ids).__contains__, names)), np.uint8)
             self._names, self._cav_ids = list(names), cav_ids
-        self._braking.add(speeds - last, self._driver_kinds())
+        self._braking.add(speeds - last_speeds, self._driver_kinds())
         self._speeds = speeds
 
     def _driver_kinds(self) -> NDArray[np.uint8]:
@@ -181,9 +181,10 @@ class OpenRoadLog:
         teleported: Sequence[str],
         groups: Sequence[Hashable],
     ) -> tuple[NDArray[np.intp], dict[str, Any]]:
-        """Return the column of each vehicle, and the fields of the record; empty `branches`: unknown origins.
+        """Return the column of each vehicle, and the fields of the record by name.
 
-        Only vehicles of one branch and group share columns.
+        `branches` are the origins of the vehicles, empty if unknown. Only vehicles of the same branch and group share
+        columns.
         """
         vehicles, cavs = self.traffic.vehicle_ids, dict.fromkeys(trajectory.vehicle for trajectory in trajectories)
         columns = self.traffic.columns([*zip((name in cavs for name in vehicles), branches, groups, strict=True)])
@@ -205,20 +206,21 @@ class OpenRoadLog:
     def make_audit(self, trajectories: Sequence[Trajectory]) -> audit.Audit:
         """Return the braking in every simulation step, and the CAVs' car following in every control step."""
         moments = max((len(trajectory.states.speed) for trajectory in trajectories), default=0)
-        speed, leader, gap = np.full((3, moments, len(trajectories)), np.nan)
-        for column, each in enumerate(trajectories):
-            rows = slice(len(each.states.speed))
-            speed[rows, column] = each.states.speed
-            leader[rows, column], gap[rows, column] = each.states.leader_speed, each.states.leader_gap
-        added = np.concatenate([np.zeros(0), *(trajectory.shield_braking for trajectory in trajectories)])
-        is_overridden, step = added > audit.OVERRIDE_TOLERANCE, self._scenario.control_step
-        following = audit.following_statistics(speed, leader, gap, step, is_overridden, np.zeros_like(added))
+        speed, leader_speed, gap = np.full((3, moments, len(trajectories)), np.nan)
+        for column, trajectory in enumerate(trajectories):
+            states, rows = trajectory.states, slice(len(trajectory.states.speed))
+            speed[rows, column], leader_speed[rows, column] = states.speed, states.leader_speed
+            gap[rows, column] = states.leader_gap
+        added_braking = np.concatenate([np.zeros(0), *(trajectory.shield_braking for trajectory in trajectories)])
+        is_overridden, step = added_braking > audit.OVERRIDE_TOLERANCE, self._scenario.control_step
+        is_yielding = np.zeros_like(added_braking)
+        following = audit.following_statistics(speed, leader_speed, gap, step, is_overridden, is_yielding)
         human, cav = map(self._braking.statistics, (audit.HUMAN_DRIVER, audit.CAV_DRIVER))
         return audit.Audit(human, cav, following, self._scenario.safety.time_gap)
 
 
 class MultiLaneLog(OpenRoadLog):
-    """The log on a road with lanes: braking after cut-ins counts separately, time gaps not until recovery."""
+    """The log of a road with lanes: braking after cut-ins counts separately, and time gaps count after recovery."""
 
     def __init__(
         self,
@@ -230,29 +232,30 @@ class MultiLaneLog(OpenRoadLog):
         super().__init__(scenario, names, speeds)
         self._tracked_leaders = tracked_leaders
         self._following: dict[str, tuple[str, int, bool, FollowingState]] = {}
-        """state of each CAV: leader, its first step, whether the CAV recovers from the change of leader, last state"""
+        """for each CAV: its leader, first step behind the leader, whether it recovers from the change, and state"""
         self._steady_following = array("d")
-        """steps of CAVs long behind the same leader: speed, leader speed, gap, and recovery"""
+        """speed, leader speed, gap and recovery of CAVs that have followed the same leader for long enough"""
         self._step_count = 0
 
     def _driver_kinds(self) -> NDArray[np.uint8]:
         self._step_count += 1
-        kinds, rows = self._kinds.copy(), {name: row for row, name in enumerate(self._names)}
-        names = [name for name in self._cav_ids if name in rows]
-        for name, (leader, current) in zip(names, self._tracked_leaders(names) if names else (), strict=True):
-            last_leader, since, was_recovering, previous = self._following.get(name, (None, 0, False, current))
-            since = since if leader == last_leader else self._step_count
-            time_behind_leader = (self._step_count - since) * self._scenario.simulation_step
+        kinds, rows = self._kinds.copy(), {vehicle_id: row for row, vehicle_id in enumerate(self._names)}
+        cav_ids = [cav_id for cav_id in self._cav_ids if cav_id in rows]
+        tracked_leaders = self._tracked_leaders(cav_ids) if cav_ids else ()
+        for cav_id, (leader, current) in zip(cav_ids, tracked_leaders, strict=True):
+            last_leader, first_step, was_recovering, previous = self._following.get(cav_id, (None, 0, False, current))
+            first_step = first_step if leader == last_leader else self._step_count
+            time_behind_leader = (self._step_count - first_step) * self._scenario.simulation_step
             if time_behind_leader < audit.CUT_IN_SECONDS:
-                kinds[rows[name]] = audit.CAV_AFTER_CUT_IN
+                kinds[rows[cav_id]] = audit.CAV_AFTER_CUT_IN
             recovers = bool(leader) and audit.is_recovering(was_recovering, time_behind_leader, previous, current)
-            self._following[name] = leader, since, recovers, current
+            self._following[cav_id] = leader, first_step, recovers, current
             if leader and time_behind_leader > audit.STEADY_FOLLOWING_SECONDS:
                 self._steady_following.extend((*current, recovers))
         return kinds
 
     def make_audit(self, trajectories: Sequence[Trajectory]) -> audit.Audit:
-        """Return the audit of every simulation step; overrides and jerk of every control step."""
+        """Return the audit of every simulation step; overrides and jerk are those of control steps."""
         speed, leader_speed, gap, recovers = np.array(self._steady_following, np.float64).reshape(-1, 4).T[:, None]
         step, common = self._scenario.simulation_step, super().make_audit(trajectories)
         steady = audit.following_statistics(speed, leader_speed, gap, step, in_recovery=recovers)

@@ -1,4 +1,4 @@
-"""Roads with one lane and always the same vehicles: neighbors, the log of an episode, and the record made from it."""
+"""Roads with one lane and constant vehicles: neighbors, the log of an episode, and its record."""
 
 from array import array
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ MAX_RECALL_SECONDS = 60.0
 CROSSING_APPROACH_LENGTH = 50.0
 """distance before a crossing on which SUMO's braking counts as yielding [m]"""
 NOISE_BLOCK_STEPS = 100
-"""steps of human speed noise that are drawn at once; the rest of a block is dropped when CAVs take over"""
+"""number of steps of human speed noise drawn at once; the rest of a block is dropped when CAVs take over"""
 
 
 class NeighborIndices(NamedTuple):
@@ -35,7 +35,7 @@ class NeighborIndices(NamedTuple):
 
 
 def loop_neighbors(indices: Any, vehicle_count: int) -> NeighborIndices:
-    """Return the neighbors of vehicles on a loop with one lane. They never change, as overtaking is impossible."""
+    """Return the neighbors of vehicles on a loop with one lane, where neighbors never change."""
     return NeighborIndices(indices, (indices + 1) % vehicle_count, (indices - 1) % vehicle_count)
 
 
@@ -50,12 +50,12 @@ def loop_state(
     """Return the local state of the vehicles `neighbors.own`; floats for integer indices.
 
     Speeds [m/s] and positions of front bumpers, not wrapped [m], are in road order: arrays of shape (vehicles,) or
-    (vehicles, moments), or lists. An infinite `loop_length` [m] is that of a road with ends. `crossings` are ranges
-    where the road crosses itself [m]. `penetration_rate`: as reported by a service; None: there is none.
+    (vehicles, moments), or lists. `loop_length` [m] is infinite on a road with ends. `crossings` are ranges where the
+    road crosses itself [m]. `penetration_rate` is the rate that a service reports; None without a service.
     """
     own, leader, follower = neighbors
     speed, position = speeds[own], positions[own]
-    state = LocalState(  # keyword arguments would take as long as all the rest, in every step of a simulator
+    state = LocalState(  # keyword arguments would double the time of this function, which runs in every step
         speed,
         speeds[leader],
         gap_on_loop(position, positions[leader], loop_length, VEHICLE_LENGTH),
@@ -65,7 +65,7 @@ def loop_state(
         loop_length if type(position) is float else np.full(position.shape, loop_length),
     )
     if loop_length == inf:
-        state = without_loop(state)
+        state = as_open_road_state(state)
     if penetration_rate is not None:
         state = state._replace(penetration_rate=speed * 0.0 + penetration_rate)
     if not crossings:
@@ -75,17 +75,17 @@ def loop_state(
     return state._replace(distance_to_crossing=nearest)
 
 
-def without_loop(state: LocalState) -> LocalState:
-    """Return a state on a road with ends that was computed on an infinite loop."""
+def as_open_road_state(state: LocalState) -> LocalState:
+    """Return a state computed on an infinite loop as a state on a road with ends."""
     speed, gap = state.speed, state.follower_gap
-    follower = observe_neighbor(gap < inf, gap, state.follower_speed, speed)
-    return state._replace(follower_speed=follower[0], follower_gap=follower[1], loop_length=speed * nan)
+    follower_speed, follower_gap = observe_neighbor(gap < inf, gap, state.follower_speed, speed)
+    return state._replace(follower_speed=follower_speed, follower_gap=follower_gap, loop_length=speed * nan)
 
 
 def poses_along(outline: Floats, positions: Floats, loop_length: float) -> Floats:
-    """Return rows (x, y, heading) of vehicles on a closed road, shape (..., 3): [m], and [rad] against the x axis.
+    """Return rows (x, y, heading) of vehicles on a closed road [m, rad], shape (..., 3); heading 0 is the x axis.
 
-    The outline has rows (coordinate along the road, x, y); positions of front bumpers are not wrapped [m], any shape.
+    The outline has rows (coordinate along the road, x, y). Positions of front bumpers are not wrapped [m], any shape.
     """
     (x, y), (rear_x, rear_y) = (
         [np.interp(along % loop_length, outline[:, 0], outline[:, axis]) for axis in (1, 2)]
@@ -96,7 +96,7 @@ def poses_along(outline: Floats, positions: Floats, loop_length: float) -> Float
 
 @dataclass(frozen=True)
 class OrderedRoadLog:
-    """Log of a road: D control steps of S simulation steps in all, N vehicles, C of them CAVs."""
+    """Log of a road with N vehicles, C of them CAVs, over D control steps with S simulation steps in total."""
 
     scenario: Scenario
     road: OrderedRoad
@@ -111,20 +111,20 @@ class OrderedRoadLog:
     safe_accelerations: Floats
     """accelerations after the safety filter [m/s2], shape (S, C); no rows if CAVs stayed human"""
     commanded_speeds: Floats
-    """speeds that follow from them [m/s], shape (S, C); no rows if CAVs stayed human"""
+    """speeds after each step with these accelerations [m/s], shape (S, C); no rows if CAVs stayed human"""
     has_crashed: bool = False
     fuel: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     """fuel rate [mg/s], shape (D, N); (0, 0) if not recorded"""
     penetration_rate: float | None = None
-    """penetration rate as reported to the CAVs; None: not reported"""
+    """penetration rate that is reported to the CAVs; None if it is not reported"""
 
     @property
     def cav_indices(self) -> NDArray[np.intp]:
         """Indices of the CAVs among the vehicles, in road order."""
-        return np.array([self.road.vehicle_ids.index(name) for name in self.road.cav_ids])
+        return np.array([self.road.vehicle_ids.index(cav_id) for cav_id in self.road.cav_ids])
 
     def speeds_and_positions(self) -> tuple[Floats, Floats]:
-        """Return speeds [m/s] and positions [m] in every simulation step, shape (N, S + 1): Euler steps."""
+        """Return speeds [m/s] and positions [m] in every simulation step, shape (N, S + 1), by Euler steps."""
         start = self.start_positions[:, None]
         positions = next_position(start, self.noise_free_speeds.T.cumsum(1), self.scenario.simulation_step)
         return self.speeds.T, np.column_stack([start, positions])
@@ -140,31 +140,31 @@ class OrderedRoadLog:
         driver_log: DriverLog,
         rows: Any,
     ) -> Episode:
-        """Return the record; `rows` are those of the CAVs in the decisions, (C,), or None if these are floats."""
+        """Return the record; `rows` are those of the CAVs in the decisions, (C,), or None if decisions are floats."""
         road, stride = self.road, self.scenario.steps_per_control_step
         speeds, positions = (values[:, ::stride] for values in speeds_and_positions)
         control_steps = speeds.shape[1] - 1
         gaps = gap_on_loop(positions, np.roll(positions, -1, axis=0), road.loop_length, VEHICLE_LENGTH)
-        states, driven = self._local_states(speeds, positions), road.driven_count
+        states, driven_count = self._local_states(speeds, positions), road.driven_count
         applied, filter_braking = self._applied_and_filtered()
         shield_braking = self._added_braking().reshape(control_steps, -1, len(road.cav_ids)).max(1).clip(0.0, None)
         trajectories = list[Trajectory]()
-        for number, name in enumerate(road.cav_ids):
-            entry = number if rows is None else int(rows[number])
+        for index, cav_id in enumerate(road.cav_ids):
+            entry = index if rows is None else int(rows[index])
             entry_rows = None if rows is None else np.full(control_steps + 1, entry)
-            state = states.map(lambda values: np.ascontiguousarray(values[number]))  # noqa: B023
-            commands = (np.ascontiguousarray(values[:, number]) for values in (applied, filter_braking, shield_braking))
-            trip = name, entry, 0, entry_rows, state
+            state = states.map(lambda values: np.ascontiguousarray(values[index]))  # noqa: B023
+            commands = (np.ascontiguousarray(values[:, index]) for values in (applied, filter_braking, shield_braking))
+            trip = cav_id, entry, 0, entry_rows, state
             trajectories.append(make_trajectory(*trip, *commands, terminated=self.has_crashed, driver_log=driver_log))
         return Episode(
             **common_fields,
-            vehicle_ids=road.vehicle_ids[:driven],
+            vehicle_ids=road.vehicle_ids[:driven_count],
             cav_ids=road.cav_ids,
-            speeds=np.ascontiguousarray(speeds[:driven].T),
-            positions=np.ascontiguousarray(positions[:driven].T),
-            gaps=np.ascontiguousarray(gaps[:driven].T),
-            fuel=self.fuel[:, :driven],
-            replayed_motion=np.stack([positions[driven:].T, speeds[driven:].T], -1),
+            speeds=np.ascontiguousarray(speeds[:driven_count].T),
+            positions=np.ascontiguousarray(positions[:driven_count].T),
+            gaps=np.ascontiguousarray(gaps[:driven_count].T),
+            fuel=self.fuel[:, :driven_count],
+            replayed_motion=np.stack([positions[driven_count:].T, speeds[driven_count:].T], -1),
             loop_length=nan if road.loop_length == inf else road.loop_length,
             crossings=road.crossings,
             outline=road.center_line,
@@ -175,7 +175,7 @@ class OrderedRoadLog:
     def _audit(self, speeds: Floats, positions: Floats) -> Audit:
         step, time_gap = self.scenario.simulation_step, self.scenario.safety.time_gap
         states = self._local_states(speeds, positions).map(lambda values: values.T)
-        followed = states.speed, states.leader_speed, states.leader_gap
+        pairs = states.speed, states.leader_speed, states.leader_gap
         accelerations = np.diff(speeds[: self.road.driven_count], axis=1) / step
         is_cav = np.zeros(len(accelerations), bool)
         is_cav[self.cav_indices] = len(self.requested_accelerations) > 0
@@ -187,12 +187,12 @@ class OrderedRoadLog:
         return Audit(
             braking_statistics(accelerations[~is_cav]),
             braking_statistics(accelerations[is_cav]),
-            following_statistics(*followed, step, is_overridden, near_crossing),
+            following_statistics(*pairs, step, is_overridden, near_crossing),
             time_gap,
         )
 
     def _applied_and_filtered(self) -> tuple[Floats, Floats]:
-        """Return the CAVs' mean commands, and the filter's largest reductions of them [m/s2], (D, C) each."""
+        """Return the CAVs' mean filtered commands, and the largest reductions by the filter [m/s2], (D, C) each."""
         stride, requested = self.scenario.steps_per_control_step, self.requested_accelerations
         if len(requested):
             reductions = requested[:, None] - self.safe_accelerations.reshape(len(requested), stride, -1)
@@ -201,17 +201,17 @@ class OrderedRoadLog:
         return actual, np.zeros_like(actual)
 
     def _added_braking(self) -> Floats:
-        """Return the braking that SUMO added to each command in each step [m/s2], shape (S, C)."""
-        moved = self.noise_free_speeds[:, self.cav_indices]
+        """Return the braking that SUMO added to the commands in each step [m/s2], shape (S, C)."""
+        actual_speeds = self.noise_free_speeds[:, self.cav_indices]
         if not len(self.requested_accelerations):
-            return np.zeros_like(moved)
-        # A command beyond the top speed is not carried out, which is no braking.
+            return np.zeros_like(actual_speeds)
+        # Limiting a command to the top speed is not braking.
         commanded = np.minimum(self.commanded_speeds, self.scenario.top_speed)
-        return (commanded - moved) / self.scenario.simulation_step
+        return (commanded - actual_speeds) / self.scenario.simulation_step
 
 
 class OrderedRoadRecorder:
-    """Collects the rows of a `OrderedRoadLog` while an episode runs; `series` has them by name, one after the other."""
+    """Collects the rows of an `OrderedRoadLog` during an episode; `series` has the joined rows of each field."""
 
     def __init__(self, scenario: Scenario, road: OrderedRoad, start_positions: Floats, speeds: Iterable[float]) -> None:
         self._arguments = scenario, road, start_positions
@@ -219,7 +219,7 @@ class OrderedRoadRecorder:
         self.series = {name: array("d") for name in names} | {"speeds": array("d", speeds)}
 
     def make_log(self, **fields: Any) -> OrderedRoadLog:
-        """Return the log so far, with other `fields`."""
+        """Return the log so far; `fields` are its other fields."""
         _, road, _ = self._arguments
         widths: dict[str, int] = dict.fromkeys(("noise_free_speeds", "speeds"), len(road.vehicle_ids))
         for name, values in self.series.items():
@@ -227,7 +227,7 @@ class OrderedRoadRecorder:
         return OrderedRoadLog(*self._arguments, **fields)
 
     def last_applied_acceleration(self) -> Floats:
-        """Return the CAVs' accelerations in the last control step, after the safety filter [m/s2], shape (CAVs,)."""
+        """Return the CAVs' mean accelerations in the last control step, after the filter [m/s2], shape (CAVs,)."""
         scenario, road, _ = self._arguments
         count = len(road.cav_ids) * scenario.steps_per_control_step
         rows = np.array(self.series["safe_accelerations"][-count:]).reshape(-1, len(road.cav_ids))
@@ -235,7 +235,7 @@ class OrderedRoadRecorder:
 
 
 def ordered_scene(road: OrderedRoad, positions: Floats, speeds: Any) -> RoadScene:
-    """Return a picture of all vehicles with positions along the road, not wrapped [m], and speeds [m/s]."""
+    """Return the scene of all vehicles from positions along the road, not wrapped [m], and speeds [m/s]."""
     is_cav = np.isin(road.vehicle_ids, road.cav_ids)
     if len(road.center_line):
         poses, line = poses_along(road.center_line, positions, road.loop_length), road.center_line[:, 1:]

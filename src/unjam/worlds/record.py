@@ -1,4 +1,4 @@
-"""The record of an episode: trajectories of CAVs, speeds and positions of all vehicles, and what was counted."""
+"""The record of an episode: trajectories of CAVs, speeds and positions of all vehicles, and counts of events."""
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from unjam.worlds.audit import Audit
 from unjam.worlds.world import DriverLog
 
 SHARED_COLUMN_FRAMES = 200
-"""frames of an episode: an empty one separates vehicles in a shared column, or one would seem to jump back"""
+"""number of frames of an episode in a video; vehicles that share a column are at least one frame apart"""
 VEHICLE_GROUPS = {
     "cars": ("passenger", "private", "hov", "taxi", "evehicle", "custom1", "custom2"),
     "trucks": ("truck", "trailer", "delivery"),
@@ -33,7 +33,7 @@ class Trajectory:
     vehicle: str
     start_step: int
     states: LocalState
-    """states that the CAV observed, shape (T + 1,): the last entry is the state at the end"""
+    """states that the CAV observed, and its state at the end, shape (T + 1,)"""
     observations: Floats
     """network observation at each action and at the end, shape (actions + 1, inputs); (1, 0) without a network"""
     expert_acceleration: Floats
@@ -55,7 +55,7 @@ class Trajectory:
 
     @property
     def step_slice(self) -> slice:
-        """The control steps of the episode."""
+        """The control steps of the trip in the episode."""
         return slice(self.start_step, self.start_step + len(self.applied_acceleration))
 
     @cached_property
@@ -65,7 +65,7 @@ class Trajectory:
 
     @property
     def actions_and_rewards(self) -> tuple[Floats, Floats]:
-        """The network's residuals, and the sum of rewards while each was held; shape (actions,)."""
+        """The network's residual in each action, and the sum of rewards during the action; shape (actions,)."""
         starts = np.arange(0, len(self.residual), self.action_repeat)
         return self.residual[starts], np.add.reduceat(self.reward, starts)
 
@@ -84,8 +84,8 @@ def make_trajectory(
 ) -> Trajectory:
     """Return the trajectory of a trip with the driver's decisions; arguments are as in `Trajectory`, or as follows.
 
-    `entry_number` counts earlier CAVs; `rows` are the rows among the CAVs in each step, shape (T + 1,), or None if
-    decisions are floats.
+    `entry_number` is the number of CAVs that entered earlier. `rows` has the row of the CAV in each step, shape
+    (T + 1,); None if decisions are floats.
     """
     trip, commands = (vehicle, start_step, states), (applied_acceleration, filter_braking, shield_braking)
     if not driver_log.decisions:
@@ -99,16 +99,16 @@ def make_trajectory(
     observations = [*observations, driver_log.last_observation]
     steps = range(start_step, start_step + len(applied_acceleration))
     actions = [*steps[:: driver_log.action_repeat], steps.stop]
-    if np.size(observations[steps.stop]) == 0:  # a collision between two actions, after which other CAVs drove on
+    if np.size(observations[steps.stop]) == 0:  # a collision between two actions; other CAVs drove on
         actions[-1] = actions[-2]
-    inputs = select(observations, actions).astype(np.float64).reshape(len(actions), -1)
+    observed = select(observations, actions).astype(np.float64).reshape(len(actions), -1)
     decisions, memory = (select(experts, steps), select(residuals, steps)), driver_log.initial_memories[entry_number]
-    return Trajectory(*trip, inputs, *decisions, *commands, memory, driver_log.action_repeat, terminated)
+    return Trajectory(*trip, observed, *decisions, *commands, memory, driver_log.action_repeat, terminated)
 
 
 @dataclass(frozen=True)
 class Trips:
-    """The trips of all n vehicles that were to depart in an episode, with durations so far; arrays have shape (n,).
+    """The trips of all n vehicles with a departure in an episode, until its end; arrays have shape (n,).
 
     Source: https://sumo.dlr.de/docs/Simulation/Output/TripInfo.html
     """
@@ -118,12 +118,12 @@ class Trips:
     depart_delay: Floats = field(default_factory=lambda: np.zeros(0))
     """time that each vehicle waited for its insertion, `departDelay` [s]"""
     duration: Floats = field(default_factory=lambda: np.zeros(0))
-    """time since insertion [s]; 0 of a vehicle that was not inserted"""
+    """time on the road [s]; 0 if the vehicle was not inserted"""
     time_loss: Floats = field(default_factory=lambda: np.zeros(0))
     """time lost by driving below the desired speed, `timeLoss` [s]"""
     has_arrived: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
     entrances: tuple[str, ...] = ()
-    """edge on which each vehicle was inserted; empty: it was not"""
+    """edge on which each vehicle was inserted; empty if it was not inserted"""
     depart_speed: Floats = field(default_factory=lambda: np.zeros(0))
     """speed of each vehicle at its insertion [m/s]"""
 
@@ -139,17 +139,19 @@ class Trips:
 
     @property
     def values_at_end(self) -> dict[str, float]:
-        """Number of vehicles that have not arrived, and share of delay in their travel time; empty without trips."""
-        unfinished = ~self.has_arrived
-        delay, spent = (float(values[unfinished].sum()) for values in (self.delay, self.travel_time))
-        values = {"unfinished_trips": int(unfinished.sum()), "delay_share_at_end": delay / spent if spent else 0.0}
-        return values if self.vehicle_ids else {}
+        """Number of unfinished trips, and share of delay in their travel time; empty without trips."""
+        if not self.vehicle_ids:
+            return {}
+        is_unfinished = ~self.has_arrived
+        delay, travel_time = (float(times[is_unfinished].sum()) for times in (self.delay, self.travel_time))
+        share = delay / travel_time if travel_time else 0.0
+        return {"unfinished_trips": int(is_unfinished.sum()), "delay_share_at_end": share}
 
     def vehicles_of(self, *groups: str) -> set[str]:
         """Return the ids of the vehicles of some `VEHICLE_GROUPS`."""
         classes = {vehicle_class for group in groups for vehicle_class in VEHICLE_GROUPS[group]}
         pairs = zip(self.vehicle_ids, self.vehicle_classes, strict=True)
-        return {name for name, vehicle_class in pairs if vehicle_class in classes}
+        return {vehicle_id for vehicle_id, vehicle_class in pairs if vehicle_class in classes}
 
     def mean_travel_time(self, group: str) -> float:
         """Return the mean travel time of a group of `VEHICLE_GROUPS` [s]; NaN if it has no vehicles."""
@@ -159,14 +161,14 @@ class Trips:
 
 @dataclass(frozen=True)
 class SlowEntrance:
-    """An edge on which vehicles wait for their insertion, although traffic moves freely or their speed is fixed."""
+    """An edge where vehicles wait for their insertion, although traffic is free or their insertion speed is fixed."""
 
     edge: str
     vehicles: int
     depart_delay: float
-    """mean [s]"""
+    """mean waiting time [s]"""
     depart_speed: float
-    """mean [m/s]"""
+    """mean insertion speed [m/s]"""
 
 
 @dataclass(frozen=True)
@@ -181,11 +183,11 @@ class SumoWarning:
 
 @dataclass(frozen=True)
 class Episode:
-    """The record of one episode: T control steps, N vehicles or columns. The warm-up is not part of it."""
+    """The record of one episode with T control steps and N vehicles or columns, without the warm-up."""
 
     seed: tuple[int, ...]
     status: str
-    """`completed`; `failed`; `collision`, or `teleports` beyond SUMO's max-num-teleports, ended it early"""
+    """`completed`, `failed`, or the cause of an early end: `collision`, or `teleports` (max-num-teleports of SUMO)"""
     reason: str = ""
     error: str = ""
     control_step: float = 0.1
@@ -193,19 +195,19 @@ class Episode:
     warmup: int = 0
     drawn_values: dict[str, float] = field(default_factory=dict)
     loop_length: float = float("nan")
-    """length of a closed road [m]; NaN of a road with ends"""
+    """length of a closed road [m]; NaN on a road with ends"""
     crossings: tuple[tuple[float, float], ...] = ()
     """ranges along the road where it crosses itself [m]"""
     merge_positions: tuple[float, ...] = ()
     """positions along the road where ramps join [m]"""
     limit_speed: float = float("nan")
-    """the scenario's own limit of speed [m/s]"""
+    """speed limit of the scenario [m/s]"""
     vehicle_ids: tuple[str, ...] = ()
     cav_ids: tuple[str, ...] = ()
     vehicle_columns: tuple[int, ...] = ()
-    """column of each vehicle if vehicles of different times share columns, CAVs only with CAVs; empty: own columns"""
+    """column of each vehicle if vehicles share columns, CAVs only with CAVs; empty if each has its own column"""
     snapshot_stride: int = 1
-    """number of control steps between two snapshots of positions: more than 1 if many vehicles drive for long"""
+    """number of control steps between two snapshots of positions; above 1 in long episodes with many vehicles"""
     collisions: int = 0
     """vehicles that collided: on a built-in road by contact, on a user's network according to its settings"""
     contacts: int = 0
@@ -217,31 +219,31 @@ class Episode:
     gaps: Floats = field(default_factory=lambda: np.zeros((1, 0)))
     """net gap to the leader [m], shape (T // snapshot_stride + 1, N)"""
     replayed_motion: Floats = field(default_factory=lambda: np.zeros((1, 0, 2)))
-    """positions [m] and speeds [m/s] of the k vehicles that replay recordings, shape (T + 1, k, 2): no vehicle of the
-    others, but the leader of the first"""
+    """positions [m] and speeds [m/s] of k vehicles that replay recordings, shape (T + 1, k, 2); they lead the vehicles
+    of `vehicle_ids`, which do not contain them"""
     fuel: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    """fuel rate in each step [mg/s], shape (T, N), on a road with ends total (T,); (0, 0) if not recorded"""
+    """fuel rate in each step [mg/s], shape (T, N); on a road with ends the total, (T,); (0, 0) if not recorded"""
     outline: Floats = field(default_factory=lambda: np.zeros((0, 3)))
     """center line of a closed road: rows (coordinate along the route, x, y) [m]"""
     branches: tuple[str, ...] = ()
     """origin of the vehicles of each column, on a road with several entrances"""
     arrivals: int = 0
     teleports: int = 0
-    """number of teleports by SUMO, after long standing or a collision; a teleported vehicle waits to be reinserted"""
+    """number of teleports by SUMO after long standing or a collision; SUMO reinserts a teleported vehicle later"""
     demand_peak: tuple[float, float] = (0.0, 0.0)
-    """begin and end of the time of highest demand [s]; (0, 0) without a peak"""
+    """start and end of the period of highest demand [s]; (0, 0) without a peak"""
     planned_duration: float = float("nan")
-    """duration of an episode without collisions on a road with ends [s]; NaN of a closed road"""
+    """duration of an episode without collisions on a road with ends [s]; NaN on a closed road"""
     free_flow_time: float = float("nan")
     """mean travel time in free flow [s]; NaN if unknown"""
     backlog: Floats = field(default_factory=lambda: np.zeros(0))
     """insertion backlog, including teleported and removed vehicles, shape (T + 1,); (0,) on a closed road"""
     teleported: int = 0
-    """vehicles of the backlog at the end that were teleported and not reinserted"""
+    """number of vehicles in the backlog at the end that were teleported and not reinserted"""
     removed: int = 0
-    """vehicles of the backlog at the end that SUMO has removed for good, from a jam or a collision"""
+    """number of vehicles in the backlog at the end that SUMO removed after a jam or a collision"""
     lane_lines: Floats = field(default_factory=lambda: np.zeros((0, 2)))
-    """lanes of a road with ends: rows (x, y) [m], a row of NaN between two; (0, 2) if not recorded"""
+    """lanes of a road with ends: rows (x, y) [m], separated by rows of NaN; (0, 2) if not recorded"""
     poses: Floats = field(default_factory=lambda: np.zeros((0, 0, 3)))
     """(x, y, heading) of front bumpers on a road with ends [m, rad], shape (T // snapshot_stride + 1 or 0, N, 3)"""
     lane_indices: Floats = field(default_factory=lambda: np.zeros((0, 0)))
@@ -254,10 +256,10 @@ class Episode:
     trips: Trips = field(default_factory=Trips)
     """trips of all vehicles on a user's network; empty on other roads"""
     slow_entrances: tuple[SlowEntrance, ...] = ()
-    """entrances of a user's network at which demand waits without a jam"""
+    """entrances of a user's network where vehicles wait without a jam"""
     audit: Audit = field(default_factory=Audit)
     warnings: tuple[SumoWarning, ...] = ()
-    """SUMO's warnings, including the warm-up; without teleports, collisions and braking, which are counted above"""
+    """SUMO's warnings, also in the warm-up, except teleports, collisions and braking, which have their own counts"""
 
     @property
     def reward(self) -> Floats:
@@ -292,16 +294,16 @@ def assign_columns(
 ) -> NDArray[np.intp]:
     """Return a column for each of n trips, given the first and the last step of each (inclusive).
 
-    Only trips of one group share a column, with at least `min_spacing` empty steps between two of them.
+    Only trips of the same group share a column, with at least `min_spacing` empty steps between two trips.
     """
-    columns, used = np.zeros(len(groups), np.intp), 0
+    columns, column_count = np.zeros(len(groups), np.intp), 0
     heaps: dict[Hashable, list[tuple[int, int]]] = {}
     for trip in np.argsort(first_steps, kind="stable").tolist():
         heap = heaps.setdefault(groups[trip], [])
         if heap and heap[0][0] + min_spacing < first_steps[trip]:
             _, column = heappop(heap)
         else:
-            column, used = used, used + 1
+            column, column_count = column_count, column_count + 1
         columns[trip] = column
         heappush(heap, (int(last_steps[trip]), column))
     return columns
@@ -310,7 +312,7 @@ def assign_columns(
 def common_fields(
     scenario: Scenario, road: Road, seed: Sequence[int], has_crashed: bool, stop_reason: str = ""
 ) -> dict[str, Any]:
-    """Return the fields that all records of simulated roads have, by name; `stop_reason` is that of an early end."""
+    """Return the common fields of all records by name; `stop_reason` is the reason of an early end by SUMO."""
     return {
         "seed": tuple(seed),
         "status": "collision" if has_crashed else "teleports" if stop_reason else "completed",
@@ -324,5 +326,5 @@ def common_fields(
 
 
 def failed_episode(seed: tuple[int, ...], reason: str, error: str) -> Episode:
-    """Return the record of an episode that did not run: every requested episode has a row."""
+    """Return the record of an episode that did not run, because each requested episode must have a record."""
     return Episode(seed=seed, status="failed", reason=reason, error=error)

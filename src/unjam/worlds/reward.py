@@ -25,34 +25,34 @@ MOBILITY_WEIGHT, TIME_GAP_WEIGHT, ACCELERATION_WEIGHT = 1.0, 0.1, 0.1
 MERGE_TARGET_SPEED = 20.0
 """target speed of the merge reward, and scale of speeds in the power reward [m/s]"""
 MERGE_FREE_FLOW_VEHICLES = 30.0
-"""scale of the number of vehicles in the power reward: about that on the merge in free flow"""
+"""scale of the number of vehicles in the power reward: about the number on the merge in free flow"""
 CRASH_CLOSURE_STEPS = 2_400
 """control steps for which a crash closes a road in the travel-time reward: a whole on-ramp episode"""
 MIN_CRASH_BACKLOG = 200
-"""minimum number of vehicles that a crash stops, as more would enter: about 160 (3,700 veh/h for 154 s) drive there"""
+"""minimum number of vehicles that a crash stops; about 160 (3,700 veh/h for 154 s) drive on an on-ramp road"""
 MAX_CALM_TIME_GAP, MAX_CALM_GAP = 5.0, 90.0
-"""a CAV lags behind if its time gap [s] and its gap [m] are larger than these"""
+"""limits of time gap [s] and gap [m]; a CAV beyond both lags behind"""
 LATE_WEIGHT = 0.01
-"""cost of each meter beyond them [ml/s]"""
+"""cost of each meter by which a CAV lags behind [ml/s]"""
 STEADY_FUEL = 0.05
 """fuel of a mid-size car at a constant speed of 10 to 25 m/s [ml/m]"""
 STANDSTILL_SPEED = 1e-3
 """lower limit of the speed in time gaps [m/s]"""
 MAX_REWARD_TERM = 1e100
-"""limit of a term in one control step, so that no return overflows"""
+"""largest magnitude of a term in one control step, so that no return overflows"""
 MAX_REWARD_CELLS = 4_000_000
-"""control steps times vehicles in one call of a reward function: hours of traffic need not be in memory at once"""
+"""maximum of control steps times vehicles in one call of a reward function, which limits the memory"""
 
 
 class Outcome(NamedTuple):
-    """The outcome of control steps, one per row. NumPy arrays or torch tensors, SI units.
+    """The outcome of control steps, one per row: NumPy arrays or torch tensors in SI units.
 
-    The rewards of the package also take the outcome of one control step without the axis of rows, with a bool and a
-    float where there is one value; the values of a single CAV may then be floats, too.
+    The rewards of the package also accept one control step without the axis of rows: `has_crashed` is then a bool,
+    `backlog` a float, and values of a single CAV may be floats.
     """
 
     speeds: Array
-    """speeds of all (in a model: modeled) vehicles after the step [m/s], shape (rows, vehicles); NaN if absent"""
+    """speeds of all vehicles of the road or model after the step [m/s], shape (rows, vehicles); NaN if absent"""
     accelerations: Array
     """commands of the CAVs within the action limit [m/s2], shape (rows, CAVs); NaN if absent"""
     time_gaps: Array
@@ -65,19 +65,19 @@ class Outcome(NamedTuple):
 
 
 Reward = Callable[[Outcome], dict[str, Array]]
-"""A reward function: its terms by name, each of shape (rows,). The reward is their sum."""
+"""a function that returns terms by name, each of shape (rows,); the reward is the sum of the terms"""
 RewardLike = str | Callable[[Outcome], Any]
 """the name of a reward, or a function of this process that returns its terms by name, or one array"""
 
 
 def _nan_mean(values: Array) -> Array:
-    """Mean over the last axis without NaN; 0 if all are NaN."""
+    """Return the mean over the last axis without NaN; 0 if all values are NaN."""
     if type(values) is float:
         return _nan_sum(values)
     if namespace(values) is np:
         total = np.add.reduce(values, -1)  # NaN if a vehicle is absent
         is_any_absent = isnan(total) if values.ndim == 1 else np.isnan(total).any()
-        if not is_any_absent:  # the way below takes several times as long
+        if not is_any_absent:  # much faster than the sum without NaN
             return total / max(values.shape[-1], 1)
     return _nan_sum(values) / clamp_min((~namespace(values).isnan(values)).sum(-1), 1)
 
@@ -90,16 +90,16 @@ def _nan_sum(values: Array) -> Array:
 
 
 def released_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward of Table 1 on ring and figure eight, as in the authors' code: 4 mean v / 20 - 4 mean |a|; 0 at a crash."""
-    running = outcome.has_crashed == 0
+    """Return the reward of Table 1 on loops, as in the authors' code: 4 mean v / 20 - 4 mean |a|; 0 at a crash."""
+    is_running = outcome.has_crashed == 0
     return {
-        "speed": 4.0 * _nan_mean(outcome.speeds) / 20.0 * running,
-        "acceleration": -4.0 * _nan_mean(abs(outcome.accelerations)) * running,
+        "speed": 4.0 * _nan_mean(outcome.speeds) / 20.0 * is_running,
+        "acceleration": -4.0 * _nan_mean(abs(outcome.accelerations)) * is_running,
     }
 
 
 def eq16_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward Eq. 16 of the paper with the sign of its first term corrected: it rewards speeds near v_des."""
+    """Return the reward of Eq. 16 with a corrected sign of its first term, which rewards speeds near v_des."""
     return {
         "speed": MOBILITY_WEIGHT * clamp_min(DESIRED_SPEED - abs(DESIRED_SPEED - _nan_mean(outcome.speeds)), 0.0),
         "time_gap": TIME_GAP_WEIGHT * time_gap_penalty(outcome),
@@ -108,80 +108,80 @@ def eq16_reward(outcome: Outcome) -> dict[str, Array]:
 
 
 def printed_eq16_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward Eq. 16 as printed: its first term rewards low speeds. It is here to show this."""
+    """Return the reward of Eq. 16 as printed, for comparison: its first term rewards low speeds."""
     speed = MOBILITY_WEIGHT * clamp_min(DESIRED_SPEED - _nan_mean(outcome.speeds), 0.0)
     return {**eq16_reward(outcome), "speed": speed}
 
 
 def released_merge_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward of Table 1 on the merge, as in the authors' code; 0 at a crash, and never below 0.
+    """Return the reward of Table 1 on the merge, as in the authors' code; 0 at a crash, and never below 0.
 
-    1 - ||20 - v|| / ||20|| (norms over all vehicles), minus 0.1 for each second by which a CAV's time gap is below 1 s.
+    It is 1 - ||20 - v|| / ||20|| (norms over all vehicles) minus 0.1 per second by which time gaps are below 1 s.
     """
     xp = namespace(outcome.speeds)
-    running = outcome.has_crashed == 0
-    on_road = ~xp.isnan(outcome.speeds)
-    errors = _nan_sum((MERGE_TARGET_SPEED - outcome.speeds) ** 2)
-    relative = errors / (MERGE_TARGET_SPEED**2 * clamp_min(on_road.sum(-1), 1))
-    speed = clamp_min(1.0 - square_root(relative), 0.0) * on_road.any(-1) * running
-    gaps = TIME_GAP_WEIGHT * time_gap_penalty(outcome) * running
-    return {"speed": speed, "time_gap": gaps, "lower_bound": clamp_min(-speed - gaps, 0.0)}
+    is_running = outcome.has_crashed == 0
+    is_present = ~xp.isnan(outcome.speeds)
+    squared_error = _nan_sum((MERGE_TARGET_SPEED - outcome.speeds) ** 2)
+    relative_error = squared_error / (MERGE_TARGET_SPEED**2 * clamp_min(is_present.sum(-1), 1))
+    speed = clamp_min(1.0 - square_root(relative_error), 0.0) * is_present.any(-1) * is_running
+    penalty = TIME_GAP_WEIGHT * time_gap_penalty(outcome) * is_running
+    return {"speed": speed, "time_gap": penalty, "lower_bound": clamp_min(-speed - penalty, 0.0)}
 
 
 def fuel_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward little fuel of the CAVs for their distance [ml/s]: about 0 in steady driving, less with braking.
+    """Return a reward for low fuel consumption of the CAVs per distance [ml/s]: about 0 in steady driving.
 
-    Fuel is that of `unjam.physics.fuel` without the part that becomes kinetic energy, which is lost only in braking.
-    Time gaps below 1 s cost 0.1 for each second, gaps beyond 90 m and 5 s 0.01 for each meter, a crash 10.
+    Fuel is that of `unjam.physics.fuel` without the part that becomes kinetic energy, which only braking wastes. Time
+    gaps below 1 s cost 0.1 per second, gaps beyond 90 m and 5 s cost 0.01 per meter, and a crash costs 10.
     """
     speeds, accelerations = outcome.cav_speeds, outcome.accelerations
-    lost = fuel_rate(speeds, accelerations) - kinetic_fuel_rate(speeds, accelerations)
-    late = clamp_min(_cav_gaps(outcome) - clamp_min(MAX_CALM_TIME_GAP * speeds, MAX_CALM_GAP), 0.0)
+    lost_fuel = fuel_rate(speeds, accelerations) - kinetic_fuel_rate(speeds, accelerations)
+    lag = clamp_min(_cav_gaps(outcome) - clamp_min(MAX_CALM_TIME_GAP * speeds, MAX_CALM_GAP), 0.0)
     return {
-        "fuel": _nan_mean(STEADY_FUEL * speeds - lost),
+        "fuel": _nan_mean(STEADY_FUEL * speeds - lost_fuel),
         "time_gap": TIME_GAP_WEIGHT * time_gap_penalty(outcome),
-        "late": -LATE_WEIGHT * _nan_sum(late),
+        "late": -LATE_WEIGHT * _nan_sum(lag),
         "crash": -10.0 * outcome.has_crashed,
     }
 
 
 def power_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward flow and speed together: the distance that all vehicles cover, times their mean speed; 0 at a crash.
+    """Return a reward for flow and speed: the sum of all speeds times the mean speed; 0 at a crash.
 
-    About 1 in free flow on the merge. Source: the power of Kleinrock 1979 (IEEE ICC, 43.1), in vehicles.
+    It is about 1 in free flow on the merge. Source: the power of Kleinrock 1979 (IEEE ICC, 43.1), in vehicles.
     """
     flow = _nan_sum(outcome.speeds) / (MERGE_TARGET_SPEED * MERGE_FREE_FLOW_VEHICLES)
     return {"power": flow * _nan_mean(outcome.speeds) / MERGE_TARGET_SPEED * (outcome.has_crashed == 0)}
 
 
 def travel_time_reward(outcome: Outcome) -> dict[str, Array]:
-    """Reward short travel times: minus the number of vehicles on the road and in the backlog, in hundreds.
+    """Return a reward for short travel times: minus the number of vehicles on the road and in the backlog, in hundreds.
 
-    The return is proportional to the mean travel time including insertion delays. After a crash, which ends the
-    episode, all these vehicles, and at least `MIN_CRASH_BACKLOG`, wait for `CRASH_CLOSURE_STEPS` control steps.
+    The return is proportional to the mean travel time including insertion delays. A crash ends the episode, and costs
+    as if these vehicles, at least `MIN_CRASH_BACKLOG`, had to wait for `CRASH_CLOSURE_STEPS` control steps.
     """
     vehicles = (~namespace(outcome.speeds).isnan(outcome.speeds)).sum(-1) + outcome.backlog
-    closed = CRASH_CLOSURE_STEPS * clamp_min(vehicles, MIN_CRASH_BACKLOG) * outcome.has_crashed
-    return {"travel_time": -(vehicles + closed) / 100.0}
+    crash_cost = CRASH_CLOSURE_STEPS * clamp_min(vehicles, MIN_CRASH_BACKLOG) * outcome.has_crashed
+    return {"travel_time": -(vehicles + crash_cost) / 100.0}
 
 
 def time_gap_penalty(outcome: Outcome) -> Array:
-    """Term: minus the seconds by which the CAVs' time gaps are below 1 s."""
+    """Return minus the sum of the seconds by which time gaps of CAVs are below 1 s."""
     return -_nan_sum(clamp_min(MAX_PENALIZED_TIME_GAP - outcome.time_gaps, 0.0))
 
 
 def gap_penalty(outcome: Outcome) -> Array:
-    """Term: minus the mean gap of the CAVs [100 m]: the longer it is, the smaller the flow."""
+    """Return minus the mean gap of the CAVs [100 m], as longer gaps reduce the flow."""
     return -_nan_mean(_cav_gaps(outcome)) / 100.0
 
 
 def acceleration_penalty(outcome: Outcome) -> Array:
-    """Term: minus the CAVs' mean squared acceleration [m2/s4]."""
+    """Return minus the mean squared acceleration of the CAVs [m2/s4]."""
     return -_nan_mean(outcome.accelerations * outcome.accelerations)
 
 
 def speed_variation_penalty(outcome: Outcome) -> Array:
-    """Term: minus the standard deviation of speed across vehicles [m/s]."""
+    """Return minus the standard deviation of the speeds of all vehicles [m/s]."""
     mean = _nan_mean(outcome.speeds)[..., None]
     return -square_root(_nan_mean((outcome.speeds - mean) ** 2))
 
@@ -211,28 +211,28 @@ def reward_label(reward: RewardLike) -> str:
 
 
 def time_gap(gap: Array, speed: Array) -> Array:
-    """Return gap over speed [s]; a very large number for a standing vehicle."""
+    """Return gap over speed [s]; it is very large for a standing vehicle."""
     return gap / clamp_min(speed, STANDSTILL_SPEED)
 
 
 def _cav_gaps(outcome: Outcome) -> Array:
-    """Return the gaps of the CAVs [m]: the inverse of `time_gap`."""
+    """Return the gaps of the CAVs [m] from their time gaps and speeds."""
     return outcome.time_gaps * clamp_min(outcome.cav_speeds, STANDSTILL_SPEED)
 
 
 def make_reward(text: RewardLike) -> Reward:
-    """Return the reward for a name, with weights of its terms, or for a user's function.
+    """Return the reward function for a name, which may contain weights, or for a user's function.
 
-    `released:acceleration=2,time_gap=0.5` has double weight of its term `acceleration`, plus half of the term
-    `time_gap` of `REWARD_TERMS`. A function, or `path.py:name` of one, takes an `Outcome` and returns its terms by
-    name, or one array. Raise `InputError` for unknown names and terms, and weights that are not numbers.
+    `released:acceleration=2,time_gap=0.5` doubles the term `acceleration` of `released`, and adds half of the term
+    `time_gap` of `REWARD_TERMS`. A function, also as `path.py:name`, takes an `Outcome` and returns its terms by name,
+    or one array. Raise `InputError` for unknown names and terms, and for weights that are not numbers.
     """
     if not isinstance(text, str):
         return _user_reward(UserFunction.from_object(text, "an Outcome"))
     name, weights = split_parameters(text)
     for term, weight in weights.items():
         is_number = isinstance(weight, int | float) and not isinstance(weight, bool)
-        if not is_number or not abs(weight) <= float_info.max:  # refuses NaN, too
+        if not is_number or not abs(weight) <= float_info.max:  # also refuses NaN
             raise invalid_value(f"reward {name}: {term}", weight, "a number")
     if not is_file_reference(name) and name not in REWARDS:
         raise unknown_name("reward", name, [*REWARDS, "path.py:name"])
@@ -254,7 +254,7 @@ def make_reward(text: RewardLike) -> Reward:
 
 
 def is_packaged_reward(reward: RewardLike) -> bool:
-    """Return whether a reward is one of the package, with or without weights, instead of a user's function."""
+    """Return whether a reward is a reward of the package, with or without weights, and not a user's function."""
     return isinstance(reward, str) and not is_file_reference(split_parameters(reward)[0])
 
 
@@ -270,34 +270,35 @@ def _user_reward(function: UserFunction) -> Reward:
 
     try:
         terms_of(slice(None))
-    except (InputError, ValueError):  # it fits other roads than this small one; an error is reported where it drives
+    except (InputError, ValueError):  # it may need another road than this example; errors appear in its episodes
         return user_reward
     check_row_independence(terms_of, f"reward {function.label}", "control steps")
     return user_reward
 
 
 def _random_outcome(rows: slice, vehicles: int = 6, cavs: int = 2) -> Outcome:
-    """Return the same random control steps in each call, of which `rows` are selected."""
+    """Return `rows` of random control steps, which are the same in each call."""
     generator = np.random.default_rng(0)
     speeds, accelerations = generator.uniform(0, 20, (PROBE_ROWS, vehicles)), generator.normal(size=(PROBE_ROWS, cavs))
-    time_gaps, crashed = generator.uniform(0.5, 3, (PROBE_ROWS, cavs)), np.arange(PROBE_ROWS) == 1
-    numbers = speeds, accelerations, time_gaps, crashed, 10 * speeds[:, 0], speeds[:, :cavs]
-    return Outcome(*(values[rows] for values in numbers))
+    time_gaps, has_crashed = generator.uniform(0.5, 3, (PROBE_ROWS, cavs)), np.arange(PROBE_ROWS) == 1
+    fields = speeds, accelerations, time_gaps, has_crashed, 10 * speeds[:, 0], speeds[:, :cavs]
+    return Outcome(*(values[rows] for values in fields))
 
 
 def episode_reward_terms(
     reward: Reward, speeds: Floats, trajectories: Sequence[Trajectory], has_crashed: bool, backlog: Floats
 ) -> dict[str, Floats]:
-    """Return the terms of a reward in a whole episode, each of shape (T,); raise `InputError` if one is invalid.
+    """Return the terms of a reward in an episode, each of shape (T,); raise `InputError` if a term is invalid.
 
     Speeds are those of all vehicles, shape (T + 1, N); the backlog has shape (T + 1,), or (0,) if there is none.
     """
-    steps, rows = len(speeds) - 1, max(1, MAX_REWARD_CELLS // max(1, speeds.shape[1]))
-    parts = [slice(start, min(start + rows, steps)) for start in range(0, max(steps, 1), rows)]
+    step_count, block_size = len(speeds) - 1, max(1, MAX_REWARD_CELLS // max(1, speeds.shape[1]))
     terms = list[dict[str, Floats]]()
-    for part in parts:
-        outcome = _step_outcomes(speeds, trajectories, has_crashed and part.stop == steps, backlog, part)
-        terms.append(validate_reward_terms(reward, outcome, part.start))
+    for start in range(0, max(step_count, 1), block_size):
+        stop = min(start + block_size, step_count)
+        crashes = has_crashed and stop == step_count
+        outcome = _step_outcomes(speeds, trajectories, crashes, backlog, slice(start, stop))
+        terms.append(validate_reward_terms(reward, outcome, start))
     return {name: np.concatenate([term[name] for term in terms]) for name in terms[0]}
 
 
@@ -315,18 +316,18 @@ def _step_outcomes(
         later_steps = slice(steps.start + 1, steps.stop + 1)
         time_gaps[rows, column] = time_gap(cav.states.leader_gap[later_steps], cav.states.speed[later_steps])
         cav_speeds[rows, column] = cav.states.speed[later_steps]
-    crashed = np.zeros(size, bool)
-    crashed[-1:] = has_crashed
-    waiting = backlog[1:][step_range] if len(backlog) else np.zeros(size)
+    crash_steps = np.zeros(size, bool)
+    crash_steps[-1:] = has_crashed
+    step_backlog = backlog[1:][step_range] if len(backlog) else np.zeros(size)
     # Column-major: the rounding of sums over vehicles depends on the order in memory.
     all_speeds = np.asfortranarray(speeds[1:][step_range])
-    return Outcome(all_speeds, accelerations, time_gaps, crashed, waiting, cav_speeds)
+    return Outcome(all_speeds, accelerations, time_gaps, crash_steps, step_backlog, cav_speeds)
 
 
 def validate_reward_terms(
     reward: Reward, outcome: Outcome, start: int = 0, row_name: str = "step"
 ) -> dict[str, Floats]:
-    """Return the terms in steps from `start` on; raise `InputError` unless each has an allowed value per step."""
+    """Return the terms of steps from `start` on; raise `InputError` unless each term has an allowed value per step."""
     label, terms = f"reward {object_label(reward)}", dict[str, Floats]()
     answers = reward(outcome)
     if not answers:
@@ -343,7 +344,7 @@ def validate_reward_terms(
 
 
 def check_tensor_terms(reward: Reward, terms: dict[str, Array]) -> None:
-    """Raise `InputError` unless a reward has terms, and all are torch tensors of allowed real numbers."""
+    """Raise `InputError` unless a reward has terms, and all terms are torch tensors of allowed real numbers."""
     label = f"reward {object_label(reward)}"
     if not terms:
         raise InputError(f"{label}: it has no terms; allowed: at least one")
@@ -352,22 +353,22 @@ def check_tensor_terms(reward: Reward, terms: dict[str, Array]) -> None:
         if is_complex is None or is_complex():
             kind = f"a {type(values).__name__} is not allowed for the term {name!r}"
             raise InputError(f"{label}: {kind}; allowed: a tensor of real numbers, made of those of the Outcome")
-        is_allowed = abs(1.0 * values.detach()) <= MAX_REWARD_TERM  # truth values have no absolute value
+        is_allowed = abs(1.0 * values.detach()) <= MAX_REWARD_TERM  # Booleans have no absolute value
         if not bool(is_allowed.all()):
             value, allowed = float(values.detach()[~is_allowed][0]), f"finite, at most {MAX_REWARD_TERM:g}"
             raise InputError(f"{label}: term {name!r} is {value:g}; allowed: {allowed}")
 
 
 def step_reward_terms(reward: Reward, outcome: Outcome, step: int, needs_rows: bool) -> dict[str, float]:
-    """Return the terms of a reward, a user's if it `needs_rows`, in one step without the axis of rows.
+    """Return the terms of a reward in one control step without the axis of rows.
 
-    Raise `InputError` unless each term is one finite number.
+    A user's reward `needs_rows`. Raise `InputError` unless each term is one finite number.
     """
     if not needs_rows:
         terms = {name: float(value) for name, value in reward(outcome).items()}
-        if all(abs(value) <= MAX_REWARD_TERM for value in terms.values()):  # NaN is refused, too
+        if all(abs(value) <= MAX_REWARD_TERM for value in terms.values()):  # also refuses NaN
             return terms
     rows = Outcome(*(np.array(values, ndmin=axes) for values, axes in zip(outcome, (2, 2, 2, 1, 1, 2), strict=True)))
-    if step == 0:  # a constant of one number would be right for one step only
+    if step == 0:  # a constant term has the right shape for one row only
         validate_reward_terms(reward, Outcome(*(np.repeat(values, 2, axis=0) for values in rows)))
     return {name: values.item() for name, values in validate_reward_terms(reward, rows, step).items()}

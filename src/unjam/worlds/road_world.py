@@ -1,4 +1,4 @@
-"""The world of one road: what can be inspected of it, and the common part of those in a simulator."""
+"""The world of one road: its interface for inspection, and the common part of the worlds in a simulator."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
@@ -22,23 +22,24 @@ DrawnRoad = tuple[Road, Sequence[np.random.SeedSequence]]
 
 
 class RoadScene(NamedTuple):
-    """One moment of a road with n vehicles and their speeds [m/s], for pictures."""
+    """A road with n vehicles at one moment, for pictures."""
 
     lane_lines: Floats
-    """rows (x, y) [m]; a row of NaN between two lines"""
+    """rows (x, y) [m]; rows of NaN separate lines"""
     poses: Floats
-    """rows (x, y, heading) of the front bumpers: [m], and [rad] against the x axis, shape (n, 3)"""
+    """rows (x, y, heading) of the front bumpers [m, rad], shape (n, 3); heading 0 is the x axis"""
     speeds: Floats
+    """speeds [m/s]"""
     is_cav: NDArray[np.bool_]
 
 
 class RoadWorld(World[Episode], Protocol):
-    """A world of one road with its inspecting part, for environments and pictures; `World` is the driving part."""
+    """A `World` of one road that environments and pictures can inspect."""
 
     road: Road
-    """road that the scenario has drawn"""
+    """the road that was drawn from the scenario"""
     cav_ids: Sequence[str]
-    """the CAVs on the road now, in order of entry: the rows of states and commands"""
+    """ids of the CAVs on the road now, in order of entry, as the rows of states and commands"""
     speeds: Sequence[float] | Floats
     """speeds of all vehicles on the road [m/s]"""
     control_steps: int
@@ -48,7 +49,7 @@ class RoadWorld(World[Episode], Protocol):
 
     @property
     def backlog(self) -> int:
-        """The insertion backlog now."""
+        """Current insertion backlog [vehicles]."""
         return 0
 
     @property
@@ -57,15 +58,15 @@ class RoadWorld(World[Episode], Protocol):
         return False
 
     def exact_state(self) -> LocalState:
-        """Return the local state of the CAVs now without errors of sensors, arrays of shape (CAVs,)."""
+        """Return the current local state of the CAVs without sensor errors, arrays of shape (CAVs,)."""
         return self.local_state()
 
     def last_applied_acceleration(self) -> Array:
-        """Return the CAVs' accelerations in the last control step after the filter [m/s2], (CAVs,) or a float."""
+        """Return the CAVs' accelerations in the last control step, after the filter [m/s2]: (CAVs,), or a float."""
         ...
 
     def record_so_far(self) -> Episode:
-        """Return the record since the start without the driver's decisions; the world can still be inspected."""
+        """Return the record so far, without the driver's decisions."""
         return self.record(DriverLog())
 
     def scene(self) -> RoadScene:
@@ -74,7 +75,7 @@ class RoadWorld(World[Episode], Protocol):
 
 
 class SimulatedRoad(RoadWorld):
-    """The common part of the worlds in a simulator: random numbers, sensors, safety filter, and the episode's end."""
+    """The common part of worlds in a simulator: random numbers, sensors, safety filter, and end of the episode."""
 
     is_scalar = False
     remaining_rows: Sequence[int] | None = None  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -85,7 +86,7 @@ class SimulatedRoad(RoadWorld):
         self.has_crashed = False
         self.is_finished = False
         self.stop_reason = ""
-        """why the simulator's own rules end the episode early; empty: they do not"""
+        """reason of an early end by the rules of the simulator; empty if the episode goes on"""
         self.control_steps = self.entered_count = 0
         self.is_controlled = False
         braking, step = scenario.safety.leader_braking, scenario.simulation_step
@@ -100,14 +101,14 @@ class SimulatedRoad(RoadWorld):
 
     @property
     def cav_count(self) -> int:
-        """Number of CAVs on the road now."""
+        """Number of CAVs on the road."""
         return len(self.cav_ids)
 
     @property
     def has_ended(self) -> bool:
-        """Whether the horizon is reached, the road stays empty, or the episode has ended early."""
-        is_over = self.has_crashed or self.is_finished or bool(self.stop_reason)
-        return is_over or self.control_steps >= self.scenario.horizon
+        """Whether the horizon is reached, no vehicle will enter the empty road, or the episode has ended early."""
+        ends_early = self.has_crashed or self.is_finished or bool(self.stop_reason)
+        return ends_early or self.control_steps >= self.scenario.horizon
 
     def local_state(self) -> LocalState:
         """Return the state that the CAVs observe now: arrays of shape (CAVs,), or floats of a single CAV."""
@@ -128,7 +129,7 @@ class SimulatedRoad(RoadWorld):
         return self._cav_actuation.apply(name, acceleration, sensed)
 
     def noise(self, episode_noise_size: int = 0) -> Array:
-        """Return standard normal noise for one control step, as `World.noise`; of a scalar CAV shape (size,)."""
+        """Return standard normal noise for one control step as `World.noise`; shape (size,) if the CAV is scalar."""
         if not episode_noise_size:
             return self._exploration_generator.standard_normal(len(self.cav_ids))
         if self._episode_noise is None:

@@ -23,26 +23,27 @@ from unjam.worlds.sumo.sandboxed import enter_sandbox
 from unjam.worlds.sumo.simulation import Simulation
 
 PROGRESS_INTERVAL = 0.2
+"""minimum time between two progress messages [s]"""
 
 
 def _answer(open_once: Callable[[str], Backend], output: IO[bytes], request: dict[str, Any], arrays: Arrays) -> None:
-    """Run an episode and send its record. The record of hours of traffic does not stay in memory here."""
-    last = time.monotonic()
+    """Run the requested episode and send its record."""
+    last_time = time.monotonic()
 
     def send_progress(control_steps: int) -> None:
-        nonlocal last
-        if time.monotonic() - last > PROGRESS_INTERVAL:
-            last = time.monotonic()
+        nonlocal last_time
+        if time.monotonic() - last_time > PROGRESS_INTERVAL:
+            last_time = time.monotonic()
             try:
                 write_message(output, {"progress": control_steps})
             except BrokenPipeError:
                 sys.exit()  # the parent has ended
 
     try:
-        if "files" in request:  # what the parent has read of the files; changed files are read again
+        if "files" in request:  # read by the parent; changed files are read again
             store_answer(request["scenario"]["file"], request["files"])
         expect_code(request["code"])
-        with seeded_generators(request["seed"]):  # a user's file or class may draw from them, too
+        with seeded_generators(request["seed"]):  # a user's file or class may draw random numbers
             scenario = scenario_from_recipe(request["scenario"])
             if scenario.reads_user_files:
                 enter_sandbox()
@@ -50,15 +51,15 @@ def _answer(open_once: Callable[[str], Backend], output: IO[bytes], request: dic
         options = {name: request[name] for name in ("seed", "reward", "explore", "record_details", "stop_at_contact")}
         options |= {"backend": open_once(request["backend"]), "on_progress": send_progress}
         content, record_arrays = pack(run_episode(scenario, driver, **options))
-    except Exception as error:  # every requested episode has a row, also one that failed
+    except Exception as error:  # a failed episode has a record, too
         unjam_error = as_unjam_error(error)
         failed = failed_episode(tuple(request["seed"]), str(unjam_error), type(unjam_error).__name__)
         content, record_arrays = pack(failed)
     write_message(output, {"episode": content}, record_arrays)
 
 
-def _open(stack: ExitStack, backend: str) -> Backend:
-    """Return a backend that stays open for all episodes; SUMO may run in this process, which has its own sandbox."""
+def _open_backend(stack: ExitStack, backend: str) -> Backend:
+    """Return a backend that stays open for all episodes; SUMO runs in this process, which can be sandboxed."""
     if backend == "sumo":
         return SumoBackend(stack.enter_context(Simulation(owns_stdout=True)))
     return stack.enter_context(open_backend(backend))
@@ -66,6 +67,6 @@ def _open(stack: ExitStack, backend: str) -> Backend:
 
 if __name__ == "__main__":
     answer_pipe = open_answer_pipe()
-    gc.freeze()  # the imported objects stay; searching them for garbage would cost time in every episode
+    gc.freeze()  # no garbage collection of imported objects, which would take time in each episode
     with ExitStack() as stack:
-        answer_requests(partial(_answer, cache(partial(_open, stack)), answer_pipe))
+        answer_requests(partial(_answer, cache(partial(_open_backend, stack)), answer_pipe))

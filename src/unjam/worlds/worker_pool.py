@@ -1,4 +1,4 @@
-"""Parallel episodes in worker processes; the results do not depend on what happens to a worker."""
+"""Parallel episodes in worker processes; lost workers do not change the results."""
 
 import os
 import queue
@@ -29,11 +29,11 @@ from unjam.worlds.record import Episode, failed_episode
 from unjam.worlds.reward import RewardLike
 
 MAX_EPISODE_ATTEMPTS = 3
-"""attempts to run an episode before its row reports a failure"""
+"""number of attempts to run an episode before its record reports a failure"""
 WORKER_TIMEOUT = 30.0
-"""seconds without a message, except those of waiting for a processor, after which a worker counts as hung"""
+"""time without a message, excluding waits for a processor, after which a worker counts as hung [s]"""
 MIN_PROCESSOR_WAIT = 0.1
-"""a silent worker that has waited less than this for a processor counts as hung [s]"""
+"""wait for a processor below which a silent worker counts as hung [s]"""
 
 ResultT = TypeVar("ResultT")
 Message = tuple[dict[str, Any], Arrays]
@@ -41,22 +41,22 @@ Message = tuple[dict[str, Any], Arrays]
 
 @dataclass(frozen=True)
 class EpisodeTask:
-    """The arguments of one `run_episode`."""
+    """The arguments of one call of `run_episode`."""
 
     scenario: Scenario
     driver: Driver
     seed: tuple[int, ...]
     reward: RewardLike = ""
-    """a function only for episodes in this process"""
+    """a function is only allowed for episodes in this process"""
     explore: float = 0.0
     record_details: bool = False
     stop_at_contact: bool = True
     backend: BackendLike = "sumo"
-    """an object only for episodes in this process"""
+    """an object is only allowed for episodes in this process"""
 
     @property
     def is_serializable(self) -> bool:
-        """Whether another process can run it."""
+        """Whether another process can run the task."""
         is_named = isinstance(self.reward, str) and isinstance(self.backend, str)
         return is_named and is_serializable(self.driver)
 
@@ -69,23 +69,20 @@ class EpisodeTask:
         return content, arrays
 
     def code_hashes(self) -> dict[str, str]:
-        """Return hashes of the files of reward and backend by path; drivers and scenarios have those of their own."""
+        """Return hashes of the files of reward and backend by path; drivers and scenarios contain their own hashes."""
         reward, _ = split_parameters(str(self.reward or self.scenario.reward))
         return code_hashes([reward, str(self.backend)])
 
 
 class WorkerPool(AbstractContextManager["WorkerPool"]):
-    """A fixed number of worker processes, started when first needed, and replaced when they die or hang.
-
-    The episodes depend only on the tasks.
-    """
+    """A fixed number of worker processes, which start when first needed, and are replaced when they die or hang."""
 
     def __init__(
         self, count: int = 1, timeout: float = WORKER_TIMEOUT, max_attempts: int = MAX_EPISODE_ATTEMPTS
     ) -> None:
         self.count, self._max_attempts, self._is_first, self._owner = count, max_attempts, True, os.getpid()
         remove_stale_private_folders()
-        self._temporary_folder = PrivateFolder()  # of all workers, so that a killed one leaves no files
+        self._temporary_folder = PrivateFolder()  # shared, so that killed workers leave no files
         self._idle_workers: queue.LifoQueue[_Worker] = queue.LifoQueue()
         self._workers = [_Worker(timeout, self._temporary_folder.name) for _ in range(count)]
         self._code_hashes = dict[str, str]()
@@ -94,7 +91,7 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
             self._idle_workers.put(worker)
 
     def run(self, tasks: Sequence[EpisodeTask], on_progress: Callable[[int, int], None] | None = None) -> list[Episode]:
-        """Run all tasks and return their episodes in order; a failed one contains the reason.
+        """Run all tasks and return their episodes in order; a failed episode contains the reason.
 
         `on_progress` is called with a task's index and its control steps so far, from several threads.
         """
@@ -106,14 +103,15 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
         transform: Callable[[int, Episode], ResultT],
         on_progress: Callable[[int, int], None] | None = None,
     ) -> list[ResultT]:
-        """Run all tasks and return `transform(index, episode)` of each, called from several threads, to save memory.
+        """Run all tasks and return `transform(index, episode)` of each; episodes need not stay in memory.
 
-        Raise `SumoInputError` if SUMO refuses the files of the very first task, and so would refuse those of others.
+        `transform` is called from several threads. Raise `SumoInputError` if SUMO refuses the files of the first task
+        of the pool, because it would refuse those of the others, too.
         """
         check_owner(self._owner, "worker pool: it")
         task_by_code = {(task.reward, task.scenario.reward, task.backend): task for task in tasks}
         for task in task_by_code.values():
-            self._code_hashes = task.code_hashes() | self._code_hashes  # code stays what it was at first
+            self._code_hashes = task.code_hashes() | self._code_hashes  # the first hash of a file stays valid
         is_first, self._is_first = self._is_first, False
 
         def run_one(index: int, task: EpisodeTask) -> ResultT:
@@ -147,7 +145,7 @@ class WorkerPool(AbstractContextManager["WorkerPool"]):
             self._idle_workers.put(worker)
 
     def close(self) -> None:
-        """Stop all workers; may be called twice."""
+        """Stop all workers; further calls have no effect."""
         for worker in self._workers:
             worker.stop()
         self._thread_pool.shutdown(wait=True, cancel_futures=True)
@@ -162,7 +160,7 @@ class _WorkerLostError(Exception):
 
 
 class _Worker:
-    """One worker process and the pipe to it."""
+    """A worker process and the pipes to it."""
 
     def __init__(self, timeout: float, temporary_folder: str) -> None:
         self._timeout, self._temporary_folder = timeout, temporary_folder
@@ -173,9 +171,8 @@ class _Worker:
 
     def _start(self) -> subprocess.Popen[bytes]:
         # BLAS threads would compete with the other workers for the cores.
-        one_thread = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        self._error_file = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the process)
-        environment = {**one_thread, "TMPDIR": self._temporary_folder}
+        environment = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "TMPDIR": self._temporary_folder}
+        self._error_file = tempfile.TemporaryFile()  # noqa: SIM115  (closed after the process)
         process = start_child("unjam.worlds.worker", self._error_file, **environment)
         self._sent_files.clear()
         self._messages: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
@@ -183,7 +180,7 @@ class _Worker:
         return process
 
     def run(self, task: EpisodeTask, code: dict[str, str], on_progress: Callable[[int], object]) -> Episode:
-        """Return the episode of a task, with hashes of its code; raise `_WorkerLostError` if the process is lost."""
+        """Return the episode of a task, given hashes of its code; raise `_WorkerLostError` if the process is lost."""
         was_sandboxed, self._is_sandboxed = self._is_sandboxed, task.scenario.reads_user_files
         if was_sandboxed and not self._is_sandboxed:  # a process cannot leave its sandbox
             self._kill()
@@ -191,7 +188,7 @@ class _Worker:
             if self._is_stopped:
                 raise _WorkerLostError("stopped")
             process = self._process = self._process or self._start()
-        # The process reads and loads a user's network before its first message.
+        # A sandboxed process reads a user's network before its first message.
         timeout = self._timeout + (MAX_READER_TIME if self._is_sandboxed else 0.0)
         try:
             content, arrays = task.message()
@@ -210,24 +207,24 @@ class _Worker:
         raise _WorkerLostError(self._exit_reason(process))
 
     def _next_message(self, process: subprocess.Popen[bytes], timeout: float) -> Message | None:
-        """Return the next message, None after the last one; raise `queue.Empty` after a time without one [s]."""
+        """Return the next message, None after the last one; raise `queue.Empty` after `timeout` [s]."""
         while True:
-            start = processor_wait(process.pid)
+            previous_wait = processor_wait(process.pid)
             try:
                 return self._messages.get(timeout=timeout)
-            except queue.Empty:  # on a busy machine the process may not have run
-                timeout = processor_wait(process.pid) - start
+            except queue.Empty:  # the process may have waited for a processor
+                timeout = processor_wait(process.pid) - previous_wait
                 if timeout < MIN_PROCESSOR_WAIT:
                     raise
 
     def _send(self, process: subprocess.Popen[bytes], content: dict[str, Any], arrays: Arrays) -> None:
-        """Send a task, with the content of the user's files the first time that the process needs it."""
+        """Send a task; the first task with a file of the user also contains its content."""
         assert process.stdin is not None
         file = content["scenario"].get("file")
         if file and file not in self._sent_files and (answer := stored_answer(file)):
             self._sent_files.add(file)
             content = {**content, "files": answer}
-        timer = threading.Timer(self._timeout, process.kill)  # a full pipe without a reader blocks forever
+        timer = threading.Timer(self._timeout, process.kill)  # a write into a full pipe without a reader never returns
         timer.start()
         try:
             write_message(process.stdin, content, dict(arrays))
@@ -252,24 +249,24 @@ class _Worker:
             process.wait()
 
     def stop(self) -> None:
-        """End the process; it is not started again."""
+        """End the process for good."""
         with self._start_lock:
             self._is_stopped = True
             self._kill()
 
 
 def processor_wait(process_id: int) -> float:
-    """Return for how long a process was ready to run, but had no processor [s]; 0 where that is unknown."""
+    """Return the total time that a process has waited for a processor [s]; 0 if it is unknown."""
     with suppress(OSError, ValueError, IndexError):
         return int(Path(f"/proc/{process_id}/schedstat").read_text().split()[1]) / 1e9
     return 0.0
 
 
 def _forward_messages(process: subprocess.Popen[bytes], messages: "queue.SimpleQueue[Message | None]") -> None:
-    """Put the messages of the process into a queue; None after the last one."""
+    """Put the messages of the process into a queue, and None after the last message."""
     assert process.stdout is not None
     try:
         while True:
             messages.put(read_message(process.stdout))
-    except Exception:  # end of file, or a frame that was cut by the end of the process
+    except Exception:  # the end of the pipe, also within a message
         messages.put(None)

@@ -1,4 +1,4 @@
-"""The interface between drivers and worlds, and two worlds without a simulator: recordings, and car-following pairs."""
+"""The interface between drivers and worlds, and two worlds without a simulator: recordings and car-following pairs."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ from unjam.tree import Arrays
 RecordT = TypeVar("RecordT", covariant=True)
 
 ProgressCallback = Callable[[int], None]
-"""called now and then with the number of control steps made"""
+"""called regularly with the number of control steps so far"""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class DriverLog:
     """The decisions of a driver in a world, one per control step."""
 
     decisions: list[tuple[Array, Array, Array]] = field(default_factory=list)
-    """the expert's acceleration, the residual, and the network's observation; empty without a network"""
+    """the expert's acceleration, the residual and the network's observation; empty without a network"""
     last_observation: Array | None = None
     initial_memories: list[Arrays] = field(default_factory=list)
     """the expert's memory before the first control step of each CAV, in order of entry"""
@@ -32,59 +32,59 @@ class DriverLog:
 
 
 class World(Protocol[RecordT]):
-    """Moves n CAVs as commanded and provides their observations; only `unjam.worlds.drive` calls it."""
+    """Moves n CAVs as commanded, and provides their observations; `unjam.worlds.drive` calls it."""
 
     limits: Limits
-    """limits on the accelerations that are carried out"""
+    """limits of commanded accelerations"""
     is_scalar: bool
-    """whether its only CAV has floats as state and command, instead of arrays with one row"""
+    """whether states and commands of its single CAV are floats instead of arrays with one row"""
     entered_count: int
     """number of CAVs handed to the driver so far"""
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
-        """Start, and hand the CAVs to the driver unless they stay human (`is_controlled` false).
+        """Start, and hand the CAVs to the driver; they stay human unless `is_controlled`.
 
-        Return their earlier states for drivers with a memory, shape (CAVs, steps), oldest first; None without any.
+        Return earlier states of the CAVs for drivers with a memory, shape (CAVs, steps), oldest first, or None.
         """
         ...
 
     @property
     def cav_count(self) -> int:
-        """Number of CAVs on the road now: the rows of states and commands."""
+        """Number of CAVs on the road, which is the number of rows of states and commands."""
         ...
 
     @property
     def remaining_rows(self) -> Sequence[int] | None:
-        """Rows before the last control step that remain; new CAVs follow them. None: nothing has changed."""
+        """Previous rows of the remaining CAVs, behind which new CAVs follow; None if no CAV has entered or left."""
         ...
 
     @property
     def has_ended(self) -> bool:
-        """Whether there are no further control steps."""
+        """Whether no further control step follows."""
         ...
 
     def local_state(self) -> LocalState:
-        """Return the state that the CAVs observe now: arrays of shape (CAVs,), or floats of a single CAV."""
+        """Return the state that the CAVs observe: arrays of shape (CAVs,), or floats of a single CAV."""
         ...
 
     def advance(self, command: Command | None) -> None:
-        """Carry out one control step of every CAV; None: they stay human. Raise `InputError` for invalid commands."""
+        """Simulate one control step; CAVs without a command stay human. Raise `InputError` for invalid commands."""
         ...
 
     def noise(self, episode_noise_size: int = 0) -> Array:
         """Return standard normal noise for one action of a network: shape (CAVs,), or a float.
 
-        With `episode_noise_size`, shape (CAVs, size): the same numbers for all CAVs of a road and the whole episode.
+        With `episode_noise_size`, return shape (CAVs, size), equal for all CAVs of a road and all steps of an episode.
         """
         ...
 
     def record(self, driver_log: DriverLog) -> RecordT:
-        """Return the record of what happened, with the driver's decisions."""
+        """Return the record of the episode with the driver's decisions."""
         ...
 
 
 class _OfflineWorld:
-    """Common part of the worlds without a simulator: always the same rows, no history and no exploration."""
+    """The common part of the worlds without a simulator: constant rows, no history and no exploration."""
 
     is_scalar, remaining_rows = False, None
     cav_count: int
@@ -93,18 +93,18 @@ class _OfflineWorld:
         """Start without a history."""
 
     def noise(self, episode_noise_size: int = 0) -> Floats:
-        """Return zeros: there is no exploration."""
+        """Return zeros, because there is no exploration."""
         return np.zeros((self.cav_count, episode_noise_size) if episode_noise_size else self.cav_count)
 
 
 class RecordedWorld(_OfflineWorld):
-    """A recording of states that does not depend on the driver: for the commands and memories that result."""
+    """Recorded states, which do not depend on the driver, to compute its commands and memories."""
 
     def __init__(self, states: LocalState, limits: Limits) -> None:
         """Take the states of n CAVs in T control steps, arrays of shape (T, n)."""
         self.states, self.limits = states, limits
         self.cav_count = self.entered_count = states.speed.shape[1]
-        self._row_names = [f"row {number}" for number in range(self.cav_count)]
+        self._row_names = [f"row {index}" for index in range(self.cav_count)]
         self._accelerations: list[list[float]] = []
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
@@ -117,7 +117,7 @@ class RecordedWorld(_OfflineWorld):
         return len(self._accelerations) == len(self.states.speed)
 
     def local_state(self) -> LocalState:
-        """Return the state of the present step, read-only; after the end, that of the last step."""
+        """Return the state of the current step, or of the last step after the end; its arrays are read-only."""
         step = min(len(self._accelerations), len(self.states.speed) - 1)
         return self.states.select(step).as_read_only()
 
@@ -132,7 +132,7 @@ class RecordedWorld(_OfflineWorld):
 
 
 class CarFollowingWorld(_OfflineWorld):
-    """n CAVs behind leaders; the follower of each CAV has the CAV's own speed and gap."""
+    """n CAVs behind leaders with given accelerations; each follower has the speed and gap of its CAV."""
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class CarFollowingWorld(_OfflineWorld):
         loop_length: float = np.nan,
         actuator: Actuator = INSTANT_ACTUATOR,
     ) -> None:
-        """Take the pairs' initial state, arrays (n,), and leaders' accelerations [m/s2], (T, n)."""
+        """Take the initial state of the pairs, arrays (n,), and the accelerations of the leaders [m/s2], (T, n)."""
         self.limits, self._step = limits, step
         self._states = [FollowingState(*(np.array(values, np.float64) for values in initial_state))]
         self._actuator, self._actuator_state = actuator, actuator.initial_state(self._states[0].speed, step)
@@ -157,10 +157,10 @@ class CarFollowingWorld(_OfflineWorld):
         return len(self._states) > len(self._leader_accelerations)
 
     def local_state(self) -> LocalState:
-        """Return the state that the CAVs observe now, read-only arrays of shape (n,)."""
-        speed, leader, gap = self._states[-1]
+        """Return the state that the CAVs observe, read-only arrays of shape (n,)."""
+        speed, leader_speed, gap = self._states[-1]
         position = self._position if np.isnan(self._loop_length).all() else self._position % self._loop_length
-        return LocalState(speed, leader, gap, speed, gap, position, self._loop_length).as_read_only()
+        return LocalState(speed, leader_speed, gap, speed, gap, position, self._loop_length).as_read_only()
 
     def advance(self, command: Command | None) -> None:
         """Make one step of all pairs."""
@@ -169,9 +169,9 @@ class CarFollowingWorld(_OfflineWorld):
         acceleration = self.limits.clip(np.asarray(command.acceleration))
         self._actuator_state = self._actuator.apply_command(acceleration, previous.speed, self._actuator_state, step)
         speed = next_speed(previous.speed, self._actuator_state.acceleration, step)
-        leader = next_speed(previous.leader_speed, self._leader_accelerations[len(self._states) - 1], step)
+        leader_speed = next_speed(previous.leader_speed, self._leader_accelerations[len(self._states) - 1], step)
         self._position = self._position + speed * step
-        self._states.append(FollowingState(speed, leader, previous.gap + (leader - speed) * step))
+        self._states.append(FollowingState(speed, leader_speed, previous.gap + (leader_speed - speed) * step))
 
     def record(self, driver_log: DriverLog) -> FollowingState:
         """Return the states of all pairs in T steps, arrays of shape (T + 1, n)."""

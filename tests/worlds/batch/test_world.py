@@ -164,7 +164,7 @@ def test_rings_are_warmed_up_once_and_the_newest_kept(monkeypatch: pytest.Monkey
         still, noise = np.zeros(3), NoiseState({}, np.zeros((0, 2)))
         return {ring: WarmUpState(still, still[1:], still[1:], False, noise, None) for ring in rings}
 
-    for name, value in {"MAX_CACHED_CAVS": 4, "WARM_UP_CACHE": kept, "_warm_up": warm_up}.items():
+    for name, value in {"MAX_CACHED_CAVS": 4, "WARM_UP_CACHE": kept, "_simulate_warm_ups": warm_up}.items():
         monkeypatch.setattr(f"unjam.worlds.batch.run.{name}", value)
     states: Any = warm_up_states
     first, second, same = states(["a", "b", "a"], ["b", "c"])

@@ -1,4 +1,4 @@
-"""The batch as a backend: batches of one road, which can be inspected."""
+"""The batch as a backend: batches of one road, which environments and pictures can inspect."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,7 +11,7 @@ from unjam.scenarios.motorway import Motorway
 from unjam.scenarios.ring import LoopScenario
 from unjam.scenarios.scenario import Scenario
 from unjam.worlds.backend import WorldOptions, check_support
-from unjam.worlds.batch.motorway.vehicles import NUMBERS_PER_ROAD
+from unjam.worlds.batch.motorway.vehicles import KEYS_PER_ROAD
 from unjam.worlds.batch.motorway.world import MotorwayBatch
 from unjam.worlds.batch.ring.recorded import RecordedBatch
 from unjam.worlds.batch.ring.world import RingBatch
@@ -22,25 +22,25 @@ from unjam.worlds.world import DriverLog
 
 
 class BatchBackend:
-    """The batch, with one road at a time; `run_batches` simulates many at once."""
+    """Simulates one road at a time in a batch; `run_batches` simulates many roads at once."""
 
     label: ClassVar[str] = "batch"
 
     def supports(self, scenario: Scenario) -> str:
-        """Return why a batch cannot simulate a scenario, at least with SUMO's distribution; empty if it can."""
+        """Return why a batch cannot simulate a scenario, not even in distribution; empty if it can."""
         return statistically_unsupported_reason(scenario)
 
     @contextmanager
     def open(self, scenario: Scenario, seed: tuple[int, ...], options: WorldOptions) -> Iterator[RoadWorld]:
         """Yield the road of an episode; raise `InputError` if a batch cannot simulate it."""
         check_support(self, scenario)
-        world = SINGLE[required_batch_kind(scenario).world](scenario, seed)
+        world = SINGLE_ROADS[required_batch_kind(scenario).world](scenario, seed)
         world.measured_fields = options.measured_fields
         yield world
 
 
 class _SingleRoad:
-    """What batches of one road have in common."""
+    """The common part of batches with one road."""
 
     roads: Sequence[Any]
 
@@ -64,7 +64,7 @@ class _SingleRoad:
 
 
 class SingleRing(_SingleRoad, RingBatch):
-    """One closed road of a batch."""
+    """A batch of one closed road."""
 
     backlog, expects_cavs = 0, False
 
@@ -74,7 +74,7 @@ class SingleRing(_SingleRoad, RingBatch):
 
     @property
     def speeds(self) -> Floats:
-        """Of all vehicles with a driver [m/s]."""
+        """Speeds of all vehicles with a driver [m/s]."""
         return super().speeds[:, 0]
 
     def scene(self) -> RoadScene:
@@ -83,28 +83,28 @@ class SingleRing(_SingleRoad, RingBatch):
 
 
 class SingleRecordedRoad(SingleRing, RecordedBatch):
-    """One recorded road of a batch."""
+    """A batch of one recorded road."""
 
 
 class SingleMotorway(_SingleRoad, MotorwayBatch):
-    """One motorway of a batch."""
+    """A batch of one motorway."""
 
     def __init__(self, scenario: Motorway, seed: Sequence[int]) -> None:
         super().__init__(scenario, [seed])
 
     @property
     def cav_ids(self) -> list[str]:
-        """The CAVs on the road now, in order of entry."""
-        return [self.road.entries[number % NUMBERS_PER_ROAD].name for number in self._cav_numbers.tolist()]
+        """Ids of the CAVs on the road, in order of entry."""
+        return [self.road.entries[key % KEYS_PER_ROAD].name for key in self._cav_keys.tolist()]
 
     @property
     def speeds(self) -> Floats:
-        """Of all vehicles [m/s]."""
+        """Speeds of all vehicles [m/s]."""
         return self._traffic.vehicles.speed
 
     @property
     def backlog(self) -> int:
-        """The insertion backlog now."""
+        """Current insertion backlog [vehicles]."""
         return int(self.backlogs[0])
 
     @property
@@ -113,12 +113,16 @@ class SingleMotorway(_SingleRoad, MotorwayBatch):
         return self.entered_count < len(self.road.cav_ids)
 
     def exact_state(self) -> LocalState:
-        """Return the exact local state of the CAVs now."""
+        """Return the exact local state of the CAVs, whose sensors have no errors here."""
         return self.local_state()
 
     def scene(self) -> RoadScene:
-        """Raise `UnjamError`: a batch has no geometry of motorways."""
+        """Raise `UnjamError`, because batches of motorways have no coordinates."""
         raise UnjamError("render: the batch draws no pictures of motorways; allowed: backend='sumo'")
 
 
-SINGLE: dict[type, Any] = {RingBatch: SingleRing, RecordedBatch: SingleRecordedRoad, MotorwayBatch: SingleMotorway}
+SINGLE_ROADS: dict[type, Any] = {
+    RingBatch: SingleRing,
+    RecordedBatch: SingleRecordedRoad,
+    MotorwayBatch: SingleMotorway,
+}

@@ -1,4 +1,4 @@
-"""Which scenarios a batch can simulate as SUMO does, in which world, and which of them can share a batch."""
+"""Checks which scenarios a batch can simulate, exactly as SUMO or in distribution, and which can share a batch."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -24,7 +24,7 @@ MAX_SIMULATION_STEP = 0.37
 MOTORWAY_STEP = 0.5
 """simulation step of motorways, which SUMO's EIDM divides into two [s]"""
 MAX_BATCH_LANES = 2
-"""lanes of a motorway in a batch, which considers one lane change from each lane"""
+"""maximum number of lanes of a motorway in a batch, which considers one lane change from each lane"""
 
 
 @dataclass(frozen=True)
@@ -32,18 +32,18 @@ class BatchKind:
     """How batches simulate the scenarios of one class."""
 
     world: type[RingBatch] | type[MotorwayBatch]
-    reason: Callable[[Any], str]
+    unsupported_reason: Callable[[Any], str]
     """returns why a batch cannot simulate a scenario of this class; empty if it can"""
     is_exact: bool = False
-    """whether episodes equal SUMO's except for rounding; otherwise they do in distribution"""
+    """whether episodes equal SUMO's except for rounding; otherwise only their distribution does"""
     max_roads: int = 128
-    """maximum number of roads in a batch that keeps whole episodes: some 130 MB for rings of 22 vehicles"""
+    """maximum number of roads in a batch that records episodes: about 130 MB for rings with 22 vehicles"""
     has_own_drivers: bool = False
     """whether each road of a batch can have its own driver and exploration"""
 
 
 def unsupported_reason(scenario: Scenario) -> str:
-    """Return why a batch cannot reproduce SUMO's episodes of a scenario exactly; empty if it can."""
+    """Return why a batch cannot reproduce SUMO's episodes of a scenario except for rounding; empty if it can."""
     if (kind := batch_kind(scenario)) and not kind.is_exact:
         return f"{scenario.title} is neither a ring nor a recorded road"
     return statistically_unsupported_reason(scenario)
@@ -52,22 +52,22 @@ def unsupported_reason(scenario: Scenario) -> str:
 def statistically_unsupported_reason(scenario: Scenario) -> str:
     """Return why a batch cannot simulate a scenario at all; empty if it can, at least with SUMO's distribution.
 
-    On figure eights nearly all steps equal SUMO's, but one other decision about the right of way changes the queue. On
-    on-ramps, all vehicles change lanes at once, and drivers' errors are other draws.
+    On figure eights nearly all steps equal SUMO's, but one different decision about the right of way changes the queue.
+    On motorways, all vehicles change lanes at once, and the errors of drivers are other random numbers.
     """
     if kind := batch_kind(scenario):
-        return kind.reason(scenario)
+        return kind.unsupported_reason(scenario)
     base = next((base for base in BATCH_KINDS if isinstance(scenario, base)), None)
     return unread_reason(scenario, base or Ring, [field.name for field in fields(scenario)])
 
 
 def _ring_reason(scenario: Ring | Recorded) -> str:
-    is_native = "human_control", scenario.human_control == "native", "native"
-    return _first_reason(scenario, is_native, *_controls(scenario))
+    human_control = "human_control", scenario.human_control == "native", "native"
+    return _first_unmet_requirement(scenario, human_control, *_actuation_requirements(scenario))
 
 
 def _figure_eight_reason(scenario: FigureEight) -> str:
-    return _first_reason(
+    return _first_unmet_requirement(
         scenario,
         ("human_control", scenario.human_control == "commanded", "commanded"),
         ("right_of_way", scenario.right_of_way, "True"),
@@ -75,12 +75,12 @@ def _figure_eight_reason(scenario: FigureEight) -> str:
         ("radius", scenario.radius[0] > MIN_LOOK_AHEAD, f"> {MIN_LOOK_AHEAD:g} m: drivers do not look past a lane"),
         ("population", not scenario.population, "none"),
         ("actuation", scenario.actuation != "raw", "shielded, with an active safety filter"),
-        *_controls(scenario),
+        *_actuation_requirements(scenario),
     )
 
 
 def _motorway_reason(scenario: Motorway) -> str:
-    return _first_reason(
+    return _first_unmet_requirement(
         scenario,
         ("actuation", scenario.actuation == "cruise", "cruise"),
         ("safety.active", not scenario.safety.active, "False: CAVs have their own ACC"),
@@ -101,7 +101,7 @@ def _motorway_reason(scenario: Motorway) -> str:
     )
 
 
-def _controls(scenario: Scenario) -> tuple[tuple[str, bool, str], ...]:
+def _actuation_requirements(scenario: Scenario) -> tuple[tuple[str, bool, str], ...]:
     is_exact = scenario.actuation == "raw" or (scenario.actuation == "shielded" and scenario.safety.active)
     return (
         ("actuation", is_exact, "raw, or shielded with an active safety filter instead of SUMO's own check"),
@@ -109,9 +109,9 @@ def _controls(scenario: Scenario) -> tuple[tuple[str, bool, str], ...]:
     )
 
 
-def _first_reason(scenario: Scenario, *checks: tuple[str, bool, str]) -> str:
-    """Return the name, the value and the allowed values of the first setting that is not supported."""
-    for name, is_supported, allowed in checks:
+def _first_unmet_requirement(scenario: Scenario, *requirements: tuple[str, bool, str]) -> str:
+    """Return a message on the first setting that is not supported; each has name, support, and allowed values."""
+    for name, is_supported, allowed in requirements:
         if not is_supported:
             return f"{name}: {attrgetter(name)(scenario)} is not allowed in a batch; allowed: {allowed}"
     return ""
@@ -126,7 +126,7 @@ BATCH_KINDS: dict[type[Scenario], BatchKind] = {
 
 
 def batch_kind(scenario: Scenario) -> BatchKind | None:
-    """Return how batches simulate a scenario or, if its class has only other values, its base; None if they cannot."""
+    """Return how batches simulate a scenario, whose class may change values of its base only; None if they cannot."""
     kinds = ((base, kind) for base, kind in BATCH_KINDS.items() if isinstance(scenario, base))
     return next((kind for base, kind in kinds if not replaced_member(type(scenario), base, TEXT_MEMBERS)), None)
 
@@ -138,18 +138,18 @@ def required_batch_kind(scenario: Scenario) -> BatchKind:
     return kind
 
 
-def differ_only_in_size(first: Scenario, second: Scenario) -> bool:
-    """Return whether scenarios differ at most in the size of their roads, so that they can share a batch."""
-    size = getattr(first, "size_parameter", "")
-    shared = (field.name for field in fields(first) if field.name != size)
+def can_share_batch(first: Scenario, second: Scenario) -> bool:
+    """Return whether two scenarios can share a batch: they differ at most in the size of their roads."""
+    size_parameter = getattr(first, "size_parameter", "")
+    shared = (field.name for field in fields(first) if field.name != size_parameter)
     return type(first) is type(second) and all(getattr(first, name) == getattr(second, name) for name in shared)
 
 
 def check_batch_scenarios(scenarios: Sequence[Scenario], allow_statistical: bool) -> None:
-    """Raise `InputError` if scenarios cannot share a batch that equals SUMO exactly, or statistically if allowed."""
-    reason_of = statistically_unsupported_reason if allow_statistical else unsupported_reason
+    """Raise `InputError` if scenarios cannot share a batch that equals SUMO, if allowed only in distribution."""
+    find_reason = statistically_unsupported_reason if allow_statistical else unsupported_reason
     for scenario in scenarios:
-        if reason := reason_of(scenario):
+        if reason := find_reason(scenario):
             raise InputError(f"batch: {reason}")
-        if not differ_only_in_size(scenario, scenarios[0]):
+        if not can_share_batch(scenario, scenarios[0]):
             raise InputError("batch: the scenarios differ in more than their lengths")

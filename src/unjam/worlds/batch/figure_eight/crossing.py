@@ -1,8 +1,8 @@
-"""Movement of all vehicles of W figure eights: human drivers are commanded, and SUMO's right of way limits all.
+"""Movement of all vehicles of W figure eights, limited by SUMO's right of way; human drivers are commanded.
 
 Arrays have shape (vehicles, W) or (W,). Sources: SUMO's MSVehicle (`planMoveInternal`, `checkLinkLeader`,
 `adaptToJunctionLeader`, `processLinkApproaches`, `isLeader`) and MSLink (`opened`, `blockedByFoe`,
-`computeFoeArrivalTimeBraking`, `getLeaderInfo`). A foe is a vehicle on the other direction, as in SUMO.
+`computeFoeArrivalTimeBraking`, `getLeaderInfo`). As in SUMO, a foe is a vehicle of the crossing direction.
 """
 
 from collections.abc import Sequence
@@ -45,12 +45,12 @@ COMMANDED_SPEED_TOLERANCE = 1e-9
 
 
 class CrossingMemory(NamedTuple):
-    """State of the vehicles that is kept between steps, shape (vehicles, W); for one road (vehicles,)."""
+    """State of the vehicles between steps, shape (vehicles, W); shape (vehicles,) for one road."""
 
     waiting_time: Array
     """time that a vehicle has waited [s]"""
     entry_step: Array
-    """when each vehicle entered the crossing that it is on or was on last, in steps from now (at most 0)"""
+    """number of steps since each vehicle entered the crossing for the last time, negative"""
 
 
 class _CrossingSide(NamedTuple):
@@ -61,7 +61,7 @@ class _CrossingSide(NamedTuple):
     lane_length: Array
     """length of the lane before the crossing [m]"""
     approach_distance: Array
-    """distance before it from which SUMO registers approaching vehicles [m]"""
+    """distance before the crossing from which SUMO registers approaching vehicles [m]"""
 
 
 class _Vehicle(NamedTuple):
@@ -71,6 +71,7 @@ class _Vehicle(NamedTuple):
     """position of the front bumper past the start [m]"""
     speed: Array
     index: Array
+    """row of the vehicle"""
 
 
 class _Approach(NamedTuple):
@@ -95,12 +96,12 @@ def _last_vehicle(speed: Array, distance_past: Array) -> _Vehicle:
 
 
 def commanded_speed(speed: Array, leader_speed: Array, gap: Array, parameters: Any, step: float) -> Array:
-    """Return the commanded speeds of human drivers without noise, not clipped at 0; see `human_idm_speed`."""
+    """Return noise-free commanded speeds of human drivers, which may be negative; see `human_idm_speed`."""
     return speed + idm_acceleration(speed, leader_speed, clamp_min(gap, MIN_IDM_GAP), parameters) * step
 
 
 class FigureEightMovement:
-    """Commands the IDM with noise to human drivers, except on the crossing, and applies the right of way."""
+    """Commands the IDM with noise to human drivers outside the crossing, and applies the right of way."""
 
     def __init__(
         self,
@@ -110,7 +111,7 @@ class FigureEightMovement:
         to_array: ArrayFactory,
         human_model: human_idm.HumanSpeedModel | None = None,
     ) -> None:
-        """Take roads that cross themselves once; humans drive the CAVs, which have these indices, until `hand_over`."""
+        """Take roads that cross themselves once, and the indices of the CAVs, which humans drive until `hand_over`."""
         idm = partial(commanded_speed, parameters=scenario.humans, step=scenario.simulation_step)
         self._human_model, self._cav_indices = human_model or idm, cav_indices
         self._models, self._models_with_cavs = (
@@ -133,17 +134,17 @@ class FigureEightMovement:
         self._sumo_loop_length = to_array(2 * (2 * radius + CROSSING_LINK + INNER_LINK + OUTER_LINK + arc))
         is_behind_arc = np.stack([road.start_positions for road in roads], 1) >= before + exact_arc
         self._position_offset = to_array(np.where(is_behind_arc, arc - exact_arc, 0.0))
-        """SUMO's position of each vehicle minus that on the exact road [m]"""
+        """position of each vehicle in SUMO minus its position on the exact road [m]"""
 
     def hand_over(self) -> None:
-        """Hand the CAVs over to their driver."""
+        """Hand the CAVs to their driver."""
         self._models = self._models_with_cavs
 
     def move(self, speed: Array, position: Array, leader: human_idm.Leader, noise: Array, cav_speeds: Array) -> Array:
-        """Return the speeds after a step, (vehicles, W), with `noise` [m/s], and commands (CAVs, W) or None."""
+        """Return the speeds after a step with `noise`; `cav_speeds` are commands, (CAVs, W), or None [m/s]."""
         commanded = clamp_min(self._human_model(speed, *leader) + noise, 0.0)
         lap_position = position % self._loop_length
-        (major_start, major_end), (minor_start, minor_end) = self._crossings  # where SUMO drives humans itself
+        (major_start, major_end), (minor_start, minor_end) = self._crossings  # SUMO drives human vehicles there
         is_commanded = ((lap_position < major_start) | (major_end <= lap_position)) & (
             (lap_position < minor_start) | (minor_end <= lap_position)
         )
@@ -152,7 +153,7 @@ class FigureEightMovement:
         return self._next_speeds(speed, position, leader, commanded, is_commanded)
 
     def distances_past(self, position: Array) -> list[Array]:
-        """Return the distance of each vehicle past the start of the crossing, on both sides, wrapped to one lap [m]."""
+        """Return how far each vehicle is past the start of each side of the crossing, within one lap [m]."""
         sumo_position = position + self._position_offset
         return [(sumo_position - side.start) % self._sumo_loop_length for side in self._sides]
 
@@ -195,7 +196,7 @@ class FigureEightMovement:
         return next_speed
 
     def _visible_distance(self, look_ahead: Array, distances_past: list[Array]) -> Array:
-        """Return the distance up to which leaders are visible: the end of the last lane that SUMO looks at [m]."""
+        """Return the distance up to which leaders are visible: the end of the last lane that SUMO considers [m]."""
         xp = namespace(look_ahead)
         visible = look_ahead + self._sumo_loop_length
         for side, distance_past in zip(self._sides, distances_past, strict=True):
@@ -220,13 +221,13 @@ class FigureEightMovement:
         last: _Vehicle,
         foe: _Vehicle,
     ) -> _Approach:
-        """Return the plans of all vehicles for one side, `last` being the last vehicle past its start."""
+        """Return the plans of all vehicles for one side; `last` and `foe` are the last vehicles on both sides."""
         xp, models, speed_limit = namespace(speed), self._models, self._models.speed_limit
         is_approaching, is_on_lane = distance <= side.approach_distance, distance <= side.lane_length
         front = xp.where(is_on_lane, -distance, self._sumo_loop_length - distance)
         rearmost = front.argmin(0)
         lane_front, lane_speed = front[rearmost, self._columns], speed[rearmost, self._columns]
-        # The leader counts on the lane of its rear bumper; vehicles before the lane also see the last vehicle on it.
+        # A leader is on the lane of its rear bumper. Vehicles before the lane also see the last vehicle on the lane.
         is_leader_before_lane, is_leader_before = leader.gap <= distance - side.lane_length, leader.gap <= distance
         sees_lane = ~is_on_lane & (lane_front < VEHICLE_LENGTH)
         behind_lane = models.follow_speed(speed, lane_speed + 0.0 * speed, distance + lane_front - VEHICLE_LENGTH)
@@ -258,7 +259,7 @@ class FigureEightMovement:
         return _Approach(distance, is_approaching, to_crossing, stop_speed, go_speed, arrival_time, leave_time)
 
     def _speed_behind_foe(self, speed: Array, distance: Array, foe: _Vehicle) -> Array:
-        """Return the maximum speed of vehicles that must let a foe on the crossing pass [m/s]."""
+        """Return the maximum speeds of vehicles that must wait for a foe on the crossing [m/s]."""
         xp, models, minimum_gap = namespace(speed), self._models, self._models.minimum_gap
         rear = CONFLICT_AREA_START - (foe.front - VEHICLE_LENGTH)
         to_area = distance + CONFLICT_AREA_START
@@ -273,7 +274,7 @@ class FigureEightMovement:
         return xp.where(to_area >= 0.0, xp.maximum(safe, xp.minimum(drives_up, stop_speed)), safe)
 
     def _speed_on_crossing(self, speed: Array, safe_speed: Array, distance_past: Array, foe: _Vehicle) -> Array:
-        """Return the maximum speed of vehicles that just entered the crossing: the earlier vehicle goes first [m/s]."""
+        """Return the maximum speeds of vehicles that just entered the crossing: earlier vehicles go first [m/s]."""
         xp = namespace(speed)
         is_before_area = distance_past < CONFLICT_AREA_START + MINOR_STOP_DISTANCE
         has_conflict = is_before_area & (foe.front < CONFLICT_AREA_START + CROSSED_LANE_WIDTH + VEHICLE_LENGTH)
@@ -290,7 +291,7 @@ class FigureEightMovement:
     def _may_enter(
         self, speed: Array, major: _Approach, minor: _Approach, first: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Return whether the first yielding vehicle may enter, and whether it can still stop, (W,) each."""
+        """Return whether the first vehicle without right of way may enter, and whether it can still stop, (W,) each."""
         xp, models = namespace(speed), self._models
         distance, arrival, leave = minor.distance[first], minor.arrival_time[first], minor.leave_time[first]
         can_brake = (distance > models.brake_gap(speed)[first]) | (models.min_speed(speed)[first] == 0.0)
@@ -304,7 +305,7 @@ class FigureEightMovement:
         return (distance <= FOE_VISIBILITY_DISTANCE) & minor.is_approaching[first] & ~is_blocked, can_brake
 
     def _foe_delay(self, major: _Approach, arrival_time: Array, impatience: Array) -> Array:
-        """Return the delay of each foe that starts to brake when the other vehicle arrives [s]."""
+        """Return the delay of each foe if it starts to brake when the vehicle without right of way arrives [s]."""
         xp, step = namespace(arrival_time), self._step
         start = xp.ceil(arrival_time / step) * step
         is_same_step = xp.floor(arrival_time / step) == xp.floor(major.arrival_time / step)
@@ -320,7 +321,7 @@ class FigureEightMovement:
         return xp.where(is_same_step, 0.0, delay)
 
     def update_memory(self, speed: Array, next_speed: Array, distances_past: list[Array]) -> None:
-        """Update the memory after a step, before which the vehicles had these `distances_past` the crossing."""
+        """Update the memory after a step; `distances_past` the crossing are those before the step."""
         xp, step = namespace(speed), self._step
         waits = (next_speed <= HALTING_SPEED) & (next_speed - speed <= MAX_WAITING_ACCELERATION * step)
         waiting_time, entry_step = (self.memory.waiting_time + step) * waits, self.memory.entry_step - 1.0
@@ -330,17 +331,17 @@ class FigureEightMovement:
         self.memory = CrossingMemory(waiting_time, entry_step)
 
     def replace_roads(self, roads: Any, source: "FigureEightMovement", source_roads: Any) -> None:
-        """Continue on some roads with those of another batch."""
+        """Continue on `roads` with `source_roads` of another batch."""
         for name in ("memory", "_crossings", "_loop_length", "_sides", "_sumo_loop_length", "_position_offset"):
             setattr(self, name, replace_columns(getattr(self, name), roads, getattr(source, name), source_roads))
 
     def restore_memory(self, memories: Sequence[CrossingMemory]) -> None:
-        """Continue from the memories of the roads, shape (vehicles,) each."""
+        """Continue from the memory of each road, shape (vehicles,)."""
         self.memory = CrossingMemory(*(self._to_array(np.stack(values, 1)) for values in zip(*memories, strict=True)))
 
 
 def crossing_memories(scenario: Scenario, road: ClosedRoad, speeds: Floats, positions: Floats) -> CrossingMemory:
-    """Return the memory of the right of way at each step of an episode; all have the shape (steps, vehicles)."""
+    """Return the memory of the right of way in each step of an episode; all arrays have shape (steps, vehicles)."""
     movement = FigureEightMovement(scenario, [road], [], np.asarray)
     memories = [movement.memory]
     for speed, next_speed, position in zip(speeds, speeds[1:], positions, strict=False):
@@ -357,7 +358,10 @@ def may_follow_commands(
     motion: tuple[Floats, Floats],
     commanded_speeds: Floats,
 ) -> NDArray[np.bool_]:
-    """Return whether the right of way allows speeds; `motion`: speeds and positions; all (steps, vehicles)."""
+    """Return whether the right of way allows commanded speeds; `motion` has speeds and positions.
+
+    All arrays have shape (steps, vehicles).
+    """
     speed, position, commanded = (values.T for values in (*motion, commanded_speeds))
     roads = [road] * len(commanded_speeds)
     movement = FigureEightMovement(scenario, roads, cav_indices, np.asarray, lambda *_: commanded)
@@ -365,12 +369,12 @@ def may_follow_commands(
     movement.restore_memory([CrossingMemory(*values) for values in zip(*memories, strict=True)])
     gap = gap_on_loop(position, np.roll(position, -1, 0), road.loop_length, VEHICLE_LENGTH)
     leader = human_idm.Leader(np.roll(speed, -1, 0), gap)
-    moved = movement.move(speed, position, leader, 0.0, commanded[cav_indices])
-    return (np.abs(moved - commanded) < COMMANDED_SPEED_TOLERANCE).T
+    new_speed = movement.move(speed, position, leader, 0.0, commanded[cav_indices])
+    return (np.abs(new_speed - commanded) < COMMANDED_SPEED_TOLERANCE).T
 
 
 def figure_eight_contacts(position: Array, gap: Array, loop_length: Array) -> Array:
-    """Return which vehicles touch the leader on the same lane, or overlap on the crossing; see `ring_contacts`."""
+    """Return which vehicles touch their leader on the same lane, or overlap on the crossing; see `ring_contacts`."""
     xp, lap_position = namespace(position), position % loop_length
     lengths, touches = lane_lengths(figure_eight_radius(loop_length)), gap < human_idm.CONTACT_GAP
     if bool(touches.any()):
@@ -379,7 +383,7 @@ def figure_eight_contacts(position: Array, gap: Array, loop_length: Array) -> Ar
             end = end + length
             lane = lane + (lap_position > end)
         touches = touches & (lane == xp.concatenate([lane[1:], lane[:1]]))
-    low, high = CROSSING_LINK / 2 - CAR_WIDTH / 2, CROSSING_LINK / 2 + CAR_WIDTH / 2 + VEHICLE_LENGTH
+    area_start, area_end = CROSSING_LINK / 2 - CAR_WIDTH / 2, CROSSING_LINK / 2 + CAR_WIDTH / 2 + VEHICLE_LENGTH
     fronts = ((lap_position - start) % loop_length for start in (lengths[0], sum(lengths[:7])))
-    first, second = ((front > low) & (front < high) for front in fronts)
+    first, second = ((front > area_start) & (front < area_end) for front in fronts)
     return touches | ((first | second) & (first.any(0) & second.any(0)))

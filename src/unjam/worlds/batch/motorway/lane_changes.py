@@ -1,8 +1,8 @@
-"""SUMO's lane changes of human drivers on a motorway, all in one step.
+"""SUMO's lane changes of human drivers on a motorway, for all vehicles at once.
 
-SUMO decides for one vehicle after the other. Here, vehicles on the ramp's lane, which must change, come first, and then
-all that gain by a change, which agrees in distribution. From each lane, only one change is possible: left from the
-ramp's lane and the right lane, right from the left lane. Vehicles that must change ask others to make room.
+SUMO decides for one vehicle after the other. Here, vehicles on the ramp's lane, which must change, are first, followed
+by all vehicles that gain by a change; results agree in distribution. Each lane has one target lane: the next lane to
+the left, or the right lane for the left lane. Vehicles that must change request room from others.
 Sources: SUMO's MSLaneChanger (`getRealLeader`, `getRealFollower`, `checkChange`) and MSLCM_LC2013 (`_wantsChange`,
 `anticipateFollowSpeed`, `informLeader`, `informFollower`, `slowDownForBlocked`).
 """
@@ -22,7 +22,7 @@ MERGE_LOOK_AHEAD_TIME, LEFT_LOOK_AHEAD_FACTOR = 10.0, 2.0
 URGENCY_FACTOR = 2.0
 """factor by which the remaining time is shorter than at the look-ahead speed"""
 HELP_SPEED_DIFFERENCE, MIN_FALL_BEHIND_BRAKING = 10.0 / 3.6, 7.0 / 3.6
-"""speed difference with which vehicles overtake to help [m/s], minimum braking to fall behind a leader [m/s2]"""
+"""speed difference of vehicles that overtake to help [m/s], and minimum braking to fall behind a leader [m/s2]"""
 UNCONGESTED_SPEED = 60.0 / 3.6
 """speed above which vehicles do not pass on the right [m/s]"""
 SUMO_POSITION_TOLERANCE = 0.1
@@ -30,7 +30,7 @@ SUMO_POSITION_TOLERANCE = 0.1
 LOOK_AHEAD_RETENTION = 0.9
 """share of the look-ahead speed that remains after a second"""
 LEFT_GAIN_THRESHOLD, RIGHT_GAIN_THRESHOLD = 0.2, 2.0
-"""gains at which vehicles change"""
+"""accumulated gains above which vehicles change lanes"""
 MIN_REFERENCE_SPEED = 10.0
 """minimum speed to which gains are relative [m/s]"""
 RIGHT_SPEED_TOLERANCE = 5.0 / 3.6
@@ -38,28 +38,28 @@ RIGHT_SPEED_TOLERANCE = 5.0 / 3.6
 KEEP_RIGHT_ACCEPTANCE_TIME, KEEP_RIGHT_TIME = 7.0, 5.0
 """times that scale the obligation to keep right, as in SUMO's LC2013 [s]"""
 MIN_REMAINING_TIME = 20.0
-"""time for which the other lane must continue for an optional change [s]"""
+"""minimum remaining driving time on the target lane of an optional change [s]"""
 OVERTAKING_LOOK_AHEAD = 8.0
-"""time before necessary braking at which a vehicle starts to overtake [s]"""
+"""time before a vehicle must brake at which it starts to overtake [s]"""
 
 
 class Neighbor(NamedTuple):
-    """A neighbor of each vehicle."""
+    """The leader or the follower of each vehicle on one lane."""
 
     row: Array
     is_present: Array
-    """whether there is one within the visible distance"""
+    """whether a neighbor is within the visible distance"""
     speed: Array
     gap: Array
-    """beyond the minimum gap of the vehicle behind [m]"""
+    """gap beyond the minimum gap of the vehicle behind [m]"""
 
 
 class LaneChangeContext(NamedTuple):
-    """What each vehicle looks at before it changes to its target lane."""
+    """The information of each vehicle for a change to its target lane."""
 
     drivers: MotorwayDrivers
     target_lane: Array
-    """`NO_VEHICLE`: none"""
+    """index of the target lane; `NO_VEHICLE` without one"""
     leader: Neighbor
     target_leader: Neighbor
     target_follower: Neighbor
@@ -71,7 +71,7 @@ class LaneChangeContext(NamedTuple):
 
 
 def lane_change_context(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: float) -> LaneChangeContext:
-    """Return what each vehicle looks at, in a simulation with a `step` [s]."""
+    """Return the information of each vehicle for a lane change in a simulation step of `step` [s]."""
     lane, position, speed = vehicles.lane, vehicles.position, vehicles.speed
     sections = geometry.sections(lane, position)
     is_merging = sections.is_merging
@@ -96,17 +96,17 @@ def lane_change_context(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, 
     row = neighbors_on_lane(neighbors.followers, target_lane)
     gap = np.where(row >= 0, position - length - position[row] - vehicles.minimum_gap[row], NO_NEIGHBOR_GAP)
     behind, followers = Neighbor(row, row >= 0, speed[row], gap), drivers.select(row)
-    by_leader = ahead.is_present & (ahead.gap < clamp_min(drivers.secure_gap(speed, ahead.speed), 0.0))
-    by_follower = behind.is_present & (behind.gap < clamp_min(followers.secure_gap(behind.speed, speed), 0.0))
-    blocked = by_leader, by_follower
-    return LaneChangeContext(drivers, target_lane, leader, ahead, behind, followers, *blocked, sections, step)
+    is_leader_blocking = ahead.is_present & (ahead.gap < clamp_min(drivers.secure_gap(speed, ahead.speed), 0.0))
+    min_gap_behind = clamp_min(followers.secure_gap(behind.speed, speed), 0.0)
+    is_blocking = is_leader_blocking, behind.is_present & (behind.gap < min_gap_behind)
+    return LaneChangeContext(drivers, target_lane, leader, ahead, behind, followers, *is_blocking, sections, step)
 
 
 def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: float) -> MotorwayVehicles:
     """Return the vehicles after their lane changes, with advice for the next step."""
-    speed, previous = vehicles.speed, vehicles.look_ahead_speed
+    speed, last_speed = vehicles.speed, vehicles.look_ahead_speed
     retention = 1.0 - (1.0 - LOOK_AHEAD_RETENTION) * step
-    look_ahead_speed = np.where(speed > previous, speed, retention * previous + (1.0 - retention) * speed)
+    look_ahead_speed = np.where(speed > last_speed, speed, retention * last_speed + (1.0 - retention) * speed)
     advice = dict.fromkeys(ADVICE_FIELDS, speed * 0.0 + NO_ADVICE)
     vehicles = vehicles._replace(**advice, speed_bias=speed * 0.0, look_ahead_speed=look_ahead_speed)
     context = lane_change_context(vehicles, geometry, step)
@@ -120,18 +120,19 @@ def change_lanes(vehicles: MotorwayVehicles, geometry: MotorwayGeometry, step: f
     bias = np.where(helps & ~is_clear, helping_bias, vehicles.speed_bias)
     vehicles = vehicles._replace(speed_bias=bias)
     changes = changes & ~_has_change_conflict(vehicles, changes, geometry)
-    initial = dict.fromkeys(("speed_gain", "keep_right", "look_ahead_speed", "speed_bias"), 0.0)
-    initial |= dict.fromkeys(ADVICE_FIELDS, NO_ADVICE)
-    return vehicles.replace_rows(changes, lane=context.target_lane[changes], **initial)
+    initial_values = dict.fromkeys(("speed_gain", "keep_right", "look_ahead_speed", "speed_bias"), 0.0)
+    initial_values |= dict.fromkeys(ADVICE_FIELDS, NO_ADVICE)
+    return vehicles.replace_rows(changes, lane=context.target_lane[changes], **initial_values)
 
 
 def mandatory_lane_changes(
     vehicles: MotorwayVehicles, context: LaneChangeContext, geometry: MotorwayGeometry
 ) -> tuple[MotorwayVehicles, Array, Array]:
-    """Return the vehicles with advice, whether each must change now, and whether it is asked to make room."""
+    """Return the vehicles with advice, whether each must change now, and whether others request room from it."""
     position, step = vehicles.position, context.step
     is_on_lane = (vehicles.lane == 0) & (context.target_lane != NO_VEHICLE)
-    occupies = (vehicles.lane == 1) & (position >= geometry.origin)  # those ahead of vehicles that merge
+    # The length of the right lane that vehicles ahead of each vehicle occupy.
+    occupies = (vehicles.lane == 1) & (position >= geometry.origin)
     lengths = np.where(occupies, vehicles.minimum_gap + geometry.vehicle_length, 0.0 * position)
     total = lengths.cumsum(0)
     counts = np.bincount(vehicles.road)
@@ -144,22 +145,22 @@ def mandatory_lane_changes(
     rows = np.arange(len(position))[is_urgent]
     if len(rows) == 0:
         return vehicles, is_urgent, is_asked
-    own_advice_after, cooperative = vehicles.own_advice.copy(), vehicles.cooperative_advice.copy()
+    own_advice, cooperative = vehicles.lane_change_advice.copy(), vehicles.cooperative_advice.copy()
     bias = vehicles.speed_bias.copy()
     merging = _MergingVehicles(vehicles, context, geometry, rows)
     leader, follower = merging.leader, merging.follower
-    planned, own_advice, overtakes = merging.plan_with_leader()
+    planned, leader_advice, overtakes = merging.plan_with_leader()
     is_blocked = merging.is_leader_blocking & leader.is_present
     bias[leader.row[is_blocked]] = 1.0
     overtakes_leader = is_blocked & overtakes
     np.minimum.at(cooperative, leader.row[overtakes_leader], 0.0 * merging.speed[overtakes_leader])
-    is_request, speeds, more_advice, asks_for_change = merging.request_from_follower(planned, ~overtakes_leader)
-    own_advice_after[rows] = np.minimum(own_advice, more_advice)
+    is_request, speeds, follower_advice, asks_for_change = merging.request_from_follower(planned, ~overtakes_leader)
+    own_advice[rows] = np.minimum(leader_advice, follower_advice)
     np.minimum.at(cooperative, follower.row[is_request], (speeds - follower.speed)[is_request] / step)
     is_asked[follower.row[asks_for_change]] = True
     stuck_rows = rows[np.logical_or(merging.is_leader_blocking, merging.is_follower_blocking)]
     bias[stuck_rows] = 1.0
-    vehicles = vehicles._replace(own_advice=own_advice_after, cooperative_advice=cooperative, speed_bias=bias)
+    vehicles = vehicles._replace(lane_change_advice=own_advice, cooperative_advice=cooperative, speed_bias=bias)
     return _yield_to_stuck(vehicles, context, geometry, stuck_rows), is_urgent, is_asked
 
 
@@ -184,18 +185,18 @@ class _MergingVehicles:
         self._remaining_time = clamp_min(self._remaining_distance / look_ahead_speed / URGENCY_FACTOR, context.step)
 
     def plan_with_leader(self) -> tuple[Array, Array, Array]:
-        """Return planned speeds, advised accelerations [m/s2], and whether each vehicle overtakes its leader."""
+        """Return planned speeds, own advice [m/s2], and whether each vehicle overtakes its leader."""
         speed, step, leader = self.speed, self._step, self.leader
         planned = np.minimum(speed, self._drivers.stop_speed(speed, self._remaining_distance, step))
         leader_speed = leader.speed - step * clamp_min(-self._leader_acceleration, 1.0)
         gap = leader.gap + step * (leader_speed - planned)
         follow = self._drivers.follow_speed(speed, gap + self._minimum_gap, leader_speed, step)
         follow = np.maximum(clamp_min(speed - self._braking * step, 0.0), follow)
-        way = leader.gap + 2.0 * self._vehicle_length + self._leader_drivers.parameters.minimum_gap
-        way = clamp_min(way + self._leader_drivers.secure_gap(leader.speed, speed), 0.0)
+        distance = leader.gap + 2.0 * self._vehicle_length + self._leader_drivers.parameters.minimum_gap
+        distance = clamp_min(distance + self._leader_drivers.secure_gap(leader.speed, speed), 0.0)
         surplus = planned - leader.speed
-        duration = np.where(surplus > 0.0, way / clamp_min(surplus, 1e-6), self._remaining_time + 1.0)
-        has_room = self._remaining_distance - self._drivers.brake_gap(speed, step) >= way
+        duration = np.where(surplus > 0.0, distance / clamp_min(surplus, 1e-6), self._remaining_time + 1.0)
+        has_room = self._remaining_distance - self._drivers.brake_gap(speed, step) >= distance
         overtakes = (surplus >= 0.0) & (speed < UNCONGESTED_SPEED) & has_room & (duration <= self._remaining_time)
         braking = clamp_min((speed - follow) / self._remaining_time, MIN_FALL_BEHIND_BRAKING)
         behind = np.minimum(planned, clamp_min(speed - step * np.minimum(self._braking, braking), 0.0))
@@ -208,9 +209,9 @@ class _MergingVehicles:
         return np.where(falls_behind, behind, planned), advice, overtakes
 
     def request_from_follower(self, planned_speed: Array, may_request: Array) -> tuple[Array, Array, Array, Array]:
-        """Return whether each follower is asked for a speed, the speed, own advice, and if it is asked to change."""
+        """Return whether each follower gets a requested speed, the speed, own advice, and a request to change lanes."""
         speed, step, follower = self.speed, self._step, self.follower
-        may_ask, drivers, seconds = may_request & follower.is_present, self._follower_drivers, self._remaining_time
+        may_ask, drivers, time = may_request & follower.is_present, self._follower_drivers, self._remaining_time
         braking, minimum_gap = drivers.parameters.comfortable_deceleration, drivers.parameters.minimum_gap
         slower, after_second = clamp_min(follower.speed - step * braking, 0.0), clamp_min(follower.speed - braking, 0.0)
         surplus, room = planned_speed - after_second, follower.gap + planned_speed - after_second
@@ -223,19 +224,19 @@ class _MergingVehicles:
         behind = follower_speed(planned_speed - np.maximum(slower, follower_speed(planned_speed)))
         difference = planned_speed - follower.speed
         missing = drivers.secure_gap(follower.speed, planned_speed) - follower.gap
-        opens_alone = (difference >= HELP_SPEED_DIFFERENCE) & (missing < difference * seconds)
+        opens_alone = (difference >= HELP_SPEED_DIFFERENCE) & (missing < difference * time)
         can_brake = (room > 0.0) & (room >= needed)
-        is_in_time = (surplus > 0.0) & (surplus * seconds > needed - room + SUMO_POSITION_TOLERANCE)
+        is_in_time = (surplus > 0.0) & (surplus * time > needed - room + SUMO_POSITION_TOLERANCE)
         is_faster = follower.speed > speed
         passing = speed + HELP_SPEED_DIFFERENCE
         passing = np.where(is_faster, np.maximum(slower, passing), np.maximum(follower.speed, passing))
         requested = np.where(can_brake, np.maximum(slower, behind), np.where(is_in_time, slower, passing))
         requested = np.where(opens_alone, planned_speed - HELP_SPEED_DIFFERENCE, requested)
         is_passed = ~opens_alone & ~can_brake & ~is_in_time
-        is_passed = is_passed & ~(is_faster & ((follower.speed - speed) / braking < seconds))
-        way = follower.gap + 2.0 * self._vehicle_length + self._minimum_gap
-        way = clamp_min(way + self._drivers.secure_gap(planned_speed, passing), 0.0)
-        own_speed = np.maximum(passing - way / seconds, speed - step * self._braking)
+        is_passed = is_passed & ~(is_faster & ((follower.speed - speed) / braking < time))
+        distance = follower.gap + 2.0 * self._vehicle_length + self._minimum_gap
+        distance = clamp_min(distance + self._drivers.secure_gap(planned_speed, passing), 0.0)
+        own_speed = np.maximum(passing - distance / time, speed - step * self._braking)
         is_blocked = may_ask & self.is_follower_blocking
         own_advice = np.where(is_blocked & is_passed, (own_speed - speed) / step, NO_ADVICE)
         keeps_gap = may_ask & ~self.is_follower_blocking & self.is_leader_blocking
@@ -246,7 +247,7 @@ class _MergingVehicles:
 def _yield_to_stuck(
     vehicles: MotorwayVehicles, context: LaneChangeContext, geometry: MotorwayGeometry, stuck_rows: Array
 ) -> MotorwayVehicles:
-    """Return the vehicles with advice to those that crawl next to the ramp's lane: each lets one stuck vehicle in."""
+    """Return the vehicles; those that crawl next to the ramp's lane get advice to let one stuck vehicle merge."""
     if len(stuck_rows) == 0:
         return vehicles
     position, speed = vehicles.position, vehicles.speed
@@ -271,7 +272,7 @@ def _yield_to_stuck(
 def _speed_gain_changes(
     vehicles: MotorwayVehicles, context: LaneChangeContext, geometry: MotorwayGeometry, may_change: Array
 ) -> tuple[MotorwayVehicles, Array]:
-    """Return the vehicles with their gains, and whether each wants to change for its gain or to keep right."""
+    """Return the vehicles with their gains, and whether each wants to change to gain speed or to keep right."""
     speed, step = vehicles.speed, context.step
     ahead, leader, drivers, speed_limit = context.target_leader, context.leader, context.drivers, geometry.speed_limit
     is_left = context.target_lane > vehicles.lane
@@ -279,9 +280,9 @@ def _speed_gain_changes(
     def allowed_speed(limit: Array, rows: Array) -> Array:
         return np.minimum(limit * vehicles.speed_factor[rows], vehicles.speed_cap[rows])
 
-    every, sections = slice(None), context.sections
-    target_speed = allowed_speed(speed_limit, every)
-    own_speed = allowed_speed(geometry.speed_limits(vehicles.lane, sections), every)
+    all_rows, sections = slice(None), context.sections
+    target_speed = allowed_speed(speed_limit, all_rows)
+    own_speed = allowed_speed(geometry.speed_limits(vehicles.lane, sections), all_rows)
     remaining = geometry.length - sections.start
     own_remaining = np.where(vehicles.lane == 0, sections.merge_end - sections.merge_start, remaining)
     gain, keep, is_fast = vehicles.speed_gain, vehicles.keep_right, speed >= UNCONGESTED_SPEED
@@ -312,11 +313,11 @@ def _speed_gain_changes(
         return anticipated
 
     target_lane_speed = np.minimum(target_speed, anticipated_speed(ahead, remaining))
-    # At steady speeds, the safe speeds are compared, without the restriction against passing on the right.
+    # Without acceleration, passing on the right is not restricted.
     own_lane_speed = np.minimum(np.where(accelerates, max_speed, own_speed), anticipated_speed(leader, own_remaining))
     relative = (target_lane_speed - own_lane_speed) / clamp_min(target_lane_speed, MIN_REFERENCE_SPEED)
     continues = remaining / clamp_min(speed, 0.1) > MIN_REMAINING_TIME
-    # To the right.
+    # Changes to the right.
     right = may_change & (context.target_lane < vehicles.lane)
     is_slower = own_lane_speed - RIGHT_SPEED_TOLERANCE > target_lane_speed
     decay = np.where(right & is_slower & (gain < 0.0), 0.5**step, 0.0 * gain + 1.0)
@@ -338,7 +339,7 @@ def _speed_gain_changes(
     keep = keep - np.where(is_suitable, obligation, 0.0 * keep)
     keeps_right = is_suitable & (keep < -RIGHT_GAIN_THRESHOLD)
     wants_change = keeps_right | (right & (gain < -RIGHT_GAIN_THRESHOLD) & continues)
-    # To the left.
+    # Changes to the left.
     left = may_change & is_left
     decay = np.where(own_lane_speed > target_lane_speed, 0.5**step, 0.0 * gain + 0.8**step)
     gain = np.where(left & (own_lane_speed >= target_lane_speed) & (gain > 0.0), gain * decay, gain)
@@ -352,20 +353,20 @@ def _speed_gain_changes(
 def _speed_behind_left_leader(
     vehicles: MotorwayVehicles, context: LaneChangeContext, rows: Array, speed_difference: Array
 ) -> tuple[Array, Array]:
-    """Return the speeds of vehicles that do not pass a slower one on the left, and whether each must brake soon."""
+    """Return the speeds of vehicles behind a slower vehicle on the left lane, and whether each must brake soon."""
     speed, drivers, step = vehicles.speed[rows], context.drivers.select(rows), context.step
     leader_speed, gap = context.target_leader.speed[rows], (context.target_leader.gap + vehicles.minimum_gap)[rows]
     comfortable = clamp_min(speed - vehicles.braking[rows] * step, 0.0)
     safe = drivers.follow_speed(speed, gap, leader_speed, step)
-    limited = np.maximum(comfortable, leader_speed - HELP_SPEED_DIFFERENCE)
-    safe = np.where(safe >= comfortable, safe, limited)
+    gentle = np.maximum(comfortable, leader_speed - HELP_SPEED_DIFFERENCE)
+    safe = np.where(safe >= comfortable, safe, gentle)
     safe = np.where(vehicles.speed_gain[rows] < LEFT_GAIN_THRESHOLD, np.maximum(safe, leader_speed), safe)
     later = drivers.follow_speed(speed, gap - speed_difference * OVERTAKING_LOOK_AHEAD, leader_speed, step)
     return safe, later < safe
 
 
 def _has_change_conflict(vehicles: MotorwayVehicles, changes_lane: Array, geometry: MotorwayGeometry) -> Array:
-    """Return which vehicles would change into a gap of the right lane into which a vehicle merges from the ramp."""
+    """Return which vehicles would change into a gap of the right lane where a vehicle merges from the ramp."""
     merges, conflict = changes_lane & (vehicles.lane == 0), np.zeros(len(changes_lane), bool)
     if not bool(merges.any()):
         return conflict

@@ -1,6 +1,6 @@
-"""The vehicles of W motorways in one table, those of each road from front to back, with their drivers.
+"""The vehicles of W motorways and their drivers in one table, sorted by road and from front to back.
 
-Arrays have shape (n,) for the n vehicles on a road now; m/s, m and s. Functions return new records and columns.
+Arrays have shape (n,) for the n vehicles on all roads, in m/s, m and s. Functions return new tables and columns.
 """
 
 from collections.abc import Callable
@@ -16,27 +16,29 @@ from unjam.worlds.batch.motorway import eidm
 from unjam.worlds.batch.motorway.eidm import DesiredSpeed, DriverErrors, LeaderMotion
 from unjam.worlds.lane_neighbors import NO_VEHICLE
 
-NUMBERS_PER_ROAD = 100_000
-"""more than the vehicles that enter a road in an episode"""
+KEYS_PER_ROAD = 100_000
+"""number of keys for the vehicles of one road: more than enter it in an episode"""
 NO_ADVICE = 1e6
-ADVICE_FIELDS = ("own_advice", "cooperative_advice", "adjacent_advice")
+"""advised acceleration without advice, which is never carried out [m/s2]"""
+ADVICE_FIELDS = ("lane_change_advice", "cooperative_advice", "adjacent_advice")
 MIN_IDM_STOP_DISTANCE = 0.01
 """distance below which an IDM stands [m]"""
 
 
 def as_rows(index: Array) -> Array:
-    """Return the rows of a mask, or rows as they are: many columns are selected by rows in half the time."""
+    """Return the rows of a mask, and rows unchanged, because selecting many columns by rows takes half the time."""
     return np.flatnonzero(index) if index.dtype == np.bool_ else index
 
 
 class MotorwayVehicles(NamedTuple):
-    """All vehicles."""
+    """The vehicles on all roads."""
 
     road: Array
+    """index of the road"""
     entry: Array
-    """index among the entries of the road, an integer"""
+    """index of the vehicle in the entries of its road"""
     lane: Array
-    """0: the ramp and its lane; then the motorway's lanes from right to left; an integer"""
+    """index of the lane: 0 for the ramp and its lane, then the lanes of the motorway from right to left"""
     position: Array
     """position of the front bumper along the road [m]"""
     speed: Array
@@ -50,7 +52,7 @@ class MotorwayVehicles(NamedTuple):
     speed_factor: Array
     """desired speed over the speed limit"""
     is_eidm: Array
-    """whether SUMO's EIDM drives; otherwise its IDM"""
+    """whether the driver is SUMO's EIDM instead of its IDM"""
     speed_cap: Array
     desired_speed: Array
     """desired speed of an EIDM, which adapts gradually when the limit rises [m/s]"""
@@ -65,20 +67,21 @@ class MotorwayVehicles(NamedTuple):
     """accumulated obligation to keep right, negative"""
     look_ahead_speed: Array
     """smoothed speed that determines the look-ahead distance of mandatory changes"""
-    own_advice: Array
-    """acceleration that helps the own change [m/s2]; `NO_ADVICE`: none"""
+    lane_change_advice: Array
+    """acceleration that helps the own lane change [m/s2], or `NO_ADVICE`"""
     cooperative_advice: Array
+    """acceleration that helps the lane change of another vehicle"""
     adjacent_advice: Array
     """acceleration that avoids passing on the right, or lets a stuck vehicle merge"""
     speed_bias: Array
-    """preference of a speed halfway to the maximum safe speed (1) or to the minimum (-1) for a change; 0: none"""
+    """preference for a speed halfway to the maximum safe speed (1) or to the minimum speed (-1); 0 without one"""
 
     def map(self, function: Callable[..., Any], *others: "MotorwayVehicles") -> "MotorwayVehicles":
-        """Return `function` of each column."""
+        """Return the vehicles after applying `function` to each column."""
         return MotorwayVehicles(*(function(*values) for values in zip(self, *others, strict=True)))
 
     def select(self, index: Array) -> "MotorwayVehicles":
-        """Return some of the vehicles, or all in another order."""
+        """Return the vehicles of some rows, in the order of the rows."""
         index = as_rows(index)
         return self.map(lambda values: values[index])
 
@@ -106,7 +109,7 @@ class MotorwayDrivers(NamedTuple):
     is_eidm: Array
 
     def select(self, index: Array) -> "MotorwayDrivers":
-        """Return some of the drivers."""
+        """Return the drivers of some rows."""
         index = as_rows(index)
         parameters = IDMArrays(
             *(parameter if type(parameter) is float else parameter[index] for parameter in self.parameters)
@@ -114,21 +117,21 @@ class MotorwayDrivers(NamedTuple):
         return MotorwayDrivers(parameters, DriverErrors(*(error[index] for error in self.errors)), self.is_eidm[index])
 
     def follow_speed(self, speed: Array, gap: Array, leader_speed: Array, step: float) -> Array:
-        """Return the desired speeds after a step at bumper-to-bumper gaps behind leaders."""
+        """Return the desired speeds after a step with bumper-to-bumper gaps to leaders."""
         return self.desired_speed(speed, gap, leader_speed, step).speed
 
     def desired_speed(
         self, speed: Array, gap: Array, leader_speed: Array, step: float, motion: LeaderMotion | None = None
     ) -> DesiredSpeed:
-        """Return the same with its urgency; drivers may stay cool about `motion`."""
-        values, urgency = eidm.eidm_follow_speed(speed, gap, leader_speed, self.parameters, self.errors, step, motion)
-        desired = self._eidm_or_idm(values, _idm_follow_speed, speed, gap, leader_speed, step=step)
-        return DesiredSpeed(desired, np.where(self.is_eidm, urgency, (desired - speed) / step))
+        """Return the desired speeds as `follow_speed`, with accelerations; `motion` of leaders can reduce braking."""
+        speeds, uncooled = eidm.eidm_follow_speed(speed, gap, leader_speed, self.parameters, self.errors, step, motion)
+        desired = self._select_model(speeds, _idm_follow_speed, speed, gap, leader_speed, step=step)
+        return DesiredSpeed(desired, np.where(self.is_eidm, uncooled, (desired - speed) / step))
 
     def stop_speed(self, speed: Array, distance: Array, step: float) -> Array:
         """Return the desired speeds after a step of drivers that must stop within a distance."""
-        values = eidm.eidm_stop_speed(speed, distance, self.parameters, self.errors, step)
-        return self._eidm_or_idm(values, _idm_stop_speed, speed, distance, step=step)
+        speeds = eidm.eidm_stop_speed(speed, distance, self.parameters, self.errors, step)
+        return self._select_model(speeds, _idm_stop_speed, speed, distance, step=step)
 
     def secure_gap(self, speed: Array, leader_speed: Array) -> Array:
         """Return the gap, beyond the minimum gap, that drivers require for a lane change (`getSecureGap`)."""
@@ -138,9 +141,9 @@ class MotorwayDrivers(NamedTuple):
         return gap / np.where(self.is_eidm, divisor, 1.0)
 
     def safe_speed(self, gap: Array, leader_speed: Array, leader_braking: Array, step: float) -> Array:
-        """Return the maximum speed from which drivers that brake a headway later stop behind leaders that brake.
+        """Return the maximum speeds from which drivers can stop behind braking leaders after a time headway.
 
-        Source: SUMO's MSCFModel (`maximumSafeFollowSpeed`); gaps are beyond the minimum gap.
+        Gaps are those beyond the minimum gap. Source: SUMO's MSCFModel (`maximumSafeFollowSpeed`).
         """
         braking = self.parameters.comfortable_deceleration
         change, delay = braking * step, self.parameters.time_headway / step
@@ -152,14 +155,14 @@ class MotorwayDrivers(NamedTuple):
         return change * steps + remaining_gap / (steps + delay)
 
     def brake_gap(self, speed: Array, step: float) -> Array:
-        """Return the stopping distance of drivers that brake after their time headway."""
+        """Return the stopping distances of drivers that brake after their time headway."""
         braking, time_headway = self.parameters.comfortable_deceleration, self.parameters.time_headway
         return stopping_distance(speed, braking, step) + speed * time_headway
 
-    def _eidm_or_idm(
+    def _select_model(
         self, eidm_values: Array, idm_function: Callable[..., Array], *values: Array, **options: float
     ) -> Array:
-        """Return the values of EIDM drivers, and those of `idm_function` for the others."""
+        """Return `eidm_values` for EIDM drivers, and the values of `idm_function` for IDM drivers."""
         is_idm = as_rows(~self.is_eidm)
         if not len(is_idm):
             return eidm_values
@@ -180,30 +183,30 @@ def _idm_follow_speed(speed: Array, gap: Array, leader_speed: Array, parameters:
 
 
 def _idm_stop_speed(speed: Array, distance: Array, parameters: IDMArrays, step: float) -> Array:
-    near = parameters._replace(minimum_gap=0.0 * parameters.minimum_gap)
-    return _idm_follow_speed(speed, distance, 0.0 * speed, near, step) * (distance >= MIN_IDM_STOP_DISTANCE)
+    stop_parameters = parameters._replace(minimum_gap=0.0 * parameters.minimum_gap)
+    return _idm_follow_speed(speed, distance, 0.0 * speed, stop_parameters, step) * (distance >= MIN_IDM_STOP_DISTANCE)
 
 
-def vehicle_numbers(vehicles: MotorwayVehicles, rows: Any = slice(None)) -> Array:
-    """Return road and entry of vehicles as one number, by default of all."""
-    return vehicles.road[rows] * NUMBERS_PER_ROAD + vehicles.entry[rows]
+def vehicle_keys(vehicles: MotorwayVehicles, rows: Any = slice(None)) -> Array:
+    """Return a key for each vehicle in `rows`: the index of its road and that of its entry as one integer."""
+    return vehicles.road[rows] * KEYS_PER_ROAD + vehicles.entry[rows]
 
 
-def find_rows(numbers: Array, vehicles: MotorwayVehicles, candidates: Array) -> Array:
-    """Return the rows of the vehicles with these numbers among rows; `NO_VEHICLE` for those that are not there."""
+def find_rows(keys: Array, vehicles: MotorwayVehicles, candidates: Array) -> Array:
+    """Return the row of the vehicle with each key among the rows `candidates`; `NO_VEHICLE` if it is not there."""
     if not len(candidates):
-        return 0 * numbers + NO_VEHICLE
-    keys = vehicle_numbers(vehicles, candidates)
-    order = keys.argsort()
-    rows = order[np.searchsorted(keys[order], numbers).clip(0, len(keys) - 1)]
-    return np.where(keys[rows] == numbers, candidates[rows], NO_VEHICLE)
+        return 0 * keys + NO_VEHICLE
+    candidate_keys = vehicle_keys(vehicles, candidates)
+    order = candidate_keys.argsort()
+    rows = order[np.searchsorted(candidate_keys[order], keys).clip(0, len(order) - 1)]
+    return np.where(candidate_keys[rows] == keys, candidates[rows], NO_VEHICLE)
 
 
 def sorted_rows(vehicles: MotorwayVehicles) -> Array:
-    """Return the rows of the vehicles road by road, from front to back."""
+    """Return the rows of the vehicles sorted by road and from front to back."""
     return (vehicles.road * 1e6 - vehicles.position).argsort(stable=True)
 
 
 def sort_vehicles(vehicles: MotorwayVehicles) -> MotorwayVehicles:
-    """Return the vehicles road by road, from front to back."""
+    """Return the vehicles sorted by road and from front to back."""
     return vehicles.select(sorted_rows(vehicles))

@@ -1,4 +1,4 @@
-"""W recorded roads as one world: platoons behind vehicles that replay recordings, stepped as arrays."""
+"""W recorded roads as one world of arrays: platoons behind vehicles that replay recordings."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,13 +13,13 @@ from unjam.scenarios.scenario import Scenario
 from unjam.worlds.batch.human_idm import CONTACT_GAP, Leader, human_idm_speed, slow_to_desired_speed
 from unjam.worlds.batch.noise import ArrayFactory
 from unjam.worlds.batch.ring.world import RingBatch
-from unjam.worlds.ordered_road import OrderedRoadLog, without_loop
+from unjam.worlds.ordered_road import OrderedRoadLog, as_open_road_state
 from unjam.worlds.record import Episode, Floats, common_fields
 from unjam.worlds.world import DriverLog
 
 
 class RecordedBatch(RingBatch):
-    """W recorded roads of one platoon, each with its own seed and recording; they equal SUMO's except for rounding."""
+    """W recorded roads, each with its own seed and recording; episodes equal SUMO's except for rounding."""
 
     _road_arrays = (*RingBatch._road_arrays, "_next_samples", "_road_ends")
 
@@ -33,7 +33,7 @@ class RecordedBatch(RingBatch):
         super().__init__(scenarios, seeds, to_array, **options)
         recorded = [np.asarray(road.replayed_speeds) for road in self.roads]
         longest = max(map(len, recorded))
-        # After the end of its recording, a road is simulated behind a vehicle of constant speed, and no longer counted.
+        # After the end of a recording, the road is still simulated, with a constant speed, but no longer recorded.
         padded = [np.pad(speeds, (0, longest - len(speeds)), "edge") for speeds in recorded]
         self._replayed_speeds, self._next_samples = to_array(np.stack(padded, 1)), to_array(np.ones(len(recorded)))
         self._columns = np.arange(len(recorded))
@@ -45,43 +45,41 @@ class RecordedBatch(RingBatch):
 
     @property
     def is_running(self) -> Array:
-        """1 for each road that still counts, else 0, shape (W,)."""
+        """1 for each road with a running episode, else 0, shape (W,)."""
         return self._is_running
 
     @property
     def has_ended(self) -> bool:
-        """Whether all recordings, or the horizon, have ended."""
+        """Whether all recordings have ended, or the horizon is reached."""
         return self.control_steps >= float(self._ends.max())
 
     def exact_state(self) -> LocalState:
-        """Return the exact local state of the CAVs now."""
-        return without_loop(super().exact_state())
+        """Return the current local state of the CAVs without sensor errors."""
+        return as_open_road_state(super().exact_state())
 
     @property
     def motion(self) -> Array:
-        """A copy of the speeds [m/s] and positions [m] of all vehicles now, shape (W, 2, vehicles)."""
+        """A copy of the current speeds [m/s] and positions [m] of all vehicles, shape (W, 2, vehicles)."""
         return namespace(self._speed).stack((self._speed[:-1].T, self._position.T), 1)
 
     def episode_of(self, road: int, motion: Floats) -> Episode:
-        """Return the record of one road without commands, from its `motion`, (control steps + 1, 2, vehicles)."""
-        drawn_road, scenario, (speeds, positions) = (
-            cast(OrderedRoad, self.roads[road]),
-            self.scenario,
-            motion.swapaxes(0, 1),
-        )
+        """Return the record of one road without commands, from its `motion` (control steps + 1, 2, vehicles)."""
+        drawn_road, scenario = cast(OrderedRoad, self.roads[road]), self.scenario
+        speeds, positions = motion.swapaxes(0, 1)
         if scenario.steps_per_control_step > 1:
             scenario = replace(scenario, simulation_step=scenario.control_step, steps_per_control_step=1)
-        moved, no_commands = np.diff(positions, axis=0) / scenario.control_step, np.zeros((0, len(drawn_road.cav_ids)))
-        log = OrderedRoadLog(scenario, drawn_road, positions[0], moved, speeds, no_commands, no_commands, no_commands)
+        mean_speeds = np.diff(positions, axis=0) / scenario.control_step
+        no_commands = [np.zeros((0, len(drawn_road.cav_ids)))] * 3
+        log = OrderedRoadLog(scenario, drawn_road, positions[0], mean_speeds, speeds, *no_commands)
         fields = common_fields(scenario, drawn_road, (), bool(self.crashed_roads[road]))
         return log.episode((speeds.T, positions.T), fields, DriverLog(), None)
 
     def replace_roads(self, roads: Any, source: Any, source_roads: Any) -> None:
-        """Continue on some roads with those of another batch, see `RingBatch.replace_roads`."""
-        both = self._replayed_speeds, source._replayed_speeds
-        longest = np.arange(max(map(len, both)))
-        own, other = (each[longest.clip(max=len(each) - 1)] for each in both)
-        self._replayed_speeds = replace_columns(own, roads, other, source_roads)
+        """Continue on `roads` with roads of another batch; see `RingBatch.replace_roads`."""
+        recordings = self._replayed_speeds, source._replayed_speeds
+        samples = np.arange(max(map(len, recordings)))
+        target_speeds, source_speeds = (speeds[samples.clip(max=len(speeds) - 1)] for speeds in recordings)
+        self._replayed_speeds = replace_columns(target_speeds, roads, source_speeds, source_roads)
         super().replace_roads(roads, source, source_roads)
 
     def _human_speeds(self, speed: Array, leader: Leader) -> Array:
@@ -92,8 +90,8 @@ class RecordedBatch(RingBatch):
         return slow_to_desired_speed(new_speed, speed, self._road_ends - self._position, parameters, step)
 
     def _next_speeds(self, speed: Array, leader: Leader, cav_speeds: Array | None) -> tuple[Array, Array]:
-        moved, speeds = super()._next_speeds(speed, leader, cav_speeds)
-        xp = namespace(moved)
+        noise_free_speeds, speeds = super()._next_speeds(speed, leader, cav_speeds)
+        xp = namespace(speeds)
         replayed = self._replayed_speeds[as_indices(self._next_samples), self._columns][None]
         self._next_samples = clamp_max(self._next_samples + 1.0, len(self._replayed_speeds) - 1.0)
-        return xp.concatenate([moved[:-1], replayed]), xp.concatenate([speeds[:-1], replayed])
+        return xp.concatenate([noise_free_speeds[:-1], replayed]), xp.concatenate([speeds[:-1], replayed])

@@ -1,7 +1,7 @@
-"""W rings as one world, stepped as arrays of shape (vehicles, W), in road order, without the simulator.
+"""W rings as one world of arrays of shape (vehicles, W), with vehicles in road order.
 
-The first row of the vehicles' speeds is repeated at the end, so that the leaders' speeds are a slice. The CAVs' rows
-are those of the first CAV of every ring, then of the second one, and so on.
+The first row of the speeds is repeated at the end, so that the leaders' speeds are a slice. Rows of CAVs contain the
+first CAV of every ring, then the second CAV of every ring, and so on.
 """
 
 from collections.abc import Collection, Sequence
@@ -33,10 +33,10 @@ from unjam.worlds.world import DriverLog, ProgressCallback
 
 
 class WarmUpState(NamedTuple):
-    """State of one ring at the moment when its CAVs are handed over."""
+    """State of one ring after its warm-up, when its CAVs are handed to their driver."""
 
     speed: Floats
-    """speeds [m/s], shape (vehicles + 1,), with the first one again at the end"""
+    """speeds [m/s], shape (vehicles + 1,); the first speed is repeated at the end"""
     position: Floats
     """positions [m], shape (vehicles,)"""
     gap: Floats
@@ -44,14 +44,14 @@ class WarmUpState(NamedTuple):
     has_crashed: bool
     noise: NoiseState
     history: LocalState | None
-    """states that the CAVs observed in the last minute, shape (CAVs, moments); None without memory of the warm-up"""
+    """states of the CAVs in the last minute, shape (CAVs, moments); None if CAVs do not remember the warm-up"""
     crossing_memory: CrossingMemory | None = None
 
 
 class RingBatch:
-    """W closed roads of one kind, each with its own seed; rings equal SUMO's except for rounding.
+    """W closed roads of one kind, each with its own seed; episodes of rings equal SUMO's except for rounding.
 
-    With quick noise, human drivers follow only the vehicle ahead, and not also the last ones on the next lanes.
+    With quick noise, human drivers follow the vehicle ahead only, and ignore the last vehicles on the next lanes.
     """
 
     is_scalar, remaining_rows = False, None
@@ -59,13 +59,13 @@ class RingBatch:
         *("_speed", "_position", "_gap", "_loop_lengths", "_cav_loop_lengths", "_crossing_starts", "_human_parameters"),
         *("_is_running", "crashed_roads", "control_step_counts", "_ends"),
     )
-    """attributes with arrays that have a column for each road"""
+    """names of the attributes with a column for each road"""
     measured_fields: Collection[str] = ()
-    """optional fields of `LocalState` that the driver reads; others are not provided"""
+    """names of the optional fields of `LocalState` that the driver reads"""
     safe_accelerations: Sequence[Array] = ()
     """the CAVs' accelerations after the safety filter in each simulation step of the last control step [m/s2]"""
     warm_up_states: Sequence[WarmUpState] = ()
-    """state of each ring after its warm-up, if that was simulated before"""
+    """state of each ring after its warm-up; empty if the warm-up must be simulated"""
 
     def __init__(
         self,
@@ -76,28 +76,30 @@ class RingBatch:
         draw: DrawNormal | None = None,
         human_model: human_idm.HumanSpeedModel | None = None,
     ) -> None:
-        """Put the vehicles on the roads, at rest; the scenarios differ only in their lengths.
+        """Put vehicles on the roads of scenarios that differ only in their lengths.
 
-        Arrays are those of `to_array`. Whole episodes take 16 bytes for each vehicle and step (`keep_record`). `draw`
-        draws all noise, or each road that of SUMO's episode. `human_model` replaces SUMO's IDM away from junctions.
+        `to_array` makes the arrays. With `keep_record`, episodes take 16 bytes per vehicle and step. `draw` draws all
+        noise; without it, each road has the noise of SUMO's episode. `human_model` replaces SUMO's IDM away from
+        junctions.
         """
         scenario = self.scenario = scenarios[0]
-        drawn = [ring.draw_from_seed(seed) for ring, seed in zip(scenarios, seeds, strict=True)]
-        roads, generator_seeds = [cast(OrderedRoad, road) for road, _ in drawn], [others for _, others in drawn]
+        drawn_roads = [road.draw_from_seed(seed) for road, seed in zip(scenarios, seeds, strict=True)]
+        roads = [cast(OrderedRoad, road) for road, _ in drawn_roads]
+        world_seeds = [road_seeds for _, road_seeds in drawn_roads]
         self._scenarios, self._seeds, self._keep_record, self._to_array = scenarios, seeds, keep_record, to_array
         self.roads, self._is_controlled = roads, False
         vehicles, cavs = len(roads[0].vehicle_ids), len(roads[0].cav_ids)
         self._shape = cavs, len(roads)
         self.limits, self.control_steps = scenario.acceleration_limits, 0
         self.cav_count = self.entered_count = cavs * len(roads)
-        indices = np.array([roads[0].vehicle_ids.index(name) for name in roads[0].cav_ids])
+        indices = np.array([roads[0].vehicle_ids.index(cav_id) for cav_id in roads[0].cav_ids])
         self._cav_indices, self._leader_indices, self._follower_indices = (
-            column.tolist() for column in (indices, indices + 1, (indices - 1) % vehicles)
+            rows.tolist() for rows in (indices, indices + 1, (indices - 1) % vehicles)
         )
-        loops, step = np.array([road.loop_length for road in roads]), scenario.simulation_step
-        self._loop_lengths, self._cav_loop_lengths = to_array(loops), to_array(np.tile(loops, cavs))
-        start = np.stack([road.start_positions for road in roads], 1)
-        self._set_motion(np.tile([road.start_speed for road in roads], (vehicles, 1)), start, loops)
+        loop_lengths, step = np.array([road.loop_length for road in roads]), scenario.simulation_step
+        self._loop_lengths, self._cav_loop_lengths = to_array(loop_lengths), to_array(np.tile(loop_lengths, cavs))
+        start_speeds = np.tile([road.start_speed for road in roads], (vehicles, 1))
+        self._set_motion(start_speeds, np.stack([road.start_positions for road in roads], 1), loop_lengths)
         self._human_parameters = human_idm.human_parameters(roads, scenario.humans, to_array)
         self._human_model = human_model
         self._figure_eight, self._find_contacts = None, human_idm.ring_contacts
@@ -112,9 +114,9 @@ class RingBatch:
         """number of control steps in the episode of each road, shape (W,)"""
         self._noise_scale = to_array(np.full((vehicles, 1), scenario.noise_per_step * step))
         self._actuation = CAVActuation(scenario.safety, scenario.actuator, step)
-        self._readings = RingReadings(scenario, roads[0].cav_ids, generator_seeds, to_array)
+        self._readings = RingReadings(scenario, roads[0].cav_ids, world_seeds, to_array)
         self._noise = (
-            SeededNoise(generator_seeds, vehicles, (scenario.horizon, cavs), to_array)
+            SeededNoise(world_seeds, vehicles, (scenario.horizon, cavs), to_array)
             if draw is None
             else QuickNoise(draw, vehicles, cavs, len(roads))
         )
@@ -123,16 +125,16 @@ class RingBatch:
 
     @classmethod
     def from_tasks(cls, tasks: Sequence[EpisodeTask], to_array: ArrayFactory) -> Self:
-        """Return the rings of tasks."""
+        """Return a batch with the roads of tasks."""
         scenarios = [task.scenario for task in tasks]
         return cls(scenarios, [task.seed for task in tasks], to_array)
 
     def values_of_cavs(self, values: Array) -> Array:
-        """Return for each CAV the value of its road; values have the shape (W,)."""
+        """Return the value of the road of each CAV, given values of shape (W,)."""
         return self._to_array(np.tile(values, self._shape[0]))
 
     def _set_motion(self, speeds: Array, positions: Array, loop_lengths: Array) -> None:
-        """Set speeds, positions and gaps; NumPy arrays of shapes (vehicles, W) [m/s], (vehicles, W) and (W,) [m]."""
+        """Set speeds [m/s], positions [m], and gaps, given NumPy arrays of shape (vehicles, W); `loop_lengths` (W,)."""
         self._speed = self._to_array(np.concatenate([speeds, speeds[:1]]))
         self._position = self._to_array(positions)
         self._gap = self._to_array(gap_on_loop(positions, np.roll(positions, -1, 0), loop_lengths, VEHICLE_LENGTH))
@@ -143,26 +145,26 @@ class RingBatch:
         self._start_positions = as_numpy(self._position)
         zeros = self._speed[0] * 0.0
         self._is_running, self.crashed_roads, self.control_step_counts = zeros + 1.0, zeros > 0.0, zeros
-        """whether each road still counts, whether there was a collision on it, and its control steps, shape (W,)"""
+        """whether the episode of each road is running and has crashed, and its control steps, shape (W,)"""
 
     def place_vehicles(self, speeds: Array, positions: Array, memories: Sequence[CrossingMemory | None]) -> None:
-        """Move vehicles before the start [m/s, m], (vehicles, W); `memories` are those of figure eights."""
+        """Set speeds [m/s] and positions [m] before the start, (vehicles, W), and the `memories` of figure eights."""
         if self._figure_eight:
             self._figure_eight.restore_memory(cast(Sequence[CrossingMemory], memories))
         self._set_motion(speeds, positions, as_numpy(self._loop_lengths))
         self._reset_log()
 
     def set_actuators(self, state: ActuatorState) -> None:
-        """Let the CAVs start with accelerations and pending commands, all rows of the first CAV, then of the second."""
+        """Set the accelerations and pending commands of the CAVs before the start."""
         self._actuation.set_state("all", state)
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> LocalState | None:
-        """Run the warm-up, unless `warm_up_states` are set; then hand the CAVs over, unless they stay human.
+        """Run the warm-up or restore `warm_up_states`, and hand the CAVs to their driver if `is_controlled`.
 
-        Return what the CAVs observed in the last minute of the warm-up, NumPy arrays of shape (CAVs * W, moments),
-        oldest first; None without a warm-up that may be remembered.
+        Return the states of the CAVs in the last minute of the warm-up, NumPy arrays of shape (CAVs * W, moments),
+        oldest first; None if there is no warm-up to remember.
         """
-        history = self._restore(self.warm_up_states) if self.warm_up_states else self._drive_warm_up()
+        history = self._restore(self.warm_up_states) if self.warm_up_states else self._simulate_warm_up()
         if bool(self.crashed_roads.any()):
             raise EpisodeError("collision in the all-human warm-up of a ring")
         self._is_controlled = is_controlled
@@ -174,11 +176,12 @@ class RingBatch:
         self._reset_log()
         return history
 
-    def _drive_warm_up(self) -> LocalState | None:
+    def _simulate_warm_up(self) -> LocalState | None:
+        """Simulate the warm-up, and return the states of the CAVs that `start` returns."""
         scenario, states = self.scenario, list[LocalState]()
         max_count = round(MAX_RECALL_SECONDS / scenario.control_step)
-        for remaining in range(scenario.warmup, 0, -1):
-            control_steps, rest_steps = divmod(remaining, scenario.steps_per_control_step)
+        for remaining_steps in range(scenario.warmup, 0, -1):
+            control_steps, rest_steps = divmod(remaining_steps, scenario.steps_per_control_step)
             if rest_steps == 0 and control_steps <= max_count:
                 states.append(self.exact_state().map(as_numpy))
             self._simulate(None)
@@ -187,17 +190,17 @@ class RingBatch:
         return states[0].map(lambda *values: np.stack(values, 1), *states[1:])
 
     def run_warm_up(self) -> list[WarmUpState]:
-        """Run the warm-up and return the state of each ring after it; for NumPy arrays and seeded noise."""
-        history, noise = self._drive_warm_up(), cast(SeededNoise, self._noise).states()
+        """Run the warm-up and return the state of each ring after it; requires NumPy arrays and seeded noise."""
+        history, noise = self._simulate_warm_up(), cast(SeededNoise, self._noise).states()
         if history is not None:
             history = history.map(lambda values: values.reshape(*self._shape, -1).swapaxes(0, 1).copy())
         speed, position, gap = (values.T.copy() for values in (self._speed, self._position, self._gap))
         states = []
-        for ring, crashed in enumerate(self.crashed_roads.tolist()):
+        for ring, has_crashed in enumerate(self.crashed_roads.tolist()):
             memory = self._figure_eight and CrossingMemory(*(values[:, ring] for values in self._figure_eight.memory))
-            own_history = None if history is None else history.select(ring)
+            ring_history = None if history is None else history.select(ring)
             motion = speed[ring], position[ring], gap[ring]
-            states.append(WarmUpState(*motion, crashed, noise[ring], own_history, memory))
+            states.append(WarmUpState(*motion, has_crashed, noise[ring], ring_history, memory))
         return states
 
     def _restore(self, states: Sequence[WarmUpState]) -> LocalState | None:
@@ -212,14 +215,14 @@ class RingBatch:
         return histories[0].map(lambda *values: np.stack(values, 1).reshape(self.cav_count, -1), *histories[1:])
 
     def replace_roads(self, roads: Any, source: Self, source_roads: Any) -> None:
-        """Continue on some roads with those of another batch that has just been started; one CAV on each.
+        """Continue on `roads` with `source_roads` of another batch that has just been started.
 
-        Both batches keep no record, and have the same kind of arrays, noise and scenario.
+        Both batches have one CAV on each road, keep no record, and have the same kind of arrays, noise and scenario.
         """
         for name in self._road_arrays:
             setattr(self, name, replace_columns(getattr(self, name), roads, getattr(source, name), source_roads))
-        for own, other in zip(roads, source_roads, strict=True):
-            self.roads[own] = source.roads[other]
+        for road, source_road in zip(roads, source_roads, strict=True):
+            self.roads[road] = source.roads[source_road]
         self._readings.replace_roads(roads, source._readings, source_roads)
         self._noise.replace_worlds(roads, source._noise, source_roads)  # pyright: ignore[reportArgumentType]
         self._actuation.reset_rows(roads)
@@ -227,7 +230,7 @@ class RingBatch:
             self._figure_eight.replace_roads(roads, source._figure_eight, source_roads)
 
     def detach_state(self) -> None:
-        """Let no gradients of torch flow through the state so far."""
+        """Detach the state of torch tensors, so that no gradients flow through earlier steps."""
         self._speed, self._position, self._gap = (
             values.detach() for values in (self._speed, self._position, self._gap)
         )
@@ -244,11 +247,11 @@ class RingBatch:
         return self.control_step_counts >= self._ends
 
     def last_applied_acceleration(self) -> Array:
-        """Return the accelerations of the CAVs in the last control step, after the filter [m/s2], shape (CAVs * W,)."""
+        """Return the CAVs' mean accelerations in the last control step, after the filter [m/s2], shape (CAVs * W,)."""
         return sum(self.safe_accelerations) / len(self.safe_accelerations)
 
     def last_outcome(self) -> Outcome:
-        """Return the outcome of the last control step, a row for each road; some arrays belong to the world."""
+        """Return the outcome of the last control step, a row for each road; its arrays must not be changed."""
         speed, _, gap = self.following_state()
         by_cav = self.last_applied_acceleration(), time_gap(gap, speed), speed
         accelerations, time_gaps, cav_speeds = (values.reshape(self._shape).T for values in by_cav)
@@ -257,7 +260,7 @@ class RingBatch:
 
     @property
     def has_ended(self) -> bool:
-        """Whether the horizon is reached; rings with a collision are still simulated but no longer counted."""
+        """Whether the horizon is reached; rings with a collision are still simulated, but no longer recorded."""
         return self.control_steps >= self.scenario.horizon
 
     def local_state(self) -> LocalState:
@@ -269,7 +272,7 @@ class RingBatch:
 
     def exact_state(self) -> LocalState:
         """Return the exact local state of the CAVs now."""
-        loop, position = self._cav_loop_lengths, self._rows_of(self._position, self._cav_indices)
+        loop, position = self._cav_loop_lengths, self._select_rows(self._position, self._cav_indices)
         if self._has_quick_noise and isfinite(self.roads[0].loop_length):
             lap_position = position - loop * namespace(position).floor(position / loop)  # `%` takes ten times as long
         else:
@@ -278,8 +281,8 @@ class RingBatch:
         distances = [(start - position) % loop for start in self._crossing_starts]
         return LocalState(
             *self.following_state(),
-            self._rows_of(self._speed, self._follower_indices),
-            self._rows_of(self._gap, self._follower_indices),
+            self._select_rows(self._speed, self._follower_indices),
+            self._select_rows(self._gap, self._follower_indices),
             lap_position,
             loop,
             distance_to_crossing=reduce(namespace(position).minimum, distances) if distances else None,
@@ -287,16 +290,17 @@ class RingBatch:
         )
 
     def following_state(self) -> FollowingState:
-        """Return the exact speeds of the CAVs, and those of and gaps to their leaders now, shape (CAVs * W,) each."""
-        own, leader_speed = self._cav_indices, self._rows_of(self._speed, self._leader_indices)
-        return FollowingState(self._rows_of(self._speed, own), leader_speed, self._rows_of(self._gap, own))
+        """Return the exact speeds, leader speeds and gaps of the CAVs, shape (CAVs * W,) each."""
+        leader_speed = self._select_rows(self._speed, self._leader_indices)
+        speed, gap = (self._select_rows(values, self._cav_indices) for values in (self._speed, self._gap))
+        return FollowingState(speed, leader_speed, gap)
 
-    def _rows_of(self, values: Array, indices: list[int]) -> Array:
+    def _select_rows(self, values: Array, indices: list[int]) -> Array:
         """Return the values of some vehicles of all rings, shape (CAVs * W,)."""
         return values[indices[0]] if len(indices) == 1 else values[indices].reshape(-1)
 
     def advance(self, command: Command | None) -> None:
-        """Simulate one control step with the same command throughout; None: the CAVs stay human."""
+        """Simulate one control step with a constant command; without a command the CAVs stay human."""
         requested = None
         if self._is_controlled:
             requested = batch_commanded_accelerations(command, self.limits, self.cav_count, self.control_steps)
@@ -308,7 +312,7 @@ class RingBatch:
         self._is_running = self._is_running * (~self.crashed_roads & ~self.completed_roads)
 
     def _human_speeds(self, speed: Array, leader: human_idm.Leader) -> Array:
-        """Return the speeds of all vehicles after this step if humans drive them, shape (vehicles, W)."""
+        """Return the noise-free speeds of all vehicles after this step as human drivers, shape (vehicles, W)."""
         parameters, step = self._human_parameters, self.scenario.simulation_step
         if self._human_model is not None:
             return self._human_model(speed, *leader)
@@ -317,7 +321,7 @@ class RingBatch:
         return human_idm.human_ring_speed(speed, self._position, leader, self._loop_lengths, parameters, step)
 
     def _simulate(self, accelerations: Array | None) -> Array:
-        """Simulate one step, and return the CAVs' safe accelerations; None: the CAVs are human."""
+        """Simulate one step, and return the accelerations of the CAVs after the filter; None if they are human."""
         step, speed, state = self.scenario.simulation_step, self._speed, self.following_state()
         safe, commanded = None, None
         if accelerations is not None:
@@ -326,85 +330,88 @@ class RingBatch:
             if self._keep_record:
                 self._series["safe_accelerations"].append(safe)
                 self._series["commanded_speeds"].append(commanded)
-        moved, speeds = self._next_speeds(speed[:-1], human_idm.Leader(speed[1:], self._gap), commanded)
-        xp = namespace(moved)
-        leader_moved = xp.concatenate([moved[1:], moved[:1]])
-        self._gap = self._gap + (leader_moved - moved) * step
-        self._position = next_position(self._position, moved, step)
+        noise_free, speeds = self._next_speeds(speed[:-1], human_idm.Leader(speed[1:], self._gap), commanded)
+        xp = namespace(noise_free)
+        leader_speed = xp.concatenate([noise_free[1:], noise_free[:1]])
+        self._gap = self._gap + (leader_speed - noise_free) * step
+        self._position = next_position(self._position, noise_free, step)
         if self._figure_eight or bool((self._gap < human_idm.CONTACT_GAP).any()):
             contacts = self._find_contacts(self._position, self._gap, self._loop_lengths)
             self.crashed_roads = self.crashed_roads | (contacts.any(0) & (self._is_running > 0.0))
         self._speed = xp.concatenate([speeds, speeds[:1]])
         if self._keep_record:
-            self._series["noise_free_speeds"].append(moved)
+            self._series["noise_free_speeds"].append(noise_free)
             self._series["speeds"].append(speeds)
         return safe
 
     def _next_speeds(self, speed: Array, leader: human_idm.Leader, cav_speeds: Array | None) -> tuple[Array, Array]:
-        """Return the speeds with which all vehicles move in this step, and those after it, (vehicles, W) each."""
+        """Return noise-free speeds with which vehicles move in this step, and speeds after it, (vehicles, W) each."""
         commanded = None if cav_speeds is None else cav_speeds.reshape(self._shape)
         if self._figure_eight:
             noise = self._noise.human_noise() * self._noise_scale if self.scenario.noise > 0 else 0.0
             return (self._figure_eight.move(speed, self._position, leader, noise, commanded),) * 2
-        moved = self._human_speeds(speed, leader)
+        noise_free = self._human_speeds(speed, leader)
         if commanded is not None:
             min_speed = speed[self._cav_indices] - self.scenario.cav_max_braking * self.scenario.simulation_step
-            moved[self._cav_indices] = clamp_max(clamp_min(commanded, min_speed), self.scenario.top_speed)
+            noise_free[self._cav_indices] = clamp_max(clamp_min(commanded, min_speed), self.scenario.top_speed)
         if self.scenario.noise > 0:
-            return moved, clamp_min(moved + self._noise.human_noise() * self._noise_scale, 0.0)
-        return moved, moved
+            return noise_free, clamp_min(noise_free + self._noise.human_noise() * self._noise_scale, 0.0)
+        return noise_free, noise_free
 
     def noise(self, episode_noise_size: int = 0) -> Array:
-        """Return standard normal noise of this control step, shape (CAVs * W,), or of the episode: see `World`."""
+        """Return standard normal noise of this control step, shape (CAVs * W,), or of the episode; see `World`."""
         if episode_noise_size:
             return self._noise.episode_noise(episode_noise_size)
         return self._noise.exploration_noise(self.control_steps)
 
     def record(self, driver_log: DriverLog) -> tuple[Episode, ...]:
-        """Return the record of each ring since the start, without rewards; none if records are not kept."""
+        """Return the record of each ring, without rewards; empty if no record is kept."""
         if not self._keep_record:
             return ()
-        steps, crashed = as_numpy(self.control_step_counts).astype(int), as_numpy(self.crashed_roads) > 0.0
-        rings = zip(self._scenarios, self.roads, self._seeds, steps.tolist(), crashed.tolist(), strict=True)
+        step_counts, has_crashed = as_numpy(self.control_step_counts).astype(int), as_numpy(self.crashed_roads) > 0.0
+        rings = zip(self._scenarios, self.roads, self._seeds, step_counts.tolist(), has_crashed.tolist(), strict=True)
         rate = self.roads[0].provided_penetration_rate(self.measured_fields)
         return make_ring_episodes(rings, self._start_positions, self._series, self._find_contacts, driver_log, rate)
 
 
 class RingReadings:
-    """Readings of W rings; each ring has its own generators and calls them in the same order as SUMO's worlds."""
+    """Sensor readings of the CAVs on W rings, whose generators draw in the same order as in SUMO's worlds."""
 
     def __init__(self, scenario: Scenario, cav_ids: Sequence[str], seeds: WorldSeeds, to_array: ArrayFactory) -> None:
         sensors, braking = scenario.sensors, scenario.safety.leader_braking
-        step, used = scenario.simulation_step, () if sensors.is_exact else seeds
-        self._ring_readings = [SensorReadings(sensors, braking, step, seed) for *_, seed in used]
+        step, ring_seeds = scenario.simulation_step, () if sensors.is_exact else seeds
+        self._ring_readings = [SensorReadings(sensors, braking, step, seed) for *_, seed in ring_seeds]
         self._cav_ids, self._to_array, self._shape = cav_ids, to_array, (len(cav_ids), len(seeds))
         self._cached_readings: tuple[int, LocalState] | None = None
 
     def replace_roads(self, roads: Sequence[int], source: "RingReadings", source_roads: Sequence[int]) -> None:
-        """Continue on some rings with the sensors of another batch, from the next control step on."""
+        """Continue on `roads` with the sensors of another batch, from the next control step on."""
         if self._ring_readings:
-            for own, other in zip(roads, source_roads, strict=True):
-                self._ring_readings[own] = source._ring_readings[other]
+            for road, source_road in zip(roads, source_roads, strict=True):
+                self._ring_readings[road] = source._ring_readings[source_road]
 
     def read_for_drivers(self, step_index: int, true_state: LocalState) -> LocalState:
-        """Return the drivers' readings of the true state, the same for all calls in a control step."""
+        """Return the readings of the drivers from the true state; they are the same for all calls in a control step."""
         if not self._ring_readings:
             return true_state
         if self._cached_readings is None or self._cached_readings[0] != step_index:
-            true = true_state.map(lambda values: as_numpy(values).reshape(self._shape))
+            states = true_state.map(lambda values: as_numpy(values).reshape(self._shape))
             first, *others = (
-                readings.read_for_driver(self._cav_ids, true.select(np.s_[:, ring]))
+                readings.read_for_driver(self._cav_ids, states.select(np.s_[:, ring]))
                 for ring, readings in enumerate(self._ring_readings)
             )
-            read = first.map(lambda *values: self._to_array(np.stack(values, 1).reshape(-1)), *others)
-            self._cached_readings = step_index, read
+            joined = first.map(lambda *values: self._to_array(np.stack(values, 1).reshape(-1)), *others)
+            self._cached_readings = step_index, joined
         return self._cached_readings[1]
 
     def read_for_filters(self, true_state: FollowingState) -> FollowingState:
-        """Return the safety filters' readings of the true state, for one call in each simulation step."""
+        """Return the readings of the safety filters from the true state; call it once in each simulation step."""
         if not self._ring_readings:
             return true_state
         cavs = product(self._cav_ids, self._ring_readings)
         rows = np.stack([as_numpy(values) for values in true_state], 1).tolist()
-        read = [ring.read_for_filter(name, FollowingState(*row)) for (name, ring), row in zip(cavs, rows, strict=True)]
-        return FollowingState(*self._to_array(np.array(read).T))
+        readings = [
+            ring_readings.read_for_filter(cav_id, FollowingState(*row))
+            for (cav_id, ring_readings), row in zip(cavs, rows, strict=True)
+        ]
+        return FollowingState(*self._to_array(np.array(readings).T))
