@@ -294,7 +294,9 @@ def test_closed_environments_are_refused_until_new_ones_are_made(arguments: dict
     environment.close()
     environment.close()
     for call in (lambda: environment.step(np.zeros(environment.action_space.shape or ())), environment.reset):
-        with pytest.raises(ClosedEnvironmentError, match=r"are closed; allowed: new environments of gymnasium\.make_vec"):
+        with pytest.raises(
+            ClosedEnvironmentError, match=r"are closed; allowed: new environments of gymnasium\.make_vec"
+        ):
             call()
 
 
