@@ -15,7 +15,7 @@ class RoadInterface(NamedTuple):
 
     title: str
     is_closed: bool
-    has_coordinate: bool
+    has_route_position: bool
     """whether vehicles have a position along the road"""
     provided_fields: frozenset[str]
     """optional fields of a `LocalState`"""
@@ -61,7 +61,7 @@ class Requirements(NamedTuple):
             return "it needs a closed road"
         if missing := sorted(self.required_fields - road.provided_fields):
             return f"it needs {', '.join(missing)}"
-        if self.needs_coordinate and not road.has_coordinate:
+        if self.needs_coordinate and not road.has_route_position:
             return "it needs positions along the road"
         if other_steps := self.other_time_steps(road.control_step):
             return f"its time_step is {other_steps[0]:g} s; allowed: {road.control_step:g} s, the control step"

@@ -151,7 +151,7 @@ class Scenario(Subclassable):
     """whether the road is a loop"""
     road_model: ClassVar[str] = ""
     """world model of the whole road, a key of `unjam.models.registry`; empty: none"""
-    has_coordinate: ClassVar[bool] = True
+    has_route_position: ClassVar[bool] = True
     """whether vehicles have a position along the road"""
     has_vehicle_types: ClassVar[bool] = False
     """whether the user defines vehicle types; a CAV keeps the properties of its type"""
@@ -259,7 +259,7 @@ class Scenario(Subclassable):
     def interface(self) -> RoadInterface:
         """What it provides to drivers."""
         fields = frozenset(self.provided_fields)
-        return RoadInterface(self.title, self.is_closed, self.has_coordinate, fields, self.control_step)
+        return RoadInterface(self.title, self.is_closed, self.has_route_position, fields, self.control_step)
 
     def plain_sumo_command(self, seed: int) -> str:
         """Return the command by which plain SUMO has the same traffic without CAVs; empty on built-in roads."""

@@ -73,7 +73,7 @@ class UserNetwork(Scenario):
     title: ClassVar[str] = "user-network"
     reward: ClassVar[str] = "travel-time"
     is_closed: ClassVar[bool] = False
-    has_coordinate: ClassVar[bool] = False
+    has_route_position: ClassVar[bool] = False
     has_vehicle_types: ClassVar[bool] = True
     reads_user_files: ClassVar[bool] = True
 

@@ -60,7 +60,7 @@ class CheckedWorld:
     def __init__(self, world: Any, label: str, scenario: Scenario) -> None:
         self._world, self._label, self._scenario = world, label, scenario
         may_be_nan = set[str]() if scenario.is_closed else {"loop_length"}
-        may_be_nan |= set() if scenario.has_coordinate else {"route_position"}
+        may_be_nan |= set() if scenario.has_route_position else {"route_position"}
         self._finite_fields = set(COMMON_FIELDS) - may_be_nan
         self._step_count = 0
 
