@@ -14,7 +14,7 @@ from unjam.controller.file import packaged_file, read_controller
 from unjam.drivers.safety import STANDARD_ACTUATOR
 from unjam.drivers.wrappers import FilteredDriver
 from unjam.manifest import manifest
-from unjam.measures.effect import effect_of
+from unjam.measures.effect import compute_effect
 from unjam.measures.feasibility import overall_feasibility
 from unjam.measures.statistics import metric_estimate
 from unjam.reports.figures import png_bytes
@@ -59,7 +59,7 @@ def measure_card(name: str) -> dict[str, Any]:
         "road": road,
         "changes": changes,
         "made_for": road_description(read_controller(packaged_file(name)).manifest),
-        "compared with the human baseline": effect_of(rows, human_rows).summary,
+        "compared with the human baseline": compute_effect(rows, human_rows).summary,
         "seeds": len(rows),
         "min_time_gap": metric_estimate(rows, "min_time_gap").mean,
         "max_braking": metric_estimate(rows, "cav_max_braking").mean,

@@ -17,7 +17,7 @@ from unjam.drivers import ResidualDriver
 from unjam.drivers.registry import driver_recipe
 from unjam.drivers.wrappers import FilteredDriver, RoadTypeSwitch
 from unjam.errors import InputError
-from unjam.measures.effect import effect_of
+from unjam.measures.effect import compute_effect
 from unjam.measures.feasibility import FEASIBLE, overall_feasibility
 from unjam.measures.metrics import measure
 from unjam.measures.statistics import paired_difference
@@ -85,7 +85,7 @@ def test_the_on_ramps_adds_to_its_expert_where_a_ramp_joins_and_drives_nowhere_e
     expert, trained = "unjam:on-ramp-tuned", "unjam:on-ramp-best"
     road = {"peak": [0, 300], "horizon": 400, "penetration_rate": 0.05}
     found = unjam.drive("on-ramp", ["human", expert, trained], episodes=2, scenario_options=road, workers=2)
-    of_expert, of_trained = (effect_of(found.rows[name], found.rows["human"]) for name in (expert, trained))
+    of_expert, of_trained = (compute_effect(found.rows[name], found.rows["human"]) for name in (expert, trained))
     assert of_trained.travel_time != of_expert.travel_time
     assert of_trained.feasibility == FEASIBLE
     with pytest.raises(InputError, match="is not allowed on ring: it needs distance_to_merge"):

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.measures.test_feasibility import FEASIBLE_ROW
-from unjam.measures.effect import Effect, describe_harm, effect_of, effects_by_driver
+from unjam.measures.effect import Effect, compute_effect, describe_harm, effects_by_driver
 from unjam.measures.recommendation import MIN_VERDICT_SEEDS, rejection_reasons
 from unjam.measures.statistics import Estimate, estimate
 
@@ -73,16 +73,16 @@ def test_effects_need_a_human_baseline() -> None:
 
 def test_delay_reduction_has_its_own_confidence_interval() -> None:
     baseline = [{**row, "delay": row["travel_time"] - 60.0} for row in rows_of([90.0, 100.0, 120.0])]
-    half = effect_of(rows_of([75.0, 80.0, 90.0]), baseline).delay_reduction
+    half = compute_effect(rows_of([75.0, 80.0, 90.0]), baseline).delay_reduction
     assert (half.mean, half.low, half.high) == pytest.approx((0.5, 0.5, 0.5))  # on each seed
-    assert effect_of(rows_of([75.0, 80.0, nan]), baseline).delay_reduction.count == 2
+    assert compute_effect(rows_of([75.0, 80.0, nan]), baseline).delay_reduction.count == 2
     negative_delay = [{**row, "delay": -40.0} for row in baseline]
-    assert effect_of(rows_of([75.0] * 3), negative_delay).delay_reduction.count == 0
+    assert compute_effect(rows_of([75.0] * 3), negative_delay).delay_reduction.count == 0
 
 
 def test_differences_are_paired_on_common_seeds() -> None:
     baseline = rows_of([100.0, 120.0, 140.0, 999.0])
-    found = effect_of(rows_of([98.0, 117.0, 136.0], outflow_veh_per_h=1990.0), baseline)
+    found = compute_effect(rows_of([98.0, 117.0, 136.0], outflow_veh_per_h=1990.0), baseline)
     assert (found.travel_time.mean, found.travel_time.count) == (-3.0, 3)
     assert found.travel_time == estimate([-2.0, -3.0, -4.0])
     assert found.flow == Estimate(-10.0, -10.0, -10.0, 3)
@@ -95,17 +95,21 @@ def test_effect_has_collisions_failures_and_feasibility() -> None:
     rows = rows_of([99.0, 98.0, nan], human_braking_beyond_4_5=500.0)
     rows[0] |= {"status": "collision", "collisions": 2.0}
     rows[2] |= {"status": "failed", "collisions": nan}
-    found = effect_of(rows, rows_of([100.0] * 3))
+    found = compute_effect(rows, rows_of([100.0] * 3))
     assert (found.collisions, found.failed_episodes, found.early_ends) == (2.0, 1, 1)
     assert (found.travel_time.count, found.travel_time.mean) == (1, -2.0), "of the complete episode"
     assert found.feasibility == "2 vehicles in contact (1 of 3)"
     assert found.hard_braking.mean == 470.0
-    assert effect_of(rows_of([99.0], human_braking_beyond_4_5=500.0), rows_of([100.0])).feasibility == "feasible"
+    assert compute_effect(rows_of([99.0], human_braking_beyond_4_5=500.0), rows_of([100.0])).feasibility == "feasible"
 
 
 def test_higher_confidence_widens_the_interval() -> None:
     baseline, rows = rows_of([100.0] * 12), rows_of([99.0 + 0.3 * number for number in range(12)])
-    assert effect_of(rows, baseline, 0.99).relative_half_width > effect_of(rows, baseline).relative_half_width > 0
+    assert (
+        compute_effect(rows, baseline, 0.99).relative_half_width
+        > compute_effect(rows, baseline).relative_half_width
+        > 0
+    )
 
 
 def test_beneficial_effect_has_no_rejection_reasons() -> None:
@@ -165,7 +169,7 @@ def test_loss_of_flow_is_rejected_despite_shorter_travel_time() -> None:
 
 
 def test_one_seed_is_not_enough_for_a_recommendation() -> None:
-    found = effect_of(rows_of([50.0]), rows_of([100.0]))
+    found = compute_effect(rows_of([50.0]), rows_of([100.0]))
     reasons = rejection_reasons(found)
     assert any("1 test seed, where 10 are needed" in reason for reason in reasons)
     assert any("not shown to be shorter" in reason for reason in reasons)

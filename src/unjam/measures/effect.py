@@ -114,7 +114,7 @@ def is_measured(rows: Iterable[dict[str, Any]], metric: str) -> bool:
     return any(isfinite(row.get(metric, nan)) for row in rows)
 
 
-def effect_of(rows: EpisodeRows, baseline: EpisodeRows, confidence: float = CONFIDENCE) -> Effect:
+def compute_effect(rows: EpisodeRows, baseline: EpisodeRows, confidence: float = CONFIDENCE) -> Effect:
     """Return the effect of a driver, from its rows of `measure` and those of the human baseline.
 
     Only seeds that both have are used.
@@ -156,7 +156,7 @@ def effects_by_driver(rows_by_driver: RowsByDriver) -> dict[str, Effect]:
     """Return the effect of each driver compared with the human baseline; empty without a baseline."""
     baseline = rows_by_driver.get("human", [])
     others = ((label, rows) for label, rows in rows_by_driver.items() if label != "human")
-    return {label: effect_of(rows, baseline) for label, rows in others} if baseline else {}
+    return {label: compute_effect(rows, baseline) for label, rows in others} if baseline else {}
 
 
 def describe_harm(effect: Effect) -> str:

@@ -10,7 +10,7 @@ from math import ceil, isfinite, log2
 from typing import Any, NamedTuple
 
 from unjam.errors import raise_failure
-from unjam.measures.effect import FLOW_METRIC, TIME_METRIC, Effect, describe_harm, effect_of, is_too_small
+from unjam.measures.effect import FLOW_METRIC, TIME_METRIC, Effect, compute_effect, describe_harm, is_too_small
 from unjam.measures.feasibility import FEASIBLE
 from unjam.measures.recommendation import MIN_VERDICT_SEEDS, AccResult, ControllerResult, required_seeds
 from unjam.measures.statistics import CONFIDENCE, Estimate, format_percent, paired_difference, relative_difference
@@ -111,7 +111,7 @@ class Selection:
 
     def effect(self, option: Option) -> Effect:
         """Return the effect of an option relative to the human baseline on the same seeds."""
-        return effect_of(self.rows[option], self.rows[HUMAN_BASELINE])
+        return compute_effect(self.rows[option], self.rows[HUMAN_BASELINE])
 
 
 def min_episodes(rate_count: int, driver_count: int, with_unchanged_acc: bool = False) -> int:
@@ -260,7 +260,7 @@ def compare_on_test_seeds(
 def _controller_result(
     option: Option, rows: dict[Option, OptionRows], confidence: float, precision: float
 ) -> ControllerResult:
-    effect = effect_of(rows[option], rows[HUMAN_BASELINE], confidence)
+    effect = compute_effect(rows[option], rows[HUMAN_BASELINE], confidence)
     acc_rows = rows[Option(option.penetration_rate, ACC_DRIVER)][: len(rows[option])]
     differences = (paired_difference(rows[option], acc_rows, name, confidence) for name in (TIME_METRIC, FLOW_METRIC))
     difference, flow_difference = differences
@@ -285,7 +285,7 @@ def _has_failed(effect: Effect) -> bool:
 
 
 def _acc_result(option: Option, rows: dict[Option, OptionRows], confidence: float, precision: float) -> AccResult:
-    effect = effect_of(rows[option], rows[HUMAN_BASELINE], confidence)
+    effect = compute_effect(rows[option], rows[HUMAN_BASELINE], confidence)
     unchanged = rows.get(Option(option.penetration_rate, UNCHANGED_ACC_DRIVER))
     property_effect = paired_difference(rows[option], unchanged, "travel_time", confidence) if unchanged else None
     required = required_seeds(effect.travel_time, precision * effect.baseline_travel_time)
