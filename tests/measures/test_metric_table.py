@@ -12,8 +12,8 @@ from unjam.measures.metric_table import (
     TableRow,
     choose_baseline,
     estimate_cell,
-    in_order,
     metric_table,
+    order_by_rank,
 )
 from unjam.measures.metrics import METRICS
 from unjam.measures.statistics import estimate, probability_of_improvement
@@ -69,7 +69,7 @@ def test_a_table_of_human_drivers_alone_has_no_rows_about_cavs() -> None:
 def test_drivers_are_ordered_human_baseline_then_formulas_then_others_as_given() -> None:
     given = "runs/b", "unjam:best", "mine.py:gentle", "pi+acc", "trained", "a.unjam", "human", "acc"
     expected = ["human", "pi+acc", "acc", "runs/b", "unjam:best", "mine.py:gentle", "trained", "a.unjam"]
-    assert list(in_order(dict.fromkeys(given, 0))) == expected
+    assert list(order_by_rank(dict.fromkeys(given, 0))) == expected
 
 
 def test_differences_are_paired_and_have_their_own_columns() -> None:

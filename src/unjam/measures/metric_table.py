@@ -57,7 +57,7 @@ def driver_rank(label: str) -> int:
     return 1 if all(part.partition(":")[0] in DRIVERS for part in name.split("+")) else 2
 
 
-def in_order(by_driver: Mapping[str, Value]) -> dict[str, Value]:
+def order_by_rank(by_driver: Mapping[str, Value]) -> dict[str, Value]:
     """Return the entries by driver in the order of all tables and figures; drivers of one rank keep their order."""
     return {label: by_driver[label] for label in sorted(by_driver, key=driver_rank)}
 

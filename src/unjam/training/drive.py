@@ -18,7 +18,7 @@ from unjam.errors import InputError, invalid_value, unknown_name
 from unjam.manifest import manifest
 from unjam.measures.effect import effects_by_driver
 from unjam.measures.feasibility import feasibility_by_driver
-from unjam.measures.metric_table import choose_baseline, in_order
+from unjam.measures.metric_table import choose_baseline, order_by_rank
 from unjam.measures.metrics import METRICS
 from unjam.measures.notes import count_early_ends, episode_notes
 from unjam.measures.statistics import Estimate, paired_difference
@@ -237,7 +237,7 @@ def drive(
     seeds = held_out_seeds(episodes) if test_seeds else [(seed + index,) for index in range(episodes)]
     pool = WorkerPool(min(workers or os.cpu_count() or 1, episodes * len(drivers)))
     with lock_new_folder(folder) if folder is not None else nullcontext(), pool:
-        evaluation = evaluate(road, in_order(drivers), seeds, pool, reward, progress, backend)
+        evaluation = evaluate(road, order_by_rank(drivers), seeds, pool, reward, progress, backend)
         notes = [
             *episode_notes(evaluation.rows),
             *controller_notes(scenario_recipe(road), drivers, evaluation.plot_episodes),

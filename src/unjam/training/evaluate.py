@@ -15,7 +15,7 @@ from unjam.drivers.registry import unique_label
 from unjam.errors import InputError, raise_failure
 from unjam.files import FileWatch, atomic_write, make_folder, remove_leftovers, sha256_of, to_json
 from unjam.manifest import manifest
-from unjam.measures.metric_table import RowsByDriver, in_order
+from unjam.measures.metric_table import RowsByDriver, order_by_rank
 from unjam.measures.metrics import measure
 from unjam.measures.notes import episode_notes
 from unjam.measures.statistics import Estimate, paired_difference, summarize
@@ -181,7 +181,7 @@ def drivers_to_compare(config: RunConfig, folder: Path) -> dict[str, Driver]:
             # The name of a packaged driver is shorter than its description, which has all tuned parameters.
             is_packaged = name.startswith(PACKAGED_PREFIX) and name != config.expert
             drivers[name if is_packaged else unique_label(driver, {**expert_by_label, **drivers})] = driver
-    return in_order({**drivers, **expert_by_label, TRAINED_LABEL: make_driver(str(folder), scenario.control_step)})
+    return order_by_rank({**drivers, **expert_by_label, TRAINED_LABEL: make_driver(str(folder), scenario.control_step)})
 
 
 def evaluation_steps(config: RunConfig, folder: Path) -> int:
