@@ -11,7 +11,7 @@ import pytest
 import unjam
 from unjam.benchmarks.result import FAMILY_TEST_SEEDS
 from unjam.benchmarks.run import drive_by_label
-from unjam.benchmarks.suites import SUITES, find_suite, references
+from unjam.benchmarks.suites import SUITES, find_suite, load_references
 from unjam.errors import InputError
 from unjam.measures.gain import MIN_REFERENCE_GAIN, performance
 from unjam.road_family import FAMILY
@@ -25,11 +25,11 @@ RESULTS = Path(__file__).parents[2] / "results/all-roads.json"
 
 def test_references_are_the_rows_of_the_study() -> None:
     study = suite_references(RESULTS)["roads"]  # with seven digits
-    for road, found in references().items():
+    for road, found in load_references().items():
         assert found["expert"] == study[road]["expert"]
         for values in ("baseline", "performance"):
             assert found[values] == pytest.approx(study[road][values], rel=1e-6)
-    assert set(references()) == set(FAMILY)
+    assert set(load_references()) == set(FAMILY)
 
 
 @pytest.mark.parametrize("name", SUITES)
@@ -41,7 +41,7 @@ def test_a_suite_has_training_and_unseen_roads_of_the_family(name: str) -> None:
 @pytest.mark.parametrize("name", ["closed-roads-v1", "motorways-v1"])
 def test_the_best_expert_gains_on_each_road_of_the_smaller_suites(name: str) -> None:
     for road in find_suite(name).roads:
-        best, human = (float(np.mean(references()[road][key])) for key in ("performance", "baseline"))
+        best, human = (float(np.mean(load_references()[road][key])) for key in ("performance", "baseline"))
         assert best - human > MIN_REFERENCE_GAIN * abs(human)
         assert make_scenario(f"family/{road}").is_closed == (name == "closed-roads-v1")
 
@@ -102,7 +102,7 @@ def test_test_seeds_are_public_and_reserved() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ring-22-no-warm-up", "figure-eight-12", "one-lane-10"])
 def test_the_references_of_a_road_can_be_measured_again(name: str) -> None:
-    reference = references()[name]
+    reference = load_references()[name]
     with WorkerPool(2) as pool:
         drivers = {"human": "human", "best": reference["expert"]}
         rows = drive_by_label(make_scenario(f"family/{name}"), drivers, FAMILY_TEST_SEEDS, pool, in_batches=True)

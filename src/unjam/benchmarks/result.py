@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field, StrictBool, StrictFloat, StrictInt, StrictStr
 
-from unjam.benchmarks.suites import Suite, find_suite, references
+from unjam.benchmarks.suites import Suite, find_suite, load_references
 from unjam.controller.manifest import first_difference, short_text
 from unjam.errors import InputError, invalid_value, prefix_errors, unknown_name
 from unjam.files import INVALID_DATA_ERRORS, atomic_write, parse_json, to_json
@@ -81,7 +81,7 @@ class BenchmarkResult:
         """For each road the gain, the gain by seed, and the verdict of the feasibility check."""
         gains: dict[str, tuple[Estimate, Floats, str]] = {}
         for name, road in self.roads.items():
-            baseline, reference = _rows(road.baseline), references()[name]["performance"]
+            baseline, reference = _rows(road.baseline), load_references()[name]["performance"]
             rows = _rows(road.driver) if road.driver else baseline
             verdict = overall_feasibility(rows, baseline) if road.driver else f"not driven: {road.note}"
             arguments = rows, baseline, reference
@@ -114,7 +114,7 @@ class BenchmarkResult:
         """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend; then the means."""
         rows: list[dict[str, Any]] = [
             {"road": name, "part": FAMILY[name].part, **_interval(estimate), "feasible": verdict}
-            | {"backend": self.roads[name].backend, "expert": references()[name]["expert"]}
+            | {"backend": self.roads[name].backend, "expert": load_references()[name]["expert"]}
             for name, (estimate, _, verdict) in self._gains.items()
         ]
         empty = {"part": "", "feasible": "", "backend": "", "expert": ""}
@@ -144,7 +144,7 @@ class BenchmarkResult:
             raise InputError(f"roads: {count} are missing ({first}, ...); allowed: a finished benchmark")
         for name, road in self.roads.items():
             performances = [gain.performance(row) for row in _rows(road.baseline)]
-            for value, expected in zip(performances, references()[name]["baseline"], strict=True):
+            for value, expected in zip(performances, load_references()[name]["baseline"], strict=True):
                 if not isclose(value, expected, rel_tol=MAX_RELATIVE_DIFFERENCE):
                     versions = f"unjam {self.manifest.get('unjam')!s:.20}, backend {road.backend:.40}"
                     reason = f"performance of the human baseline ({versions})"

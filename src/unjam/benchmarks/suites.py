@@ -51,6 +51,6 @@ def find_suite(name: str) -> Suite:
 
 
 @cache
-def references() -> dict[str, dict[str, Any]]:
+def load_references() -> dict[str, dict[str, Any]]:
     """Return by road the best tuned `expert`, and by test seed the `performance` of it and of the human `baseline`."""
     return json.loads((files("unjam.benchmarks") / "references.json").read_text(encoding="utf-8"))["roads"]
