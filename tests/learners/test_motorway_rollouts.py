@@ -15,7 +15,7 @@ from unjam.learners.settings import PolicySettings
 from unjam.models import motorway_model
 from unjam.models.ensemble import torch_generator
 from unjam.models.motorway_model import learned_correction, motorway_samples
-from unjam.models.road_model import RoadModel
+from unjam.models.road_model import RoadEnsemble
 from unjam.models.settings import ModelSettings
 from unjam.models.whole_road_models import MotorwayModel
 from unjam.physics.arrays import Floats
@@ -149,12 +149,12 @@ def test_antithetic_pairs_are_held_out_together(batch_episodes: list[Episode], m
     )
     samples = [motorway_samples(batch_episodes[0], number, ROAD, "idm") for number in (6, 7, 8)]
     for group_size, numbers in ((1, {6, 7, 8}), (2, {3, 4})):
-        motorway_model.fit_motorway_model(RoadModel(MODEL, (0,)), samples, MODEL, (0,), group_size)
+        motorway_model.fit_motorway_model(RoadEnsemble(MODEL, (0,)), samples, MODEL, (0,), group_size)
         assert set(fitted_numbers[-1].tolist()) == numbers
 
 
 def test_base_none_predicts_constant_speed() -> None:
-    model = RoadModel(replace(MODEL, base="none"), (0,))
+    model = RoadEnsemble(replace(MODEL, base="none"), (0,))
     model.noise.fill_(0.3)
     speed, known = np.linspace(5.0, 25.0, 4000), np.linspace(25.0, 5.0, 4000)
     without, noisy = (

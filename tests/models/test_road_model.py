@@ -9,7 +9,7 @@ from unjam.drivers import PISaturation
 from unjam.errors import InputError
 from unjam.models.ensemble import ModelFit, torch_generator
 from unjam.models.registry import world_model_class
-from unjam.models.road_model import RoadModel, base_human_model, fit_road_model, learned_human_model, road_samples
+from unjam.models.road_model import RoadEnsemble, base_human_model, fit_road_model, learned_human_model, road_samples
 from unjam.models.settings import ModelSettings
 from unjam.scenarios import FigureEight, Merge, Ring
 from unjam.scenarios.ring import LoopScenario
@@ -32,9 +32,9 @@ def figure_eights() -> list[Episode]:
     return run_batch(tasks, allow_statistical=True)
 
 
-def fitted(episodes: list[Episode], road: LoopScenario = RING, **changes: Any) -> tuple[RoadModel, ModelFit]:
+def fitted(episodes: list[Episode], road: LoopScenario = RING, **changes: Any) -> tuple[RoadEnsemble, ModelFit]:
     settings = ModelSettings(kind="road", **changes)
-    model = RoadModel(settings, (0,))
+    model = RoadEnsemble(settings, (0,))
     samples = [road_samples(episode, number, road) for number, episode in enumerate(episodes)]
     return model, fit_road_model(model, samples, settings, road, (1,))
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from unjam.errors import InputError
 from unjam.models.ensemble import ModelFit, Seed
-from unjam.models.road_model import HumanRows, RoadModel, fit_human_model, residual_function
+from unjam.models.road_model import HumanRows, RoadEnsemble, fit_human_model, residual_function
 from unjam.models.settings import ModelSettings
 from unjam.physics.arrays import Floats
 from unjam.scenarios.motorway import Motorway
@@ -132,7 +132,7 @@ def _speeds_after_step(
 
 
 def learned_correction(
-    model: RoadModel, generator: torch.Generator, steps: int, has_noise: bool = True
+    model: RoadEnsemble, generator: torch.Generator, steps: int, has_noise: bool = True
 ) -> traffic.LearnedCorrection | None:
     """Return what the model adds to human drivers' speeds in a control step; base `none` replaces all but noise."""
     residual = residual_function(model, generator)
@@ -149,7 +149,7 @@ def learned_correction(
 
 
 def fit_motorway_model(
-    model: RoadModel, samples: Sequence[MotorwaySamples], settings: ModelSettings, seed: Seed, group_size: int = 1
+    model: RoadEnsemble, samples: Sequence[MotorwaySamples], settings: ModelSettings, seed: Seed, group_size: int = 1
 ) -> ModelFit:
     """Fit `model` as `fit_human_model`; `group_size` consecutive episodes with equal vehicles are held out together."""
     rows = HumanRows(*(np.concatenate(parts) for parts in zip(*(sample.human_rows for sample in samples), strict=True)))

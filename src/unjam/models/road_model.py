@@ -104,7 +104,7 @@ class HumanRows(NamedTuple):
     episode: Floats
 
 
-class RoadModel(ensemble.Ensemble):
+class RoadEnsemble(ensemble.Ensemble):
     """An ensemble for the residual of a base of human drivers, and the strength of their noise."""
 
     noise: Tensor
@@ -138,7 +138,7 @@ def _inputs(*columns: Array) -> Tensor:
     return torch.from_numpy(np.stack(flat, 1)) if isinstance(flat[0], np.ndarray) else torch.stack(flat, 1)
 
 
-def residual_function(model: RoadModel, generator: torch.Generator) -> LearnedCorrection | None:
+def residual_function(model: RoadEnsemble, generator: torch.Generator) -> LearnedCorrection | None:
     """Return the learned residual, with a random member for each 64 vehicles; None if the base alone is used."""
     if not model.output_mask.any():
         return None
@@ -152,7 +152,7 @@ def residual_function(model: RoadModel, generator: torch.Generator) -> LearnedCo
     return residual
 
 
-def learned_human_model(model: RoadModel, scenario: Scenario, generator: torch.Generator) -> HumanSpeedModel:
+def learned_human_model(model: RoadEnsemble, scenario: Scenario, generator: torch.Generator) -> HumanSpeedModel:
     """Return the human drivers of the model: the base plus the residual of random members."""
     base_model, residual = base_human_model(model.base, scenario), residual_function(model, generator)
     if residual is None:
@@ -191,7 +191,11 @@ def human_rows(samples: Sequence[RoadSamples], base: str, scenario: Scenario) ->
 
 
 def fit_road_model(
-    model: RoadModel, samples: Sequence[RoadSamples], settings: ModelSettings, scenario: Scenario, seed: ensemble.Seed
+    model: RoadEnsemble,
+    samples: Sequence[RoadSamples],
+    settings: ModelSettings,
+    scenario: Scenario,
+    seed: ensemble.Seed,
 ) -> ensemble.ModelFit:
     """Measure the noise of human drivers' speeds, unless they are commanded, and fit `model`, see `fit_human_model`."""
     rows = human_rows(samples, model.base, scenario)
@@ -204,7 +208,7 @@ def fit_road_model(
 
 
 def fit_human_model(
-    model: RoadModel,
+    model: RoadEnsemble,
     rows: HumanRows,
     sigma: float,
     settings: ModelSettings,

@@ -40,7 +40,7 @@ Facts = dict[str, Any]
 SamplesT = TypeVar("SamplesT", road_model.RoadSamples, MotorwaySamples)
 
 
-class WholeRoadModel(WorldModel[road_model.RoadModel, SamplesT]):
+class WholeRoadModel(WorldModel[road_model.RoadEnsemble, SamplesT]):
     """A world model of whole roads, which is fitted to samples of all vehicles in the episodes of D_a."""
 
     @classmethod
@@ -54,9 +54,9 @@ class WholeRoadModel(WorldModel[road_model.RoadModel, SamplesT]):
         if reason:
             raise InputError(f"model.kind: road is not allowed; allowed: row, for {reason}")
 
-    def new_ensemble(self) -> road_model.RoadModel:
+    def new_ensemble(self) -> road_model.RoadEnsemble:
         """Return the ensemble before any fit."""
-        return road_model.RoadModel(self.settings, self.seed)
+        return road_model.RoadEnsemble(self.settings, self.seed)
 
     def simulate_batches(self, plan: RolloutPlan) -> Iterator[list[Episode]]:
         """Yield the episodes of a plan without rewards, batch by batch."""
@@ -258,7 +258,7 @@ class MotorwayModel(WholeRoadModel[MotorwaySamples]):
         world.measured_fields = driver.requirements().measured_fields
         return finish_drive(DriveLoop(world, driver, 0.0 if exploration_scales is None else 1.0))
 
-    def _correction(self, model: road_model.RoadModel, seed: Sequence[int]) -> LearnedCorrection | None:
+    def _correction(self, model: road_model.RoadEnsemble, seed: Sequence[int]) -> LearnedCorrection | None:
         generator, steps = torch_generator(seed, "cpu"), self.scenario.steps_per_control_step
         return learned_correction(model, generator, steps, self.settings.add_noise)
 

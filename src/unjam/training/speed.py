@@ -29,7 +29,7 @@ from unjam.learners.settings import PolicySettings
 from unjam.manifest import manifest
 from unjam.models.ensemble import torch_generator
 from unjam.models.environment_data import EnvironmentData
-from unjam.models.road_model import RoadModel, learned_human_model
+from unjam.models.road_model import RoadEnsemble, learned_human_model
 from unjam.models.rollouts import ModelDynamics, check_device, draw_starts, prepare_starts, roll_out, to_device
 from unjam.models.row_model import RowModel
 from unjam.models.settings import Device, ModelSettings
@@ -343,7 +343,7 @@ def benchmark_batches(device: Device, on_message: MessageCallback = lambda line:
     torch.set_num_threads(1)
     ring = make_benchmark_ring(VEHICLES_PER_RING, 1)
     driver = make_benchmark_driver(ring.control_step)
-    model = RoadModel(BENCHMARK_MODEL, (0,)).to(device)
+    model = RoadEnsemble(BENCHMARK_MODEL, (0,)).to(device)
     model.output_mask.fill_(1.0)
     human_models = {
         "human drivers by IDM": None,
