@@ -61,7 +61,7 @@ def damaged(path: Path, **changes: object) -> Path:
         ({"limits": [1.0]}, "not a population"),
         ({"limits": ["-4", 2.0]}, "limits: '-4' is not allowed; allowed: a finite number"),
         ({"limits": [-4.0, True]}, "limits: True is not allowed"),
-        ({"residual": {"file": "../drivers.json", "sha256": "0", "authority": 1.0}}, "hash it names"),
+        ({"residual": {"file": "../drivers.json", "sha256": "0", "authority": 1.0}}, "does not have the hash in"),
         ({"residual": {"file": "gone.safetensors", "sha256": "0", "authority": 1.0}}, "not a population"),
     ],
 )

@@ -46,7 +46,7 @@ SCENARIOS: dict[str, Scenario] = {
 }
 
 EXAMPLE_PENETRATION_RATE = 0.1
-"""penetration rate of a user network as an example"""
+"""penetration rate of a user network in lists and samples"""
 TOML_KINDS: dict[str, type[Scenario]] = {kind.title: kind for kind in (Ring, FigureEight, Merge, Motorway, Recorded)}
 """kinds of road that a TOML file describes, by title"""
 SCENARIO_KINDS = {**TOML_KINDS, UserNetwork.title: UserNetwork}
@@ -71,7 +71,7 @@ def make_scenario(scenario: ScenarioLike, changes: dict[str, Any] | None = None)
     base, name = _base_scenario(scenario), scenario if isinstance(scenario, str) else object_label(scenario)
     if not changes:
         return base
-    if file := changes.get("population"):  # typical parameters, and what computes the motion, follow from it
+    if file := changes.get("population"):  # it decides the typical parameters and `human_control`
         population = read_population(str(file))
         commanded = {"human_control": "commanded"} if population.residual else {}
         changes = {"humans": asdict(population.typical), **commanded, **changes}
@@ -79,7 +79,7 @@ def make_scenario(scenario: ScenarioLike, changes: dict[str, Any] | None = None)
 
 
 def _base_scenario(scenario: ScenarioLike) -> Scenario:
-    """Return a scenario before any changes; not for .sumocfg files."""
+    """Return a scenario without changes; .sumocfg files are not supported."""
     if isinstance(scenario, Scenario):
         return scenario
     if isinstance(scenario, type):
@@ -92,21 +92,21 @@ def _base_scenario(scenario: ScenarioLike) -> Scenario:
         return load_toml_scenario(Path(scenario), TOML_KINDS)[0]
     if scenario == Motorway.title:  # the kind of a TOML file, without its settings
         return Motorway()
-    if road := FAMILY_SCENARIOS.get(scenario):
-        return make_scenario(road.scenario, road.options)
+    if family_road := FAMILY_SCENARIOS.get(scenario):
+        return make_scenario(family_road.scenario, family_road.options)
     if scenario not in SCENARIOS:
         names = {name.removeprefix(FAMILY_PREFIX): name for name in (*FAMILY_SCENARIOS, *SCENARIOS)}
         close = get_close_matches(scenario.removeprefix(FAMILY_PREFIX), names, 1)
         hint = f"; did you mean {names[close[0]]!r}?" if close else ""
         if scenario.startswith(FAMILY_PREFIX):
             raise invalid_value("scenario", scenario, f"one that `unjam scenarios family` lists{hint}")
-        others = f"{FAMILY_PREFIX}NAME", "a .sumocfg or .toml file", "path.py:name"
-        raise invalid_value("scenario", scenario, f"{', '.join((*SCENARIOS, *others))}{hint}")
+        other_forms = f"{FAMILY_PREFIX}NAME", "a .sumocfg or .toml file", "path.py:name"
+        raise invalid_value("scenario", scenario, f"{', '.join((*SCENARIOS, *other_forms))}{hint}")
     return SCENARIOS[scenario]
 
 
 def default_scenario(name: str) -> Scenario | type[Scenario]:
-    """Return the scenario or class that a configuration with this scenario starts from; the base class if unknown."""
+    """Return the scenario or class with the default settings of a named scenario; `Scenario` if the name is unknown."""
     if name.endswith(".sumocfg"):
         return UserNetwork
     is_built_in = name in (*SCENARIOS, *FAMILY_SCENARIOS, Motorway.title)
@@ -119,14 +119,14 @@ def inline_toml_file(values: dict[str, Any]) -> dict[str, Any]:
     name = values.get("scenario")
     if not isinstance(name, str) or not name.endswith(".toml"):
         return values
-    road, settings = load_toml_scenario(Path(name), TOML_KINDS)
+    scenario, settings = load_toml_scenario(Path(name), TOML_KINDS)
     options = values.get("scenario_options", {})
     options = merge_changes(settings, nest_keys(options)) if isinstance(options, dict) else options
-    return {**values, "scenario": road.title, "scenario_options": options}
+    return {**values, "scenario": scenario.title, "scenario_options": options}
 
 
 def example_scenario(name: str) -> Scenario:
-    """Return a scenario as it is listed and sampled: a user network has some CAVs."""
+    """Return a scenario for lists and samples; a user network has `EXAMPLE_PENETRATION_RATE`."""
     return make_scenario(name, {"penetration_rate": EXAMPLE_PENETRATION_RATE} if name.endswith(".sumocfg") else None)
 
 
@@ -138,7 +138,7 @@ def scenario_recipe(scenario: Scenario) -> dict[str, Any]:
 
 
 def scenario_from_recipe(recipe: dict[str, Any]) -> Scenario:
-    """Return the scenario of a recipe; the Python file of a user's class runs, and must be as it was."""
+    """Return the scenario of a recipe; run the Python file of a user's class, which must be unchanged."""
     values = dict(recipe)
     title, code = values.pop("kind", ""), values.pop(CODE_ENTRY, None)
     if code is None and title not in SCENARIO_KINDS:

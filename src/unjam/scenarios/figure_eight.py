@@ -10,7 +10,7 @@ from unjam.parameters import STRICT, NonNegative, NumberOrRange, PositiveInt, pa
 from unjam.physics.arrays import Array, Floats
 from unjam.physics.idm import equilibrium_speed
 from unjam.scenarios.ring import EdgeSpan, LoopScenario
-from unjam.scenarios.road import ClosedRoad, Connection, Edge, Node, Polyline, RoadNetwork, as_polyline
+from unjam.scenarios.road import ClosedRoad, Connection, Edge, Node, Polyline, RoadNetwork, to_polyline
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Horizon, HumanControl
 
 Radius = Annotated[int, Field(ge=15, le=10_000_000)]
@@ -20,14 +20,14 @@ CROSSING_RADIUS = 3.1
 CROSSING_LINK = 9.4
 """length of a lane across the junction [m], as netconvert makes it from that radius"""
 INNER_LINK, OUTER_LINK = 0.222837, 0.1
-"""lengths of the links at both ends of the upper and of the lower arc [m], as netconvert makes them for lanes to the
-right of the line"""
+"""lengths of the links at both ends of the upper and of the lower arc [m], as netconvert makes them for lanes on the
+right side of the line of an edge"""
 UPPER_ARC, LOWER_ARC = (1.0, pi, -pi / 2), (-1.0, pi / 2, 2 * pi)
-"""arcs of a figure eight: both coordinates of the center [radii], first and last angle [rad]"""
+"""arcs of a figure eight: x = y of the center [radii], first and last angle [rad]"""
 ARC_POINTS = 61
 """points of each arc; the lengths of the links depend on it"""
 MAJOR_PRIORITY, MINOR_PRIORITY = 78, 46
-"""priorities of the direction with the right of way (bottom to top) and of the other one, as in Flow"""
+"""priorities of the direction with the right of way (bottom to top) and of the crossing direction, as in Flow"""
 
 
 def figure_eight_length(radius: float) -> float:
@@ -51,9 +51,9 @@ def lane_lengths(radius: Array) -> tuple[Array, ...]:
 class FigureEight(LoopScenario):
     """Two loops of equal radius that cross at a junction without signals; each episode draws the radius.
 
-    The paper's figure eight has 14 vehicles, one of them a CAV, and radii of 32 to 35 m; Flow's benchmark 30 m. All
-    vehicles pass the crossing twice a lap, and those from the right yield to those from below. A queue that is longer
-    than half a lap meets its own tail there, and all vehicles stop and start.
+    The paper's figure eight has 14 vehicles, one of them a CAV, and radii of 32 to 35 m; Flow's benchmark 30 m.
+    Vehicles pass the crossing twice a lap, and vehicles from the right yield to vehicles from below. A queue longer
+    than half a lap meets its own tail at the crossing, and all vehicles stop and start.
     """
 
     title: ClassVar[str] = "figure-eight"
@@ -67,9 +67,9 @@ class FigureEight(LoopScenario):
     """range of the radius, drawn uniformly among its integers; or a single radius [m]"""
     vehicles: Annotated[int, Field(ge=2)] = 14
     cavs: PositiveInt = 1
-    """number of CAVs, evenly spread; the first leads the queue"""
+    """number of CAVs, evenly spread; the first CAV leads the queue"""
     free_length: NonNegative = 50.0
-    """free road ahead of the first vehicle at the start [m]; Flow's `bunching`"""
+    """length of free road ahead of the first vehicle at the start [m]; `bunching` in Flow"""
     horizon: Horizon = 1500
     """control steps in an episode"""
     human_control: HumanControl = "commanded"
@@ -77,25 +77,25 @@ class FigureEight(LoopScenario):
 
     @model_validator(mode="after")
     def _check_length(self) -> Self:
-        available = _edge_length(self.radius[0]) - self.free_length
-        if available < self._min_length:
+        length = _edge_length(self.radius[0]) - self.free_length
+        if length < self._min_length:
             raise ValueError(
                 f"radius: {self.radius[0]} m is not allowed for {self.vehicles} vehicles: they need "
-                f"{self._min_length:g} m of road, there are {available:.0f} m"
+                f"{self._min_length:g} m of road, but {length:.0f} m are available"
             )
         return self
 
     def build(self, size: float) -> ClosedRoad:
         """Return the figure eight of a given radius [m] with its vehicles."""
         spans = _edge_spans(size)
-        # As in Flow, vehicles are spread over the edges alone, without the links across the junctions.
+        # As in Flow, vehicles start on the edges only, not on the links across the junctions.
         spacing = (_edge_length(size) - self.free_length) / self.vehicles
         positions = np.arange(self.vehicles, dtype=np.float64) * spacing
-        edge = np.searchsorted([span.start for span in spans], positions, side="right") - 1
-        positions_on_edges = np.minimum(positions, np.array([span.end for span in spans])[edge])
+        edges = np.searchsorted([span.start for span in spans], positions, side="right") - 1
+        positions_on_edges = np.minimum(positions, np.array([span.end for span in spans])[edges])
         bottom, top, upper, right, left, lower = spans
         upper_arc, lower_arc = _arc_points(size, *UPPER_ARC), _arc_points(size, *LOWER_ARC)
-        lines = [
+        center_line_parts = [
             [(bottom.start, 0.0, -size), (top.end, 0.0, size)],
             np.column_stack([np.linspace(upper.start, upper.end, ARC_POINTS), upper_arc]),
             [(right.start, size, 0.0), (left.end, -size, 0.0)],
@@ -107,15 +107,15 @@ class FigureEight(LoopScenario):
             spans,
             positions_on_edges,
             loop_length=figure_eight_length(size),
-            network=_network(size, as_polyline(upper_arc), as_polyline(lower_arc), self.top_speed),
-            center_line=np.vstack(lines),
+            network=_figure_eight_network(size, to_polyline(upper_arc), to_polyline(lower_arc), self.top_speed),
+            center_line=np.vstack(center_line_parts),
             crossings=((bottom.end, top.start), (right.end, left.start)),
         )
 
     def limit_speed(self, size: float) -> float:
-        """Return the speed at which a queue at equilibrium just clears the crossing before its head is back [m/s].
+        """Return the speed at which a queue at equilibrium just clears the crossing before its head returns [m/s].
 
-        The queue and the crossing fill half a lap; vehicles that must yield need more, so the real limit is lower.
+        The queue and the crossing fill half a lap; vehicles that must yield need more time, so the real limit is lower.
         """
         queue = _edge_length(size) / 2 - CROSSING_LINK
         return equilibrium_speed(queue / self.vehicles - VEHICLE_LENGTH, self.humans)
@@ -126,22 +126,22 @@ def _edge_length(radius: float) -> float:
 
 
 def _edge_spans(radius: float) -> list[EdgeSpan]:
-    """Return the edges in driving order; between them lie the links of the junctions."""
+    """Return the edges in driving order; gaps between edges are the links of the junctions."""
     lengths = lane_lengths(radius)
     spans, start = [], 0.0
-    for number, name in enumerate(("bottom", "top", "upper_ring", "right", "left", "lower_ring")):
-        length, link = lengths[2 * number : 2 * number + 2]
+    for index, name in enumerate(("bottom", "top", "upper_ring", "right", "left", "lower_ring")):
+        length, link = lengths[2 * index : 2 * index + 2]
         spans.append(EdgeSpan(name, start, length))
         start += length + link
     return spans
 
 
-def _arc_points(radius: float, center: float, first: float, last: float) -> Floats:
-    angles = np.linspace(first, last, ARC_POINTS)
+def _arc_points(radius: float, center: float, first_angle: float, last_angle: float) -> Floats:
+    angles = np.linspace(first_angle, last_angle, ARC_POINTS)
     return radius * np.column_stack([np.cos(angles) + center, np.sin(angles) + center])
 
 
-def _network(radius: float, upper: Polyline, lower: Polyline, speed: float) -> RoadNetwork:
+def _figure_eight_network(radius: float, upper: Polyline, lower: Polyline, speed: float) -> RoadNetwork:
     ends = {"right": (radius, 0.0), "top": (0.0, radius), "left": (-radius, 0.0), "bottom": (0.0, -radius)}
     center = Node("center", 0.0, 0.0, has_priority=True, radius=CROSSING_RADIUS)
     nodes = (center, *(Node(f"at_{name}", x, y, has_priority=True) for name, (x, y) in ends.items()))

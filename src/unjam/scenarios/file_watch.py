@@ -12,14 +12,15 @@ from unjam.scenarios.scenario import Scenario
 
 
 def watch_files(scenarios: Iterable[Scenario], *names: Any) -> FileWatch:
-    """Return a watch of the files of scenarios, of their rewards, and of the code and TOML files that `names` name."""
+    """Return a watch of the files of scenarios and of their rewards, and of the Python and TOML files among `names`."""
     scenarios = tuple(scenarios)
-    texts = {name for name in (*names, *(scenario.reward for scenario in scenarios)) if isinstance(name, str)}
-    return FileWatch(partial(_list_files, scenarios, texts))  # environments are pickled with it
+    references = {name for name in (*names, *(scenario.reward for scenario in scenarios)) if isinstance(name, str)}
+    return FileWatch(partial(_list_files, scenarios, references))  # picklable, as environments are
 
 
-def _list_files(scenarios: Sequence[Scenario], texts: set[str]) -> set[Path]:
-    codes = {split_parameters(text)[0] for text in texts if not text.endswith(".toml")}
-    files = {FileReference.parse(code).path for code in codes if is_file_reference(code)}
-    files |= {Path(text) for text in texts if text.endswith(".toml")}
+def _list_files(scenarios: Sequence[Scenario], references: set[str]) -> set[Path]:
+    toml_files = {reference for reference in references if reference.endswith(".toml")}
+    labels = {split_parameters(reference)[0] for reference in references - toml_files}
+    files = {FileReference.parse(label).path for label in labels if is_file_reference(label)}
+    files |= set(map(Path, toml_files))
     return files.union(*(scenario.user_files for scenario in scenarios))

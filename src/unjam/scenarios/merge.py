@@ -31,9 +31,9 @@ HIGHWAY_ENTRY_SPEED, MERGE_RAMP_ENTRY_SPEED = 10.0, 7.5
 RAMP_ANGLE = pi / 4
 """angle between ramp and highway [rad]"""
 MAX_FREE_FLOW_SECONDS = 3600.0
-"""longest time in which a vehicle passes the highway in free flow [s]"""
+"""maximum time in which a vehicle may pass the highway in free flow [s]"""
 PLATOON_SIZE = 30
-"""number of vehicles after which each one drives like the one before it"""
+"""number of vehicles from which on consecutive vehicles drive alike"""
 HIGHWAY_BRANCH, RAMP_BRANCH = 0, 1
 
 
@@ -41,10 +41,9 @@ HIGHWAY_BRANCH, RAMP_BRANCH = 0, 1
 class Merge(Scenario):
     """A highway of 700 m that a ramp joins 100 m before its end; some highway vehicles are CAVs.
 
-    At 2,000 + 100 vehicles an hour the road has two states. From an empty start traffic flows freely; with a few
-    vehicles standing at the start a jam grows upstream of the ramp and stays, and the queue spills back beyond the
-    entrance. All CAVs on the road have the same driver, each with its own memory, from the control step after their
-    entry until they leave.
+    At 2,000 + 100 vehicles an hour, traffic from an empty start flows freely. If a few vehicles stand on the road at
+    the start, a jam grows upstream of the ramp and stays, and the queue spills back beyond the entrance. All CAVs have
+    the same driver, each CAV with its own memory, from the control step after its entry until it leaves.
     """
 
     title: ClassVar[str] = "merge"
@@ -57,11 +56,11 @@ class Merge(Scenario):
     ramp_flow: NonNegative = 100.0
     """demand of the ramp [veh/h]"""
     penetration_rate: Annotated[float, Field(ge=0, le=1)] = 0.1
-    """share of CAVs among the highway's vehicles"""
+    """share of CAVs among the vehicles of the highway"""
     cav_spacing: Literal["random", "even"] = "random"
-    """positions of the CAVs in the stream: `random` as in the paper; `even`: each tenth vehicle, as in Flow"""
+    """CAVs in the stream: `random` as in the paper; `even` as in Flow, where every tenth vehicle is a CAV"""
     cavs: PositiveInt | None = None
-    """exact number of CAVs instead of a share, among the vehicles of the first half"""
+    """exact number of CAVs among the first half of the highway vehicles; None: `penetration_rate` applies"""
     standing_vehicles: NonNegativeInt = 5
     """human-driven vehicles that stand on the highway at the start, evenly spread"""
     simulation_step: SimulationStep = 0.2
@@ -77,41 +76,44 @@ class Merge(Scenario):
     @model_validator(mode="after")
     def _check_settings(self) -> Self:
         spacing = VEHICLE_LENGTH + max(self.humans.minimum_gap, self.sumo_human_gap)
-        most = int((MERGE_HIGHWAY_LENGTH + MERGE_INFLOW_LENGTH) / spacing)
-        if self.standing_vehicles > most:
-            raise ValueError(f"standing_vehicles: {self.standing_vehicles} is not allowed; allowed: <= {most}")
-        early = len(self._entry_times(self.inflow)) // 2
-        if self.cavs is not None and self.cavs > early:
-            raise ValueError(f"cavs: {self.cavs} is not allowed; allowed: <= {early}, the vehicles of the first half")
+        max_standing = int((MERGE_HIGHWAY_LENGTH + MERGE_INFLOW_LENGTH) / spacing)
+        if self.standing_vehicles > max_standing:
+            raise ValueError(f"standing_vehicles: {self.standing_vehicles} is not allowed; allowed: <= {max_standing}")
+        max_cavs = len(self._entry_times(self.inflow)) // 2
+        if self.cavs is not None and self.cavs > max_cavs:
+            raise ValueError(
+                f"cavs: {self.cavs} is not allowed; allowed: <= {max_cavs}, the vehicles of the first half"
+            )
         if self.human_control == "native":
             raise ValueError("human_control: 'native' is not allowed on the merge; allowed: 'commanded'")
         return self
 
     @property
     def max_vehicles(self) -> float:
-        """Vehicles of both flows."""
+        """Number of vehicles that want to enter, of both flows."""
         return self.max_duration * (self.inflow + self.ramp_flow) / 3600.0
 
     def draw(self, generator: np.random.Generator) -> MergeRoad:
         """Return the road with all vehicles that can enter; the choice of CAVs is random."""
-        cavs = self._draw_cavs(generator)
+        cav_indices = self._draw_cav_indices(generator)
         entering: list[tuple[Entry, Origin]] = []
-        begin = -(MERGE_HIGHWAY_LENGTH + JUNCTION_LENGTHS[HIGHWAY_BRANCH])
-        start = begin - ENTRANCE_LENGTH - MERGE_INFLOW_LENGTH
+        highway_start = -(MERGE_HIGHWAY_LENGTH + JUNCTION_LENGTHS[HIGHWAY_BRANCH])
+        inflow_start = highway_start - ENTRANCE_LENGTH - MERGE_INFLOW_LENGTH
         for index in range(self.standing_vehicles):
-            along = index * (MERGE_INFLOW_LENGTH + MERGE_HIGHWAY_LENGTH) / max(1, self.standing_vehicles)
-            past = along - MERGE_INFLOW_LENGTH
-            edge, position, first = ("inflow_highway", along, start) if past < 0 else ("highway", past, begin)
+            position = index * (MERGE_INFLOW_LENGTH + MERGE_HIGHWAY_LENGTH) / max(1, self.standing_vehicles)
+            edge, edge_start = "inflow_highway", inflow_start
+            if position >= MERGE_INFLOW_LENGTH:
+                edge, edge_start, position = "highway", highway_start, position - MERGE_INFLOW_LENGTH
             entry = Entry(f"human_s{index}", f"from_{edge}", position)
-            entering.append((entry, Origin(HIGHWAY_BRANCH, position + first)))
+            entering.append((entry, Origin(HIGHWAY_BRANCH, position + edge_start)))
         for index, time in enumerate(self._entry_times(self.inflow)):
-            name = f"{'cav' if index in cavs else 'human'}_{index}"
+            name = f"{'cav' if index in cav_indices else 'human'}_{index}"
             entry = Entry(name, "from_inflow_highway", 0.0, HIGHWAY_ENTRY_SPEED, time)
-            entering.append((entry, Origin(HIGHWAY_BRANCH, start)))
-        start = -(MERGE_INFLOW_LENGTH + ENTRANCE_LENGTH + MERGE_RAMP_LENGTH + JUNCTION_LENGTHS[RAMP_BRANCH])
+            entering.append((entry, Origin(HIGHWAY_BRANCH, inflow_start)))
+        ramp_start = -(MERGE_INFLOW_LENGTH + ENTRANCE_LENGTH + MERGE_RAMP_LENGTH + JUNCTION_LENGTHS[RAMP_BRANCH])
         for index, time in enumerate(self._entry_times(self.ramp_flow)):
             entry = Entry(f"human_r{index}", "from_inflow_ramp", 0.0, MERGE_RAMP_ENTRY_SPEED, time)
-            entering.append((entry, Origin(RAMP_BRANCH, start)))
+            entering.append((entry, Origin(RAMP_BRANCH, ramp_start)))
         origins = {entry.name: origin for entry, origin in entering}
         return MergeRoad(
             network=RoadNetwork(_NODES, _EDGES, self.top_speed),
@@ -130,13 +132,13 @@ class Merge(Scenario):
         seconds = self.warmup * self.simulation_step + self.horizon * self.control_step
         return [index * 3600.0 / flow for index in range(int(seconds * flow / 3600.0))]
 
-    def _draw_cavs(self, generator: np.random.Generator) -> set[int]:
+    def _draw_cav_indices(self, generator: np.random.Generator) -> set[int]:
         count = len(self._entry_times(self.inflow))
         if self.cavs is not None:
             return set(generator.choice(count // 2, self.cavs, replace=False).tolist())
         if self.cav_spacing == "even":
-            numbers = np.arange(count * self.penetration_rate) / max(self.penetration_rate, 1e-9)
-            return set(numbers.astype(int).tolist())
+            indices = np.arange(count * self.penetration_rate) / max(self.penetration_rate, 1e-9)
+            return set(indices.astype(int).tolist())
         return set(np.flatnonzero(generator.random(count) < self.penetration_rate).tolist())
 
     def limit_speed(self) -> float:
@@ -146,7 +148,7 @@ class Merge(Scenario):
         return _free_flow_speed(self.inflow, length, self.humans, self.simulation_step)
 
     def possible_cav_ids(self) -> tuple[str, ...]:
-        """Return the ids of all vehicles of the highway, as CAVs."""
+        """Return the ids that the vehicles of the highway have as CAVs."""
         return tuple(f"cav_{index}" for index in range(len(self._entry_times(self.inflow))))
 
     def _fact_values(self) -> tuple[str, str, str, str]:

@@ -28,7 +28,8 @@ DEMAND_STEP = 60.0
 HUMAN_TYPE_COUNT = 200
 """number of different human drivers"""
 Arrival = tuple[float, str, int, float | Literal["last"]]
-Section = Annotated[float, Field(ge=50, le=1_000_000)]
+"""time at which a vehicle wants to enter [s], its route, lane and speed [m/s]"""
+SectionLength = Annotated[float, Field(ge=50, le=1_000_000)]
 """length of a part of the road [m]"""
 
 
@@ -38,14 +39,14 @@ class Ramp(Subclassable):
 
     position: Positive
     """distance from the entrance of the motorway to the begin of the acceleration lane [m]"""
-    merging_length: Section = 300.0
+    merging_length: SectionLength = 300.0
     """length of the acceleration lane, along which vehicles merge [m]"""
-    length: Section = 400.0
+    length: SectionLength = 400.0
     """length of the ramp upstream of the acceleration lane [m]"""
     speed_limit: Positive = 22.22
     """speed limit of the ramp upstream of the acceleration lane [m/s]"""
     entry_speed: Positive | Literal["last"] = 15.0
-    """speed of vehicles that enter the ramp [m/s]; `last`: that of the last vehicle on it, as at the entrance"""
+    """speed of vehicles that enter the ramp [m/s]; `last`: the speed of the vehicle that entered before"""
     inflow: NonNegative = 500.0
     """demand in the peak [veh/h]"""
     off_peak_inflow: NonNegative = 250.0
@@ -60,11 +61,11 @@ class Ramp(Subclassable):
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class Motorway(Scenario):
-    """A motorway with any number of on-ramps, and a peak of demand.
+    """A motorway with any number of on-ramps and a peak of demand.
 
     Human drivers follow SUMO's extended IDM, each with other parameters, and change lanes. If the demand of the peak is
-    above capacity, a jam forms at a ramp and sends waves upstream. A CAV replaces a human-driven vehicle and desires
-    the same speed; its own ACC follows, and its driver can reduce the set speed upstream of a ramp.
+    above capacity, a jam forms at a ramp and sends waves upstream. A CAV replaces a human-driven vehicle and has the
+    same desired speed. Its ACC follows the leader, and its driver can reduce the set speed upstream of a ramp.
     """
 
     title: ClassVar[str] = "motorway"
@@ -72,7 +73,7 @@ class Motorway(Scenario):
     road_model: ClassVar[str] = "motorway"
     is_closed: ClassVar[bool] = False
 
-    length: Section = 3000.0
+    length: SectionLength = 3000.0
     """length of the motorway [m]"""
     lanes: Annotated[int, Field(ge=1, le=MAX_LANES)] = 2
     """number of lanes, without acceleration lanes"""
@@ -91,9 +92,9 @@ class Motorway(Scenario):
     min_entry_headway: NonNegative = 1.1
     """smallest time between two vehicles that want to enter a lane of the motorway [s]"""
     penetration_rate: Annotated[float, Field(ge=0, le=1)] = 0.1
-    """share of CAVs among all cars; the CAVs of a smaller share are part of those of a larger one"""
+    """share of CAVs among all cars; with equal seeds, a higher share has all CAVs of a lower share"""
     cavs: PositiveInt | None = None
-    """exact number of CAVs instead of a share, among the vehicles of the first half"""
+    """exact number of CAVs, among the cars of the first half; None: `penetration_rate` applies"""
     car_following: Literal["EIDM", "IDM"] = "EIDM"
     """SUMO's car-following model of human drivers"""
     time_headways: motorway_vehicles.Interval = (1.0, 1.8)
@@ -105,20 +106,20 @@ class Motorway(Scenario):
     minimum_gaps: motorway_vehicles.Interval = (2.0, 2.5)
     """range of the gaps of human drivers in a standing queue [m]"""
     speed_factor_std: NonNegative = 0.1
-    """standard deviation of desired speed / speed limit, with mean 1; at most 0.2 from the mean"""
+    """standard deviation of desired speed / speed limit; the mean is 1, and values are limited to 0.8 to 1.2"""
     vehicle_length: Positive = 4.8
     """length of cars [m]"""
     lane_changing: motorway_vehicles.LaneChanging = field(default_factory=motorway_vehicles.LaneChanging)
-    """how human drivers change lanes"""
+    """lane changes of human drivers"""
     trucks: motorway_vehicles.Trucks = field(default_factory=motorway_vehicles.Trucks)
     ordinary_acc: motorway_vehicles.OrdinaryACC = field(default_factory=motorway_vehicles.OrdinaryACC)
     """cars with an ACC that are not CAVs"""
     speed_limit_control: SpeedLimitControl = field(default_factory=SpeedLimitControl)
     """variable speed limits for all vehicles upstream of each ramp"""
     ramp_meter: RampMeter = field(default_factory=RampMeter)
-    """meters at all ramps"""
+    """ramp meters at all ramps"""
     roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
-    """latency and smoothing of the speeds ahead that CAVs receive"""
+    """latency and smoothing of the speeds of traffic ahead that CAVs receive"""
     simulation_step: SimulationStep = 0.5
     steps_per_control_step: PositiveInt = 2
     horizon: Horizon = 2400
@@ -126,7 +127,7 @@ class Motorway(Scenario):
     action_limit: Positive = 2.5
     actuation: Actuation = "cruise"
     safety: SafetyFilter = field(default_factory=lambda: SafetyFilter(active=False))
-    """inactive: the CAV's own ACC keeps its distance"""
+    """inactive: the CAV's own ACC keeps the distance to the leader"""
     noise: Annotated[float, Field(ge=0, le=0)] = 0.0
     """always 0: the car-following model has its own noise"""
     emission_class: str = "HBEFA4/PC_petrol_Euro-6d"
@@ -141,14 +142,14 @@ class Motorway(Scenario):
             allowed = f"<= {self.peak[0]:g}, before the peak"
             raise ValueError(f"peak_rise: {self.peak_rise:g} is not allowed; allowed: {allowed}")
         capacity = 3600.0 * self.lanes / max(self.min_entry_headway, 1e-9)
-        sources = (
+        entrances = (
             ("", self, capacity, ", by min_entry_headway"),
-            *((f"ramps.{number}.", ramp, 3600.0 / MIN_RAMP_HEADWAY, "") for number, ramp in enumerate(self.ramps)),
+            *((f"ramps.{index}.", ramp, 3600.0 / MIN_RAMP_HEADWAY, "") for index, ramp in enumerate(self.ramps)),
         )
-        for prefix, source, most, reason in sources:
+        for prefix, entrance, max_flow, reason in entrances:
             for name in ("inflow", "off_peak_inflow"):
-                if (flow := getattr(source, name)) >= most:
-                    raise ValueError(f"{prefix}{name}: {flow:g} is not allowed; allowed: < {most:.0f}{reason}")
+                if (flow := getattr(entrance, name)) >= max_flow:
+                    raise ValueError(f"{prefix}{name}: {flow:g} is not allowed; allowed: < {max_flow:.0f}{reason}")
         if (shares := self.trucks.share + self.ordinary_acc.share) > 1:
             raise ValueError(f"trucks.share + ordinary_acc.share: {shares:g} is not allowed; allowed: <= 1")
         self._check_ramps()
@@ -156,39 +157,41 @@ class Motorway(Scenario):
         return self
 
     def _check_ramps(self) -> None:
-        """Raise `ValueError` if ramps overlap or reach beyond the road, or vehicles enter one too fast."""
-        upstream_end, upstream_part = 0.0, "the entrance"
-        for number, ramp in enumerate(self.ramps):
-            geometry, name, position = ramp.geometry, f"ramps.{number}", f"{ramp.position:g}"
+        """Raise `ValueError` if ramps overlap or reach beyond the road, or if vehicles enter a ramp too fast."""
+        upstream_end, upstream_section = 0.0, "the entrance"
+        for index, ramp in enumerate(self.ramps):
+            geometry, name, position = ramp.geometry, f"ramps.{index}", f"{ramp.position:g}"
             if geometry.start < upstream_end:
-                allowed = f">= {upstream_end + ramp.length:g}, its length downstream of {upstream_part}"
+                allowed = f">= {upstream_end + ramp.length:g}, its length downstream of {upstream_section}"
                 raise ValueError(f"{name}.position: {position} is not allowed; allowed: {allowed}")
             if geometry.merge_end > self.length - MIN_END_LENGTH:
                 allowed = f"<= {self.length - MIN_END_LENGTH - ramp.merging_length:g}, upstream of the end of the road"
                 raise ValueError(f"{name}.position: {position} is not allowed; allowed: {allowed}")
-            if ramp.entry_speed != "last" and ramp.entry_speed > (most := SPEED_FACTOR_RANGE[0] * ramp.speed_limit):
-                allowed = f"<= {most:g}, the speed of the slowest drivers"
+            if ramp.entry_speed != "last" and ramp.entry_speed > (
+                max_speed := SPEED_FACTOR_RANGE[0] * ramp.speed_limit
+            ):
+                allowed = f"<= {max_speed:g}, the speed of the slowest drivers"
                 raise ValueError(f"{name}.entry_speed: {ramp.entry_speed:g} is not allowed; allowed: {allowed}")
-            upstream_end, upstream_part = geometry.merge_end, f"the merging section of {name}"
+            upstream_end, upstream_section = geometry.merge_end, f"the merging section of {name}"
 
     @property
     def max_vehicles(self) -> float:
-        """Twice as many as the largest demand has: headways are random."""
-        peak_inflow = sum(max(source.inflow, source.off_peak_inflow) for source in self._sources)
+        """Twice the number of vehicles that the largest demand has on average, because headways are random."""
+        peak_inflow = sum(max(entrance.inflow, entrance.off_peak_inflow) for entrance in self._entrances)
         return self.max_duration / 3600.0 * 2.0 * peak_inflow
 
     @property
-    def _sources(self) -> tuple["Motorway | Ramp", ...]:
+    def _entrances(self) -> tuple["Motorway | Ramp", ...]:
         return self, *self.ramps
 
     def draw(self, generator: np.random.Generator) -> MotorwayRoad:
-        """Return the road with its demand; random are the human drivers, their entry times and the choice of CAVs."""
-        types, select_type = self._draw_types(generator)
+        """Return the road with its demand; human drivers, entry times and the choice of CAVs are random."""
+        types, draw_type = self._draw_types(generator)
         entries, draws = list[Entry](), dict[str, float]()
-        for number, (time, route, lane, speed) in enumerate(sorted(self._arrivals(generator))):
-            name, human = f"vehicle_{number}", f"human_type_{generator.integers(HUMAN_TYPE_COUNT)}"
+        for index, (time, route, lane, speed) in enumerate(sorted(self._arrivals(generator))):
+            name, human_type = f"vehicle_{index}", f"human_type_{generator.integers(HUMAN_TYPE_COUNT)}"
             draws[name] = generator.random()
-            entries.append(Entry(name, route, 0.0, speed, time, lane, select_type(human)))
+            entries.append(Entry(name, route, 0.0, speed, time, lane, draw_type(human_type)))
         cars = {entry.name: draws[entry.name] for entry in entries if types[entry.vehicle_type].vehicle_class is None}
         geometry = self.geometry
         return MotorwayRoad(
@@ -213,10 +216,10 @@ class Motorway(Scenario):
 
     @property
     def free_flow_time(self) -> float:
-        """Mean travel time of human drivers in free flow [s]: as measured, or at speed limits, by off-peak demand."""
+        """Mean travel time of human drivers in free flow [s]: as measured, or at speed limits with off-peak demand."""
         geometry = self.geometry
-        if measured := FREE_FLOW_TIMES.get(geometry._replace(vehicle_length=0.0)):
-            return measured
+        if measured_time := FREE_FLOW_TIMES.get(geometry._replace(vehicle_length=0.0)):
+            return measured_time
         times, flows = [self.length / self.speed_limit], [self.off_peak_inflow]
         for ramp in self.ramps:
             times.append(ramp.length / ramp.speed_limit + (self.length - ramp.position) / self.speed_limit)
@@ -225,7 +228,7 @@ class Motorway(Scenario):
 
     @property
     def provided_fields(self) -> tuple[str, ...]:
-        """Optional fields of a `LocalState`: a distance to a merge with ramps, speeds ahead if any are known."""
+        """Optional fields of a `LocalState` that this road provides, given its ramps and roadside information."""
         to_merge = ("distance_to_merge",) if self.ramps else ()
         ahead = () if self.roadside.source == "none" else ("lane_speeds", "road_speeds")
         return ("allowed_speed", *to_merge, *ahead, "adjacent_gaps", "adjacent_speeds", "penetration_rate")
@@ -233,31 +236,31 @@ class Motorway(Scenario):
     def _select_cavs(self, draws: dict[str, float]) -> frozenset[str]:
         if self.cavs is None:
             return frozenset(name for name, draw in draws.items() if draw < self.penetration_rate)
-        early = sorted(list(draws)[: len(draws) // 2], key=draws.__getitem__)
-        return frozenset(early[: self.cavs])
+        candidates = sorted(list(draws)[: len(draws) // 2], key=draws.__getitem__)
+        return frozenset(candidates[: self.cavs])
 
     def _draw_types(self, generator: np.random.Generator) -> tuple[dict[str, VehicleType], Callable[[str], str]]:
-        """Return all vehicle types, and a function that replaces types by trucks or ACCs by draws of its own."""
+        """Return all vehicle types, and a function that draws a vehicle's type: the given one, a truck or an ACC."""
         (lane_change_generator,) = generator.spawn(1)
-        humans = {f"human_type_{number}": self._draw_human_type(generator) for number in range(HUMAN_TYPE_COUNT)}
+        humans = {f"human_type_{index}": self._draw_human_type(generator) for index in range(HUMAN_TYPE_COUNT)}
         lane_changing, trucks, acc = self.lane_changing, self.trucks, self.ordinary_acc
         types = {
             name: human_type._replace(parameters=lane_changing.draw(lane_change_generator))
             for name, human_type in humans.items()
         }
-        truck_numbers = range(motorway_vehicles.TRUCK_TYPE_COUNT if trucks.share else 0)
-        truck_types = [f"truck_type_{number}" for number in truck_numbers]
+        truck_type_count = motorway_vehicles.TRUCK_TYPE_COUNT if trucks.share else 0
+        truck_types = [f"truck_type_{index}" for index in range(truck_type_count)]
         if acc.share:
-            types |= {_with_acc(name): acc.replace_driver(types[name]) for name in humans}
+            types |= {_acc_type(name): acc.replace_driver(types[name]) for name in humans}
         types |= {name: trucks.draw(lane_change_generator, self.car_following, lane_changing) for name in truck_types}
 
-        def select_type(human: str) -> str:
+        def draw_type(human_type: str) -> str:
             draw = lane_change_generator.random()
             if draw < trucks.share:
                 return truck_types[lane_change_generator.integers(motorway_vehicles.TRUCK_TYPE_COUNT)]
-            return _with_acc(human) if draw < trucks.share + acc.share else human
+            return _acc_type(human_type) if draw < trucks.share + acc.share else human_type
 
-        return types, select_type
+        return types, draw_type
 
     def _draw_human_type(self, generator: np.random.Generator) -> VehicleType:
         human = VehicleType(
@@ -271,13 +274,13 @@ class Motorway(Scenario):
         )
         if self.driver_population is None:
             return human
-        (one,) = self.driver_population.draw(1, generator)
-        # Only following is calibrated: recordings of jams say nothing about desired speeds.
-        human = human._replace(model="IDM", time_headway=one.time_headway, minimum_gap=one.minimum_gap)
-        return human._replace(acceleration=one.max_acceleration, deceleration=one.comfortable_deceleration)
+        (driver,) = self.driver_population.draw(1, generator)
+        # The desired speed is not replaced: recordings of jams do not contain it.
+        human = human._replace(model="IDM", time_headway=driver.time_headway, minimum_gap=driver.minimum_gap)
+        return human._replace(acceleration=driver.max_acceleration, deceleration=driver.comfortable_deceleration)
 
     def _arrivals(self, generator: np.random.Generator) -> Iterator[Arrival]:
-        """Yield time, route, lane and speed of vehicles that want to enter."""
+        """Yield the arrivals of vehicles, lane by lane and ramp by ramp."""
         for lane in range(self.lanes):
             flows = self.off_peak_inflow / self.lanes, self.inflow / self.lanes
             for time in self._entry_times(generator, *flows, self.min_entry_headway):
@@ -289,7 +292,7 @@ class Motorway(Scenario):
     def _entry_times(
         self, generator: np.random.Generator, off_peak: float, peak: float, min_headway: float
     ) -> Iterator[float]:
-        """Yield times with shifted exponential headways, period by period [s]; flows in veh/h."""
+        """Yield entry times [s] with shifted exponential headways; flows in veh/h, `min_headway` in s."""
         begin = 0.0
         for end, flow in self._demand_periods(off_peak, peak):
             time = begin
@@ -302,13 +305,13 @@ class Motorway(Scenario):
 
     def _demand_periods(self, off_peak: float, peak: float) -> Iterator[tuple[float, float]]:
         """Yield the end of each period [s] and its flow [veh/h]."""
-        steps = int(self.peak_rise // DEMAND_STEP)
-        flows = [off_peak + (peak - off_peak) * (number + 0.5) / steps for number in range(steps)]
-        begin, end = self.peak[0] - steps * DEMAND_STEP, self.peak[1]
+        step_count = int(self.peak_rise // DEMAND_STEP)
+        flows = [off_peak + (peak - off_peak) * (index + 0.5) / step_count for index in range(step_count)]
+        begin, end = self.peak[0] - step_count * DEMAND_STEP, self.peak[1]
         yield begin, off_peak
-        yield from ((begin + (number + 1) * DEMAND_STEP, flow) for number, flow in enumerate(flows))
+        yield from ((begin + (index + 1) * DEMAND_STEP, flow) for index, flow in enumerate(flows))
         yield end, peak
-        yield from ((end + (number + 1) * DEMAND_STEP, flow) for number, flow in enumerate(flows[::-1]))
+        yield from ((end + (index + 1) * DEMAND_STEP, flow) for index, flow in enumerate(flows[::-1]))
         yield self.max_duration, off_peak
 
     @property
@@ -324,13 +327,13 @@ class Motorway(Scenario):
 
     def possible_cav_ids(self) -> tuple[str, ...]:
         """Return the ids of all vehicles: each can be a CAV."""
-        return tuple(f"vehicle_{number}" for number in range(int(self.max_vehicles)))
+        return tuple(f"vehicle_{index}" for index in range(int(self.max_vehicles)))
 
     def _fact_values(self) -> tuple[str, str, str, str]:
         lanes = "one lane" if self.lanes == 1 else f"{self.lanes} lanes"
         ramps = {0: "without ramps", 1: "with a ramp"}.get(len(self.ramps), f"with {len(self.ramps)} ramps")
         peak, off_peak = (
-            " + ".join(f"{getattr(source, name):g}" for source in self._sources)
+            " + ".join(f"{getattr(entrance, name):g}" for entrance in self._entrances)
             for name in ("inflow", "off_peak_inflow")
         )
         peak = f"{peak} veh/h from {self.peak[0]:g} to {self.peak[1]:g} s"
@@ -339,7 +342,7 @@ class Motorway(Scenario):
         return road, vehicles, f"{self.speed_limit:.2f} m/s", "the speed limit of the motorway"
 
 
-def _with_acc(human_type: str) -> str:
+def _acc_type(human_type: str) -> str:
     return f"acc_{human_type}"
 
 
@@ -363,8 +366,8 @@ MOTORWAY_SCENARIOS = {
         ramps=(Ramp(position=2000.0, inflow=400.0), Ramp(position=3500.0, inflow=400.0)),
     ),
 }
-"""the named roads of this kind"""
+"""built-in motorways by name"""
 FREE_FLOW_TIMES = {
     motorway.geometry._replace(vehicle_length=0.0): time for motorway, time in ((_ON_RAMP_1, 113.0), (ON_RAMP, 106.6))
 }
-"""mean travel time in human-only traffic without a peak, of six seeds [s]"""
+"""measured mean travel times in human-only traffic without a peak, six seeds [s], by geometry"""

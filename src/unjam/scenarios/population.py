@@ -1,7 +1,7 @@
 """A population of human drivers, as `unjam fit-drivers` calibrates it.
 
-A population is a file `NAME.json`; its residual network, if it has one, is `NAME.safetensors` in the same folder.
-Nothing in it is ever executed.
+A population is a file `NAME.json`. A population with a residual network also has a file `NAME.safetensors` in the same
+folder. No code in these files is executed.
 """
 
 import json
@@ -28,15 +28,15 @@ from unjam.physics.idm import IDM_PARAMETER_NAMES, IDMParameters
 from unjam.processes import lock_file
 
 PACKAGED_POPULATIONS = Path(str(files("unjam") / "scenarios/populations"))
-"""folder of the packaged populations, in which each driver has five individual parameters"""
+"""folder of the packaged populations"""
 POPULATION_FORMAT = 1
-WEIGHTS_SUFFIX = ".safetensors"  # suffix of the file with the residual networks of a population, next to it
+WEIGHTS_SUFFIX = ".safetensors"  # suffix of the file with the residual network of a population
 RESIDUAL_INPUTS = ("speed", "leader's speed minus own", "gap")
 """inputs of the residual [m/s, m/s, m]"""
 MAX_POPULATION_BYTES = 64 * 2**20
 """maximum size of a file with a population [bytes]"""
 POPULATION_KEYS = ("format", "unjam", "typical", "parameter_statistics", "limits", "drivers", "residual")
-"""keys of the file; others are `metadata`"""
+"""keys of the file; other keys are `metadata`"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,25 +44,25 @@ class Population:
     """Calibrated human drivers, one set of parameters each."""
 
     typical: IDMParameters
-    """the one IDM that fits all of them best"""
+    """the IDM that fits all drivers best"""
     drivers: tuple[IDMParameters, ...] = field(repr=False)
     limits: tuple[float, float]
-    """limits of their acceleration [m/s2]"""
+    """limits of the acceleration of all drivers [m/s2]"""
     residual: Network | None = None
-    """a correction of the IDM that all of them share: a network from RESIDUAL_INPUTS to an acceleration [m/s2]"""
+    """correction of the IDM, the same for all drivers: a network from RESIDUAL_INPUTS to an acceleration [m/s2]"""
     details: tuple[dict[str, Any], ...] = field(default=(), repr=False)
-    """other entries of the file about each driver"""
+    """other entries of each driver in the file"""
     metadata: dict[str, Any] = field(default_factory=dict, repr=False)
     """origin of the population"""
 
     @property
     def max_desired_speed(self) -> float:
-        """The largest desired speed [m/s]."""
+        """The largest desired speed of all drivers [m/s]."""
         return max(driver.desired_speed for driver in (self.typical, *self.drivers))
 
     @property
     def min_time_headway(self) -> float:
-        """The smallest time headway [s]."""
+        """The smallest time headway of all drivers [s]."""
         return min(driver.time_headway for driver in (self.typical, *self.drivers))
 
     def draw(self, count: int, generator: np.random.Generator) -> list[IDMParameters]:
@@ -80,7 +80,7 @@ class Population:
 
 
 def residual_inputs(speed: Array, leader_speed: Array, gap: Array) -> Array:
-    """Return the inputs of a residual, RESIDUAL_INPUTS, in SI units, shape (..., 3)."""
+    """Return RESIDUAL_INPUTS in SI units, shape (..., 3)."""
     return namespace(gap).stack([speed, leader_speed - speed, gap], -1)
 
 
@@ -97,31 +97,31 @@ def apply_population(
 
 @contextmanager
 def reserve_population(path: Path) -> Iterator[Callable[[Population], None]]:
-    """Lock the name of a new population for this process, and yield the function that writes it.
+    """Lock the file name of a new population for this process, and yield the function that writes the population.
 
-    Raise `InputError` if the file or that of its residual exists, now or when it is written, or another process has
-    locked the name, `DiskError` if its folder does not exist.
+    Raise `InputError` if a file of the population exists, both before and after the `with` block has computed it, or if
+    another process has locked the name. Raise `DiskError` if the folder does not exist.
     """
 
-    def check() -> None:
-        if used := [str(file) for file in (path, path.with_suffix(WEIGHTS_SUFFIX)) if os.path.lexists(file)]:
-            raise InputError(f"out: {used[0]!r} exists; allowed: a new file")
+    def check_new() -> None:
+        if existing := [str(file) for file in (path, path.with_suffix(WEIGHTS_SUFFIX)) if os.path.lexists(file)]:
+            raise InputError(f"out: {existing[0]!r} exists; allowed: a new file")
 
-    def write(population: Population) -> None:
-        check()
+    def write_new(population: Population) -> None:
+        check_new()
         write_population(path, population)
 
     if path.suffix != ".json":
         raise invalid_value("out", str(path), "a .json file")
     check_parent_folder(path)
-    check()
+    check_new()
     with lock_file(path.with_name(f".{path.name}.lock"), f"out: {str(path)!r}"):
-        check()
-        yield write
+        check_new()
+        yield write_new
 
 
 def write_population(path: Path, population: Population) -> None:
-    """Write a population to `path`, and its residual into the same folder."""
+    """Write a population to `path`, and its residual network into the same folder."""
     residual = None
     if population.residual is not None:
         weights = save(network_weights(population.residual))
@@ -154,19 +154,19 @@ def population_file(name: Path | str) -> Path:
 
 
 def read_population(name: Path | str) -> Population:
-    """Return the population of a file, or a packaged one; raise `InputError` if it is missing, damaged, or none."""
+    """Return the population of a file or of the package; raise `InputError` if it is missing, damaged or invalid."""
     path = population_file(name)
     if not os.path.exists(path):
         raise InputError(f"population: {str(path)!r} does not exist")
-    if not os.path.isfile(path):  # a device would be read without end
+    if not os.path.isfile(path):  # reading a device might never end
         raise invalid_value("population", str(path), "a file of `unjam fit-drivers`")
-    stamp = path.stat()
-    return _read_cached(path, stamp.st_mtime_ns, stamp.st_size)
+    status = path.stat()
+    return _read_population_file(path, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=8)
-def _read_cached(path: Path, modified_ns: int, size: int) -> Population:
-    """Read a file again only if it has changed: every episode needs it."""
+def _read_population_file(path: Path, modified_ns: int, size: int) -> Population:
+    """Return the population of a file, cached until the file changes, because every episode needs it."""
     if size > MAX_POPULATION_BYTES:
         raise InputError(f"population {path.name}: {size} bytes are not allowed; allowed: <= {MAX_POPULATION_BYTES}")
     try:
@@ -175,12 +175,14 @@ def _read_cached(path: Path, modified_ns: int, size: int) -> Population:
             raise InputError(f"population {path.name}: format {content['format']!r} is unknown")
         entries = content["drivers"]
         drivers = tuple(
-            build_dataclass(IDMParameters, {name: one[name] for name in IDM_PARAMETER_NAMES}, f"population.drivers.{n}")
-            for n, one in enumerate(entries)
+            build_dataclass(
+                IDMParameters, {key: entry[key] for key in IDM_PARAMETER_NAMES}, f"population.drivers.{index}"
+            )
+            for index, entry in enumerate(entries)
         )
         if not drivers:
             raise InputError(f"population {path.name}: it has no drivers")
-        low, high = (_as_number(limit, "limits") for limit in content["limits"])
+        low, high = (_finite_number(limit, "limits") for limit in content["limits"])
         if not low < 0.0 < high:
             raise ValueError(f"limits: [{low:g}, {high:g}] are not allowed; allowed: one below and one above 0")
         return Population(
@@ -196,24 +198,24 @@ def _read_cached(path: Path, modified_ns: int, size: int) -> Population:
         raise InputError(f"population {path.name}: not a population: {reason}") from None
 
 
-def _as_number(value: Any, name: str) -> float:
+def _finite_number(value: Any, key: str) -> float:
     if type(value) not in (int, float) or not isfinite(value):
-        raise ValueError(f"{name}: {value!r:.60} is not allowed; allowed: a finite number")
+        raise ValueError(f"{key}: {value!r:.60} is not allowed; allowed: a finite number")
     return float(value)
 
 
 def _read_residual(path: Path, entry: dict[str, Any] | None) -> Network | None:
     if entry is None:
         return None
-    weights_file = path.parent / Path(str(entry["file"])).name  # never a file of another folder
+    weights_file = path.parent / Path(str(entry["file"])).name  # a file in another folder is not read
     if weights_file.stat().st_size > MAX_POPULATION_BYTES:
-        raise InputError(f"population {path.name}: its residual is too large")
+        raise InputError(f"population {path.name}: its residual network is too large")
     weights = weights_file.read_bytes()
     if sha256_of(weights) != entry["sha256"]:
-        raise InputError(f"population {path.name}: damaged: {weights_file.name} does not have the hash it names")
+        raise InputError(f"population {path.name}: damaged: {weights_file.name} does not have the hash in {path.name}")
     arrays = load(weights)
     layers = ((arrays[f"{index}.weight"], arrays[f"{index}.bias"]) for index in range(len(arrays) // 2))
-    network = Network(tuple(layers), _as_number(entry["authority"], "authority"))
+    network = Network(tuple(layers), _finite_number(entry["authority"], "authority"))
     if network.input_size != len(RESIDUAL_INPUTS):
         raise InputError(f"population {path.name}: {network.input_size} inputs are not allowed; allowed: 3")
     return network

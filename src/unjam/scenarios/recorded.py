@@ -1,7 +1,7 @@
-"""The recorded road: a platoon on one lane behind a vehicle that drives as a real one was recorded.
+"""The recorded road: a platoon on one lane behind a vehicle that repeats the recorded speeds of a real vehicle.
 
-Source of the idea: Lichtlé et al. 2022, Deploying traffic smoothing cruise controllers learned from trajectory data,
-ICRA; the drives on I-24 of that experiment are the usual recordings.
+Source: Lichtlé et al. 2022, Deploying traffic smoothing cruise controllers learned from trajectory data, ICRA; the
+usual recordings are the drives on I-24 of that experiment.
 """
 
 import re
@@ -31,9 +31,9 @@ EDGE_NAME = "road"
 MAX_RECORDED_SPEED = 70.0
 """largest recorded speed [m/s]"""
 ROAD_LENGTH_STEP = 5000.0
-"""lengths of roads are multiples of it, so that few networks are made [m]"""
+"""step of the lengths of roads, so that few different networks are built [m]"""
 MAX_FREE_SPEED_SHARE = 0.95
-"""share of the desired speed up to which vehicles start with the gap of steady driving"""
+"""largest start speed / desired speed; at the desired speed itself the IDM's equilibrium gap is infinite"""
 MAX_VEHICLES = 1000
 ARTIFICIAL_SECONDS = 600.0
 ARTIFICIAL_STEP = 0.1
@@ -45,8 +45,8 @@ ARTIFICIAL_SPEEDS, ARTIFICIAL_PERIODS = (6.0, 20.0), (40.0, 200.0)
 class Recorded(Scenario):
     """A platoon on one lane behind a vehicle that repeats recorded speeds; each episode draws a recording.
 
-    The recorded vehicle does not react, and vehicles do not change lanes. All vehicles start with its speed
-    and the gaps of steady driving. Without recordings, it drives through artificial waves.
+    The recorded vehicle does not react, and vehicles do not change lanes. All vehicles start with its speed and the
+    IDM's equilibrium gaps. Without recordings, the first vehicle drives through artificial waves.
     """
 
     title: ClassVar[str] = "recorded"
@@ -60,17 +60,17 @@ class Recorded(Scenario):
     """a file with speeds, a folder of them, or a pattern like `drives/2021-03*`, see `unjam.recordings.leader_files`;
     empty: artificial waves"""
     order: Literal["random", "name"] = "random"
-    """how episodes with consecutive seeds take files, each once before any again: at random, or ordered by name"""
+    """order in which episodes with consecutive seeds use the files; each file is used once before any is repeated"""
     platoon: str = "cav human*5"
-    """vehicles behind the recorded one, from front to back, like `human*2 cav human*20`"""
+    """vehicles behind the recorded vehicle, from front to back, like `human*2 cav human*20`"""
     begin: NonNegative = 0.0
     """time in the recording at which an episode begins [s]"""
     window: NonNegative = 0.0
-    """duration of the random part of a recording that each episode has [s]; 0: all of it"""
+    """duration of the random part of a recording that an episode uses [s]; 0: the whole recording"""
     horizon: Horizon = 20_000
-    """most control steps in an episode, which ends with its recording"""
+    """maximum number of control steps in an episode; an episode also ends with its recording"""
     action_limit: Positive = 3.0
-    """hardest braking that a CAV can command [m/s2]"""
+    """strongest braking that a CAV can command [m/s2]"""
     max_acceleration: Positive = 1.5
     """largest acceleration that a CAV can command [m/s2]"""
     actuator: Actuator = STANDARD_ACTUATOR
@@ -79,7 +79,7 @@ class Recorded(Scenario):
             desired_speed=45.0, max_acceleration=1.3, comfortable_deceleration=2.0, time_headway=1.0
         )
     )
-    """human drivers of the source of this road"""
+    """parameters of human drivers, as in the source of this road"""
     noise: NonNegative = 0.3
 
     @model_validator(mode="after")
@@ -98,12 +98,12 @@ class Recorded(Scenario):
 
     @cached_property
     def vehicle_kinds(self) -> tuple[str, ...]:
-        """`cav` or `human` for each vehicle behind the recorded one, from front to back."""
+        """`cav` or `human` for each vehicle behind the recorded vehicle, from front to back."""
         kinds = list[str]()
-        for word in self.platoon.split():
-            match = re.fullmatch(r"(cav|human)(?:\*([1-9]\d{0,3}))?", word)
+        for group in self.platoon.split():
+            match = re.fullmatch(r"(cav|human)(?:\*([1-9]\d{0,3}))?", group)
             if match is None:
-                raise ValueError(f"platoon: {word!r} is not allowed; allowed: cav, human, cav*2, human*5, ...")
+                raise ValueError(f"platoon: {group!r} is not allowed; allowed: cav, human, cav*2, human*5, ...")
             kinds += [match[1]] * int(match[2] or 1)
         return tuple(kinds)
 
@@ -114,35 +114,35 @@ class Recorded(Scenario):
 
     @property
     def max_episode_steps(self) -> int:
-        """Control steps of the longest recording after its begin, or of the window, within the horizon."""
+        """Control steps of the window, or of the longest recording after `begin`; at most the horizon."""
         seconds = self.window or self._longest_recording - self.begin
         return min(self.horizon, max(1, floor(seconds / self.control_step + 1e-9)))
 
     @cached_property
     def _longest_recording(self) -> float:
-        return max(leader.seconds for leader in self._leaders) if self.recordings else ARTIFICIAL_SECONDS
+        return max(leader.seconds for leader in self._recordings) if self.recordings else ARTIFICIAL_SECONDS
 
     @property
     def max_leader_speed(self) -> float:
-        """Largest speed of all recordings [m/s]; 0 without any."""
-        return float(max(leader.speed.max() for leader in self._leaders)) if self.recordings else 0.0
+        """Largest speed of all recordings [m/s]; 0 without recordings."""
+        return float(max(leader.speed.max() for leader in self._recordings)) if self.recordings else 0.0
 
     @cached_property
-    def _leaders(self) -> list[LeaderRecording]:
+    def _recordings(self) -> list[LeaderRecording]:
         from unjam.recordings.leader_files import read_leaders
 
-        files, leaders, problems = recording_files(Path(self.recordings)), list[LeaderRecording](), dict[str, str]()
+        files, recordings, messages = recording_files(Path(self.recordings)), list[LeaderRecording](), dict[str, str]()
         for path in files:
             try:
-                leaders += read_leaders(path)
+                recordings += read_leaders(path)
             except InputError as error:
-                problems[path.name] = str(error)
-        if problems:
-            first, *others = problems
-            more = f"; also refused: {shorten_list(others)}" if others else ""
-            way = "to go on, move it elsewhere, or select others by a pattern like 'drives/2021-03*'"
-            raise InputError(f"{problems[first]}{more}{f'; {way}' if len(files) > 1 else ''}")
-        return leaders
+                messages[path.name] = str(error)
+        if messages:
+            first_file, *other_files = messages
+            also_refused = f"; also refused: {shorten_list(other_files)}" if other_files else ""
+            hint = "; move it elsewhere, or select other files by a pattern like 'drives/2021-03*'"
+            raise InputError(f"{messages[first_file]}{also_refused}{hint if len(files) > 1 else ''}")
+        return recordings
 
     @property
     def acceleration_limits(self) -> Limits:
@@ -151,7 +151,7 @@ class Recorded(Scenario):
 
     @property
     def user_files(self) -> list[Path]:
-        """The recordings, and the file of calibrated drivers."""
+        """The files with the recordings and the calibrated drivers."""
         return [*(recording_files(Path(self.recordings)) if self.recordings else []), *super().user_files]
 
     @property
@@ -166,26 +166,26 @@ class Recorded(Scenario):
 
     @property
     def notes(self) -> list[str]:
-        """What a replay cannot know."""
+        """The recordings, and the limits of a replay."""
         source = self._recordings_note() if self.recordings else "artificial waves; --recordings names a recording"
         return [source, "the recorded vehicle does not react, and vehicles do not change lanes"]
 
     def _recordings_note(self) -> str:
-        """What was read of the recordings, so that a wrong unit or a gap in time is seen."""
-        path, files, leaders = Path(self.recordings), recording_files(Path(self.recordings)), self._leaders
-        seconds, speeds = [leader.seconds for leader in leaders], np.concatenate([leader.speed for leader in leaders])
+        """Return a summary of the recordings, in which wrong units and gaps in time are visible."""
+        path, files, parts = Path(self.recordings), recording_files(Path(self.recordings)), self._recordings
+        seconds, speeds = [part.seconds for part in parts], np.concatenate([part.speed for part in parts])
         source = path.name if path.is_file() else f"{format_count(len(files), 'file')} of {path.name}"
-        parts = f"{format_count(len(leaders), 'part')} of {min(seconds):.0f} to" if len(leaders) > 1 else ""
-        text = f"{parts} {max(seconds):.0f} s with speeds of {speeds.min():.1f} to {speeds.max():.1f} m/s"
+        count = f"{format_count(len(parts), 'part')} of {min(seconds):.0f} to " if len(parts) > 1 else ""
+        text = f"{count}{max(seconds):.0f} s with speeds of {speeds.min():.1f} to {speeds.max():.1f} m/s"
         order_text = {"random": ", drawn at random", "name": ", in the order of their names"}[self.order]
-        return f"recordings: {source}: {text.strip()}{order_text if len(files) > 1 else ''}"
+        return f"recordings: {source}: {text}{order_text if len(files) > 1 else ''}"
 
     @property
     def training_notes(self) -> list[str]:
-        """What a user must know about results on test seeds."""
+        """A note on the recordings of the test seeds."""
         if not self.recordings:
             return []
-        return ["test seeds take the recordings of the training; others: drive recorded --recordings FOLDER -d RUN"]
+        return ["test seeds use the recordings of the training; for others: drive recorded --recordings FOLDER -d RUN"]
 
     def stratum(self, index: int, count: int) -> Self:
         """Return this road with the recordings of one of `count` equal parts, if there are as many files."""
@@ -194,42 +194,42 @@ class Recorded(Scenario):
         return replace(self, recordings=str(files[index * len(files) // count]))
 
     def draw_from_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
-        """Return the road of an episode's seed, the last number of which counts the files."""
+        """Return the road of an episode's seed; the last index of the seed selects the file."""
         files = recording_files(Path(self.recordings)) if self.recordings else []
         if len(files) < 2:
             return super().draw_from_seed(seed)
-        number = seed[-1] % len(files)
+        index = seed[-1] % len(files)
         if self.order == "random":
-            number = int(np.random.default_rng([len(files), *seed[:-1]]).permutation(len(files))[number])
-        road, seeds = replace(self, recordings=str(files[number])).draw_from_seed(seed)
-        return replace(road, drawn_values={**road.drawn_values, "file": float(number)}), seeds
+            index = int(np.random.default_rng([len(files), *seed[:-1]]).permutation(len(files))[index])
+        road, seeds = replace(self, recordings=str(files[index])).draw_from_seed(seed)
+        return replace(road, drawn_values={**road.drawn_values, "file": float(index)}), seeds
 
     def draw(self, generator: np.random.Generator) -> RecordedRoad:
         """Return the road with the speeds of a random recording, or of a random part of it."""
-        road, recording = self._draw_recording(generator)
-        room = recording.seconds - self.begin
-        if room < self.control_step:
+        indices, recording = self._draw_recording(generator)
+        available = recording.seconds - self.begin
+        if available < self.control_step:
             raise InputError(
                 f"begin: {self.begin:g} s is not allowed; allowed: < {recording.seconds:g} s, the duration of "
                 f"{recording.name}"
             )
-        start, seconds = self.begin, min(room, self.horizon * self.control_step)
-        if self.window > room:
+        begin, seconds = self.begin, min(available, self.horizon * self.control_step)
+        if self.window > available:
             raise InputError(
-                f"window: {self.window:g} s is not allowed; allowed: <= {room:g} s, the duration of {recording.name} "
-                "from begin"
+                f"window: {self.window:g} s is not allowed; allowed: <= {available:g} s, the duration of "
+                f"{recording.name} after begin"
             )
         if self.window:
-            start += float(generator.uniform(0.0, room - self.window))
+            begin += float(generator.uniform(0.0, available - self.window))
             seconds = min(self.window, seconds)
-        speeds = recording.speeds_at(start, seconds, self.simulation_step)
-        return self.build(speeds, {**road, "begin": start}, generator)
+        speeds = recording.speeds_at(begin, seconds, self.simulation_step)
+        return self.build(speeds, {**indices, "begin": begin}, generator)
 
     def build(self, speeds: Floats, drawn_values: dict[str, float], generator: np.random.Generator) -> RecordedRoad:
-        """Return the road behind a vehicle with given speeds in all simulation steps [m/s], shape (S + 1,)."""
-        ids = (LEADER_ID, *(f"{kind}_{number}" for number, kind in enumerate(self.vehicle_kinds)))[::-1]
-        people, speed = self.draw_humans(ids, generator), float(speeds[0])
-        humans = [people.get(name, self.humans) for name in ids[:-1]]
+        """Return the road behind a vehicle with `speeds` at the start and after each step [m/s], shape (S + 1,)."""
+        vehicle_ids = (*self._platoon_ids(), LEADER_ID)
+        human_parameters, speed = self.draw_humans(vehicle_ids, generator), float(speeds[0])
+        humans = [human_parameters.get(vehicle_id, self.humans) for vehicle_id in vehicle_ids[:-1]]
         start_speeds = [min(speed, MAX_FREE_SPEED_SHARE * human.desired_speed) for human in humans]
         spaces = [VEHICLE_LENGTH + gap for gap in map(equilibrium_gap, start_speeds, humans)]
         positions = VEHICLE_LENGTH + np.concatenate([[0.0], np.cumsum(spaces)])
@@ -239,33 +239,38 @@ class Recorded(Scenario):
         return RecordedRoad(
             network=RoadNetwork(nodes, (Edge(EDGE_NAME, "begin", "end", length),), self.top_speed),
             routes=(Route(EDGE_NAME, (EDGE_NAME,)),),
-            entries=tuple(Entry(name, EDGE_NAME, at) for name, at in zip(ids, positions.tolist(), strict=True)),
+            entries=tuple(
+                Entry(name, EDGE_NAME, position) for name, position in zip(vehicle_ids, positions.tolist(), strict=True)
+            ),
             has_entry_checks=False,
-            vehicle_ids=ids,
-            cav_ids=tuple(name for name in ids if name.startswith("cav")),
+            vehicle_ids=vehicle_ids,
+            cav_ids=self.possible_cav_ids(),
             start_positions=positions,
             replayed_speeds=speeds,
             limit_speed=nan,
             drawn_values=drawn_values,
-            human_parameters=people,
+            human_parameters=human_parameters,
         )
 
     def possible_cav_ids(self) -> tuple[str, ...]:
         """Return the ids of the CAVs, in their order along the road."""
-        names = (f"{kind}_{number}" for number, kind in enumerate(self.vehicle_kinds))
-        return tuple(name for name in names if name.startswith("cav"))[::-1]
+        return tuple(vehicle_id for vehicle_id in self._platoon_ids() if vehicle_id.startswith("cav"))
+
+    def _platoon_ids(self) -> tuple[str, ...]:
+        """Return the ids of the vehicles behind the recorded vehicle, in their order along the road."""
+        return tuple(f"{kind}_{index}" for index, kind in enumerate(self.vehicle_kinds))[::-1]
 
     def _draw_recording(self, generator: np.random.Generator) -> tuple[dict[str, float], LeaderRecording]:
-        """Return the numbers of a random file and of a part of it, and this recording; all files are equally likely."""
+        """Return the indices of a random file and of a random part of this file, and that part as a recording."""
         if not self.recordings:
             return {}, artificial_waves(generator)
         from unjam.recordings.leader_files import read_leaders  # pandas takes half a second
 
         files = recording_files(Path(self.recordings))
-        number = int(generator.integers(len(files)))
-        leaders = read_leaders(files[number])
-        part = int(generator.integers(len(leaders)))
-        return {"file": float(number), "part": float(part)}, leaders[part]
+        file_index = int(generator.integers(len(files)))
+        parts = read_leaders(files[file_index])
+        part_index = int(generator.integers(len(parts)))
+        return {"file": float(file_index), "part": float(part_index)}, parts[part_index]
 
     def _fact_values(self) -> tuple[str, str, str, str]:
         source = f"recordings of {self.recordings}" if self.recordings else "artificial waves"

@@ -1,4 +1,4 @@
-"""Closed roads with one lane, and the simplest of them: the ring, too dense for stable traffic."""
+"""Closed roads with one lane, among them the ring, which is too dense for stable traffic."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from unjam.drivers.safety import STANDARD_ACTUATOR, Actuator
 from unjam.parameters import STRICT, NumberOrRange, PositiveInt, is_packaged, parameter_dataclass
 from unjam.physics.arrays import Floats
 from unjam.physics.idm import equilibrium_speed
-from unjam.scenarios.road import ClosedRoad, Edge, Entry, Node, RoadNetwork, Route, as_polyline
+from unjam.scenarios.road import ClosedRoad, Edge, Entry, Node, RoadNetwork, Route, to_polyline
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 
 RING_EDGES = 4
@@ -20,11 +20,11 @@ RING_EDGES = 4
 LoopSize = Annotated[int, Field(ge=10, le=10_000_000)]
 """length or radius of a closed road [m]"""
 MAX_CACHED_ROADS = 256
-"""roads that are kept for later episodes: as many sizes as the default ranges have, and more"""
+"""maximum number of roads in the cache; the default ranges have fewer sizes"""
 
 
 class EdgeSpan(NamedTuple):
-    """The position of an edge along a closed road [m]."""
+    """An edge with its start and length along a closed road [m]."""
 
     name: str
     start: float
@@ -32,7 +32,7 @@ class EdgeSpan(NamedTuple):
 
     @property
     def end(self) -> float:
-        """Its end along the road [m]."""
+        """Position of the end [m]."""
         return self.start + self.length
 
 
@@ -43,19 +43,19 @@ class LoopScenario(Scenario):
     size_parameter: ClassVar[str]
     """the parameter that is drawn, uniformly among the integers of its range [m]"""
     description: ClassVar[str]
-    """description of the road, with braces for the sizes"""
+    """format string that describes the road; `{}` stands for the size"""
     limit_description: ClassVar[str]
-    """definition of its limit speed"""
+    """definition of the limit speed"""
     road_model: ClassVar[str] = "closed"
     is_first_leading: ClassVar[bool] = False
-    """whether vehicle 0 leads the queue; otherwise it is the last one"""
+    """whether vehicle 0 is the first of the queue at the start; otherwise it is the last"""
 
     vehicles: Annotated[int, Field(ge=2)] = 22
-    """on the road, CAVs included"""
+    """number of vehicles, CAVs included"""
     cavs: PositiveInt = 1
     """number of CAVs, evenly spread"""
     actuator: Actuator = STANDARD_ACTUATOR
-    """delay and lag with which a CAV follows its commands: those of a usual car"""
+    """delay and lag of a CAV's response to commands, by default those of a usual car"""
 
     @model_validator(mode="after")
     def _check_counts(self) -> Self:
@@ -67,13 +67,13 @@ class LoopScenario(Scenario):
         if self.human_control == "native" and self.driver_population and self.driver_population.residual is not None:
             raise ValueError(
                 "human_control: native is not allowed for a population with a residual network, which SUMO's own IDM "
-                "does not know; allowed: commanded"
+                "cannot apply; allowed: commanded"
             )
         return self
 
     @property
     def max_vehicles(self) -> float:
-        """All on the road."""
+        """Number of vehicles on the road."""
         return self.vehicles
 
     def build(self, size: float) -> ClosedRoad:
@@ -91,18 +91,18 @@ class LoopScenario(Scenario):
         return replace(road, human_parameters=self.draw_humans(road.vehicle_ids, generator))
 
     def _closed_road(self, size: float, edges: Sequence[EdgeSpan], positions: Floats, **fields: Any) -> ClosedRoad:
-        """Return a road of edges in driving order with vehicles at positions from the last to the first [m]."""
-        ids, names = self._vehicle_ids(), [edge.name for edge in edges]
+        """Return a road of edges in driving order; positions of vehicles are from the last to the first [m]."""
+        vehicle_ids, names = self._vehicle_ids(), [edge.name for edge in edges]
         laps = int(self.max_duration * self.top_speed / sum(edge.length for edge in edges)) + 2  # enough for an episode
-        routes = [Route(f"from_{name}", (*names[first:], *names[:first]), laps) for first, name in enumerate(names)]
+        routes = [Route(f"from_{name}", (*names[index:], *names[:index]), laps) for index, name in enumerate(names)]
         entries = []
-        for name, position in zip(ids, positions.tolist(), strict=True):
+        for vehicle_id, position in zip(vehicle_ids, positions.tolist(), strict=True):
             edge = max((edge for edge in edges if edge.start <= position), key=lambda edge: edge.start)
-            entries.append(Entry(name, f"from_{edge.name}", min(position - edge.start, edge.length)))
+            entries.append(Entry(vehicle_id, f"from_{edge.name}", min(position - edge.start, edge.length)))
         return ClosedRoad(
             routes=tuple(routes),
             entries=tuple(entries),
-            vehicle_ids=ids,
+            vehicle_ids=vehicle_ids,
             cav_ids=self.possible_cav_ids(),
             start_positions=positions,
             limit_speed=self.limit_speed(size),
@@ -121,7 +121,7 @@ class LoopScenario(Scenario):
         return {self.size_parameter: self._size_range}
 
     def stratum(self, index: int, count: int) -> Self:
-        """Return this road with one of `count` equal parts of its range of sizes, both ends included."""
+        """Return this road with part `index` of `count` equal parts of its range of sizes, both ends included."""
         low, high = self._size_range
         borders = np.linspace(low, high + 1, count + 1).astype(int)
         first, last = int(borders[index]), int(borders[index + 1]) - 1
@@ -129,12 +129,12 @@ class LoopScenario(Scenario):
 
     def possible_cav_ids(self) -> tuple[str, ...]:
         """Return the ids of the CAVs, in their order along the road."""
-        return tuple(name for name in self._vehicle_ids() if name.startswith("cav"))
+        return tuple(vehicle_id for vehicle_id in self._vehicle_ids() if vehicle_id.startswith("cav"))
 
     def _fact_values(self) -> tuple[str, str, str, str]:
-        ends = dict.fromkeys(self._size_range)
-        road = self.description.format("-".join(map(str, ends)))
-        speeds = "-".join(f"{self.limit_speed(size):.2f}" for size in ends)
+        sizes = dict.fromkeys(self._size_range)
+        road = self.description.format("-".join(map(str, sizes)))
+        speeds = "-".join(f"{self.limit_speed(size):.2f}" for size in sizes)
         return road, f"{self.vehicles} ({self.cavs} CAV)", f"{speeds} m/s", self.limit_description
 
     @property
@@ -147,20 +147,20 @@ class LoopScenario(Scenario):
 
     def _vehicle_ids(self) -> tuple[str, ...]:
         """Return all ids in their order along the road; vehicle 0 is a CAV, and CAVs are evenly spread."""
-        cavs = {round(index * self.vehicles / self.cavs) for index in range(self.cavs)}
-        ids = [f"{'cav' if index in cavs else 'human'}_{index}" for index in range(self.vehicles)]
+        cav_indices = {round(index * self.vehicles / self.cavs) for index in range(self.cavs)}
+        ids = [f"{'cav' if index in cav_indices else 'human'}_{index}" for index in range(self.vehicles)]
         return tuple(reversed(ids) if self.is_first_leading else ids)
 
 
 @lru_cache(maxsize=MAX_CACHED_ROADS)
 def _packaged_road(scenario: LoopScenario, size: float) -> ClosedRoad:
-    """Return `scenario.build(size)`, once for the many episodes of the same size."""
+    """Return `scenario.build(size)`, cached for other episodes of the same size."""
     return scenario.build(size)
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class Ring(LoopScenario):
-    """Vehicles on a circle, evenly spaced and standing at the start; each episode draws the length.
+    """A ring on which vehicles stand evenly spaced at the start; each episode draws its length.
 
     The paper's ring has 22 vehicles, one of them a CAV, on 220 to 270 m. At that density the steady flow of the IDM
     is unstable, and the noise of the human drivers grows into a wave.
@@ -177,24 +177,24 @@ class Ring(LoopScenario):
 
     @model_validator(mode="after")
     def _check_length(self) -> Self:
-        shortest = self.length[0]
-        if shortest < self._min_length:
+        length = self.length[0]
+        if length < self._min_length:
             raise ValueError(
-                f"length: {shortest} m is not allowed for {self.vehicles} vehicles; allowed: >= {self._min_length:g} m"
+                f"length: {length} m is not allowed for {self.vehicles} vehicles; allowed: >= {self._min_length:g} m"
             )
         return self
 
     def build(self, size: float) -> ClosedRoad:
-        """Return the circle of a given length [m], of equal edges, with its vehicles."""
+        """Return the ring of a given length [m], with edges of equal length, and its vehicles."""
         edge_length = size / RING_EDGES
-        coordinates = np.linspace(0, size, 161)
+        positions = np.linspace(0, size, 161)
         return self._closed_road(
             size,
             [EdgeSpan(f"edge_{index}", index * edge_length, edge_length) for index in range(RING_EDGES)],
             np.arange(self.vehicles, dtype=np.float64) * (size / self.vehicles),
             loop_length=size,
             network=_circle_network(size, self.top_speed),
-            center_line=np.column_stack([coordinates, _circle_points(2 * np.pi * coordinates / size, size)]),
+            center_line=np.column_stack([positions, _circle_points(2 * np.pi * positions / size, size)]),
         )
 
     def limit_speed(self, size: float) -> float:
@@ -211,7 +211,7 @@ def _circle_network(length: float, speed: float) -> RoadNetwork:
     nodes = tuple(Node(f"node_{index}", x, y, has_priority=True) for index, (x, y) in enumerate(corners.tolist()))
     edges = []
     for index in range(RING_EDGES):
-        line = _circle_points(2 * np.pi * (index + np.linspace(0, 1, 41)) / RING_EDGES, length)
+        arc = _circle_points(2 * np.pi * (index + np.linspace(0, 1, 41)) / RING_EDGES, length)
         ends = nodes[index].name, nodes[(index + 1) % RING_EDGES].name
-        edges.append(Edge(f"edge_{index}", *ends, length / RING_EDGES, shape=as_polyline(line)))
+        edges.append(Edge(f"edge_{index}", *ends, length / RING_EDGES, shape=to_polyline(arc)))
     return RoadNetwork(nodes, tuple(edges), speed, has_internal_links=False)

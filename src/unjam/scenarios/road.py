@@ -1,4 +1,4 @@
-"""One episode's road and traffic, as a scenario draws it: geometry, vehicles, demand."""
+"""The road and traffic of one episode, which a scenario draws: geometry, vehicles, demand."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -16,8 +16,8 @@ Polyline = tuple[tuple[float, float], ...]
 """points (x, y) [m]"""
 
 
-def as_polyline(points: Floats) -> Polyline:
-    """Return points of shape (n, 2) as a line."""
+def to_polyline(points: Floats) -> Polyline:
+    """Return points of shape (n, 2) as a polyline."""
     return tuple((x, y) for x, y in points.tolist())
 
 
@@ -34,23 +34,23 @@ class Node(NamedTuple):
 
 
 class Edge(NamedTuple):
-    """A piece of road between two nodes; length [m], speed limit [m/s]."""
+    """A piece of road between two nodes; the length is in m."""
 
     name: str
     from_node: str
     to_node: str
     length: float
     priority: int | None = None
-    """the larger one has the right of way"""
+    """edges of higher priority have the right of way; None: the simulator's default"""
     shape: Polyline = ()
-    """empty: straight"""
+    """line of the edge; empty: straight"""
     lanes: int = 1
     speed_limit: float | None = None
     """speed limit of the edge [m/s]; None: that of the network"""
 
 
 class Connection(NamedTuple):
-    """Two edges, or two lanes, that follow each other; lanes count from 0 at the right, None: all of them."""
+    """Two edges, or two lanes, that follow each other; lane 0 is the right one, None: all lanes."""
 
     from_edge: str
     to_edge: str
@@ -60,16 +60,16 @@ class Connection(NamedTuple):
 
 @dataclass(frozen=True)
 class RoadNetwork:
-    """Nodes and edges."""
+    """The nodes and edges of a road."""
 
     nodes: tuple[Node, ...]
     edges: tuple[Edge, ...]
     speed_limit: float
-    """speed limit of all edges without their own [m/s]"""
+    """speed limit of all edges that define none [m/s]"""
     has_internal_links: bool = True
     """whether the lanes across junctions have a length of their own"""
     connections: tuple[Connection, ...] = ()
-    """empty: all that are possible"""
+    """connections of edges; empty: all that are possible"""
 
 
 class Route(NamedTuple):
@@ -81,7 +81,7 @@ class Route(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """A vehicle that enters."""
+    """A vehicle that wants to enter the road."""
 
     name: str
     route: str
@@ -93,30 +93,30 @@ class Entry(NamedTuple):
     """time at which the vehicle wants to enter [s]"""
     lane: int = 0
     vehicle_type: str = ""
-    """one of the road's `vehicle_types`; empty: a human driver as the scenario says"""
+    """one of the road's `vehicle_types`; empty: that of the scenario's human drivers"""
 
 
 DRAWN_UNITS = {"file": "", "part": "", "begin": "s"}
-"""units of values that episodes draw, by name; of others meters"""
+"""units of drawn values by name; other values are in meters"""
 
 
 def format_drawn_values(values: Mapping[str, float]) -> list[str]:
-    """Return values that an episode has drawn as texts for captions."""
+    """Return the drawn values of an episode as texts for captions."""
     return [f"{name} {value:g} {DRAWN_UNITS.get(name, 'm')}".strip() for name, value in values.items()]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Road:
-    """One episode's road and traffic."""
+    """The road and traffic of one episode."""
 
     limit_speed: float
-    """speed that the traffic cannot exceed in the long run [m/s], as the scenario defines it; NaN: unknown"""
+    """speed that traffic cannot exceed in the long run, defined by the scenario [m/s]; NaN: unknown"""
     drawn_values: dict[str, float] = field(default_factory=dict)
     """values drawn from the episode's seed, by name"""
     merge_positions: tuple[float, ...] = ()
     """positions along the road where ramps join [m]"""
     human_parameters: dict[str, IDMParameters] = field(default_factory=dict)
-    """parameters of each vehicle's human driver, by vehicle; empty: all as the scenario says"""
+    """parameters of the human drivers by vehicle id; empty: all drivers have those of the scenario"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,32 +128,32 @@ class BuiltRoad(Road):
     entries: tuple[Entry, ...]
     """vehicles that want to enter, ordered by time"""
     has_entry_checks: bool = True
-    """whether SUMO inserts a vehicle only where its gap is safe"""
+    """whether SUMO inserts a vehicle only if its gap is safe"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class OrderedRoad(BuiltRoad):
-    """A road with one lane on which the same vehicles drive in the same order all the time."""
+    """A road with one lane on which the vehicles and their order never change."""
 
     vehicle_ids: tuple[str, ...]
     """all vehicles, in their order along the road"""
     cav_ids: tuple[str, ...]
-    """the CAVs among them, in the same order"""
+    """the CAVs, in the same order"""
     start_positions: Floats
-    """front bumper of each vehicle along the route at the start [m]"""
+    """position of each front bumper along the route at the start [m]"""
     loop_length: float
     """length of a closed road [m]; infinite on a road with ends"""
     center_line: Floats
-    """center line of a closed road: rows (coordinate along the route, x, y) [m]; no rows: straight"""
+    """center line of a closed road: rows (position along the route, x, y) [m]; no rows: straight"""
     replayed_speeds: Floats | None
-    """speeds of the last of `vehicle_ids`, the first on the road, at the start and after each simulation step if it
-    replays a recording [m/s], shape (S + 1,)"""
+    """recorded speeds that the front vehicle, the last of `vehicle_ids`, repeats at the start and after each simulation
+    step [m/s], shape (S + 1,); None: no vehicle repeats a recording"""
     crossings: tuple[tuple[float, float], ...] = ()
-    """sections where the road crosses itself, and SUMO itself drives commanded human drivers [m]"""
+    """sections where the road crosses itself [m]; there SUMO controls the motion of commanded human drivers"""
 
     @property
     def driven_count(self) -> int:
-        """Number of vehicles with a driver: all, or all but the last, which replays a recording."""
+        """Number of vehicles that do not replay a recording."""
         return len(self.vehicle_ids) - (self.replayed_speeds is not None)
 
     @property
@@ -168,7 +168,7 @@ class OrderedRoad(BuiltRoad):
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedRoad(OrderedRoad):
-    """A loop with one lane: vehicles neither enter nor leave nor overtake."""
+    """A loop with one lane."""
 
     replayed_speeds: None = None
 
@@ -183,13 +183,13 @@ class RecordedRoad(OrderedRoad):
 
 
 class VehicleType(NamedTuple):
-    """A vehicle and its driver on a motorway, with parameters of one of SUMO's car-following models, in SI units."""
+    """A type of vehicle and driver on a motorway: parameters of one of SUMO's car-following models, in SI units."""
 
     model: str
     time_headway: float
     acceleration: float
     deceleration: float
-    """comfortable"""
+    """comfortable deceleration"""
     minimum_gap: float
     """gap to a standing leader [m]"""
     speed_factor: float
@@ -202,7 +202,7 @@ class VehicleType(NamedTuple):
     emission_class: str | None = None
     """SUMO's emission class; None: that of the scenario"""
     parameters: tuple[tuple[str, float], ...] = ()
-    """parameters of lane changing by SUMO's names; SUMO's defaults for others"""
+    """parameters of lane changing by SUMO's names; others have SUMO's defaults"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +210,7 @@ class OpenRoad(Road):
     """A road with ends, which vehicles enter and leave."""
 
     cav_ids: frozenset[str] = frozenset()
-    """the CAVs, if they are known before they enter"""
+    """the CAVs, if the scenario chooses them before they enter"""
 
 
 class Origin(NamedTuple):
@@ -229,16 +229,16 @@ class MergeRoad(BuiltRoad, OpenRoad):
     origins: dict[str, Origin]
     """origins of all vehicles that can enter, by vehicle id"""
     junction_lengths: tuple[float, float]
-    """lengths of the lanes across the junction up to the merge point, of main road and ramp [m]; on them SUMO itself
-    drives commanded human drivers"""
+    """lengths of the lanes across the junction up to the merge point, of main road and ramp [m]; on these lanes SUMO
+    controls the motion of commanded human drivers"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class UserNetworkRoad(OpenRoad):
-    """A network of the user, with all its traffic."""
+    """A SUMO network of the user with its traffic."""
 
     files: SumoFiles
-    """the content of its files"""
+    """content of the files of the network"""
     penetration_rate: float
     """share of the eligible vehicles that become CAVs"""
     cav_types: tuple[str, ...]
@@ -250,8 +250,8 @@ class UserNetworkRoad(OpenRoad):
     max_cav_count: int | None = None
     """maximum number of CAVs: the first that enter"""
     drivers: tuple[IDMParameters, ...] = ()
-    """calibrated human drivers, one for each car; empty: all drive as their types say"""
+    """calibrated human drivers, of which each car has one; empty: the vehicle types define all drivers"""
     calibrated_types: frozenset[str] = frozenset()
-    """vehicle types that they drive"""
+    """vehicle types with calibrated human drivers"""
     roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
     """the roadside information that CAVs receive"""

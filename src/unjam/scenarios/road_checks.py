@@ -1,4 +1,4 @@
-"""Checks of the roads that users' classes draw: numbers are finite, names exist, and lengths agree with each other."""
+"""Checks of the roads that classes of users draw: finite numbers, existing names and consistent lengths."""
 
 from collections.abc import Collection
 from itertools import pairwise
@@ -11,14 +11,14 @@ from unjam.physics.kinematics import gap_on_loop
 from unjam.scenarios.road import BuiltRoad, ClosedRoad, Edge, Road
 from unjam.text import format_count, shorten_list
 
-ROUNDING = 1.0, 0.02
-"""difference between two lengths that is rounding: [m], and relative to the length"""
+LENGTH_TOLERANCES = 1.0, 0.02
+"""tolerances of lengths for rounding: absolute [m], and relative"""
 JUNCTION_SHARE = 0.1
-"""largest share of a loop that lanes across junctions can have, which edges and center line do not contain"""
+"""largest share of the length of a loop that its lanes across junctions can have"""
 
 
 def check_road(road: object, vehicle_length: float, context: str) -> None:
-    """Raise `InputError`, which names `context`, if a road contradicts itself or is no `Road`; length [m]."""
+    """Raise `InputError` unless `road` is a consistent `Road`; `context` begins the message, the length is in m."""
     if not isinstance(road, Road):
         raise InputError(f"{context}: draw() returns {type(road).__name__}; allowed: a Road")
     try:
@@ -30,20 +30,22 @@ def check_road(road: object, vehicle_length: float, context: str) -> None:
         raise InputError(f"{context}: road.{error}") from None
 
 
-def _refuse(field: str, value: object, allowed: str) -> None:
+def _raise_not_allowed(field: str, value: object, allowed: str) -> None:
     raise ValueError(f"{field}: {value} is not allowed; allowed: {allowed}")
 
 
-def _check_length(field: str, length: float, expected: float, meaning: str, share: float = ROUNDING[1]) -> None:
+def _check_length(
+    field: str, length: float, expected: float, meaning: str, tolerance: float = LENGTH_TOLERANCES[1]
+) -> None:
     if not (np.isfinite(length) and length > 0):
-        _refuse(field, f"{length:g} m", "> 0 m")
-    if abs(length - expected) > ROUNDING[0] + share * expected:
-        _refuse(field, f"{length:.1f} m", f"{expected:.1f} m, {meaning}")
+        _raise_not_allowed(field, f"{length:g} m", "> 0 m")
+    if abs(length - expected) > LENGTH_TOLERANCES[0] + tolerance * expected:
+        _raise_not_allowed(field, f"{length:.1f} m", f"{expected:.1f} m, {meaning}")
 
 
 def _check_name(field: str, name: str, names: Collection[str]) -> None:
     if name not in names:
-        _refuse(field, repr(name), shorten_list(names))
+        _raise_not_allowed(field, repr(name), shorten_list(names))
 
 
 def _line_length(points: Floats) -> float:
@@ -55,54 +57,65 @@ def _check_network(road: BuiltRoad) -> None:
     nodes, edges = {node.name: node for node in road.network.nodes}, {edge.name: edge for edge in road.network.edges}
     routes = {route.name: route for route in road.routes}
     for name, edge in edges.items():
-        for end in ("from_node", "to_node"):
-            _check_name(f"edges.{name}.{end}", getattr(edge, end), nodes)
+        for field in ("from_node", "to_node"):
+            _check_name(f"edges.{name}.{field}", getattr(edge, field), nodes)
         ends = [(nodes[node].x, nodes[node].y) for node in (edge.from_node, edge.to_node)]
         _check_length(f"edges.{name}.length", edge.length, _line_length(np.array(edge.shape or ends)), "its line")
     for name, route in routes.items():
         for edge_name in route.edges:
             _check_name(f"routes.{name}.edges", edge_name, edges)
-        for first, second in pairwise(route.edges):
-            if edges[first].to_node != edges[second].from_node:
-                _refuse(f"routes.{name}.edges", f"{second} after {first}", "edges that meet at a node")
+        for edge_name, next_name in pairwise(route.edges):
+            if edges[edge_name].to_node != edges[next_name].from_node:
+                _raise_not_allowed(
+                    f"routes.{name}.edges", f"{next_name} after {edge_name}", "edges that meet at a node"
+                )
     for entry in road.entries:
         _check_name(f"entries.{entry.name}.route", entry.route, routes)
         length = edges[routes[entry.route].edges[0]].length
         if not 0 <= entry.position <= length:
-            _refuse(f"entries.{entry.name}.position", f"{entry.position:g} m", f"0 to {length:g} m, on its first edge")
+            _raise_not_allowed(
+                f"entries.{entry.name}.position", f"{entry.position:g} m", f"0 to {length:g} m, on its first edge"
+            )
 
 
 def _check_loop(road: ClosedRoad, vehicle_length: float) -> None:
     """Raise `ValueError` if the lengths or the vehicles of a closed road contradict each other."""
     edges = {edge.name: edge for edge in road.network.edges}
-    loop, share = road.loop_length, JUNCTION_SHARE if road.network.has_internal_links else ROUNDING[1]
+    loop, tolerance = road.loop_length, JUNCTION_SHARE if road.network.has_internal_links else LENGTH_TOLERANCES[1]
     lap = [edges[name] for name in road.routes[0].edges]
-    _check_length("loop_length", loop, sum(edge.length for edge in lap), "the sum of its edges", share)
+    _check_length("loop_length", loop, sum(edge.length for edge in lap), "the sum of its edges", tolerance)
     line = np.asarray(road.center_line, np.float64)
     if line.ndim != 2 or line.shape[1] != 3 or not np.isfinite(line).all():
-        _refuse("center_line", f"an array of shape {line.shape}", "finite rows (coordinate, x, y)")
-    _check_length("center_line", _line_length(line[:, 1:]), loop, "the length of the loop", share)
+        _raise_not_allowed("center_line", f"an array of shape {line.shape}", "finite rows (position, x, y)")
+    _check_length("center_line", _line_length(line[:, 1:]), loop, "the length of the loop", tolerance)
     _check_length("center_line", float(line[-1, 0] - line[0, 0]), loop, "the length of the loop")
     ids, positions = road.vehicle_ids, np.asarray(road.start_positions, np.float64)
     for name in road.cav_ids:
         _check_name("cav_ids", name, ids)
     if positions.shape != (len(ids),) or not np.isfinite(positions).all():
-        _refuse("start_positions", f"an array of shape {positions.shape}", format_count(len(ids), "finite position"))
+        _raise_not_allowed(
+            "start_positions", f"an array of shape {positions.shape}", format_count(len(ids), "finite position")
+        )
     gaps = gap_on_loop(positions, np.roll(positions, -1), loop, vehicle_length)
     if len(ids) > 1 and (gaps.min() < 0 or gaps.sum() > loop):
         row = int(gaps.argmin())
-        _refuse("start_positions", f"{positions[row]:.1f} m of {ids[row]}", "vehicles in their order, without contact")
+        _raise_not_allowed(
+            "start_positions", f"{positions[row]:.1f} m of {ids[row]}", "vehicles in their order, without contact"
+        )
     if not road.network.has_internal_links:
-        _check_starts(road, lap)
+        _check_entries(road, lap)
 
 
-def _check_starts(road: ClosedRoad, lap: list[Edge]) -> None:
-    offsets = dict(zip([edge.name for edge in lap], np.cumsum([0.0, *(edge.length for edge in lap)]), strict=False))
+def _check_entries(road: ClosedRoad, lap: list[Edge]) -> None:
+    """Raise `ValueError` unless vehicles enter a closed road at their start positions; `lap` has its edges in order."""
+    edge_starts = dict(zip([edge.name for edge in lap], np.cumsum([0.0, *(edge.length for edge in lap)]), strict=False))
     starts = dict(zip(road.vehicle_ids, road.start_positions, strict=True))
     routes = {route.name: route for route in road.routes}
     for entry in road.entries:
         _check_name("entries", entry.name, starts)
-        position, start = offsets[routes[entry.route].edges[0]] + entry.position, starts[entry.name]
-        off = (position - start) % road.loop_length
-        if min(off, road.loop_length - off) > ROUNDING[0]:
-            _refuse(f"entries.{entry.name}", f"{position:.1f} m on the loop", f"{start:.1f} m, as in start_positions")
+        position, start = edge_starts[routes[entry.route].edges[0]] + entry.position, starts[entry.name]
+        offset = (position - start) % road.loop_length
+        if min(offset, road.loop_length - offset) > LENGTH_TOLERANCES[0]:
+            _raise_not_allowed(
+                f"entries.{entry.name}", f"{position:.1f} m on the loop", f"{start:.1f} m, as in start_positions"
+            )

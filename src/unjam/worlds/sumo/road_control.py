@@ -97,7 +97,7 @@ class RampControl:
         if self._limits.active:
             if self._is_due(self._limits.interval):
                 self._share = self._limits.next_share(self._share, density, self._speed_limit)
-                self._limit = self._limits.limit(self._share, self._speed_limit)
+                self._limit = self._limits.posted_limit(self._share, self._speed_limit)
             self._limit_speeds(vehicles)
         if self._meter.active:
             if self._is_due(self._meter.interval):
