@@ -118,7 +118,7 @@ def test_an_unknown_packaged_population_is_refused_with_the_known_ones() -> None
 
 
 def test_on_a_motorway_only_car_following_is_calibrated(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="population: one with a residual network is not allowed on a motorway"):
+    with pytest.raises(InputError, match="population: a residual network is not allowed on a motorway"):
         make_scenario("on-ramp", {"population": str(written(tmp_path, NETWORK))})
     road = make_scenario("on-ramp", {"population": str(written(tmp_path))}).draw(np.random.default_rng(0))
     assert isinstance(road, MotorwayRoad)

@@ -252,7 +252,7 @@ BIKES = '<routes><vType id="bike" vClass="bicycle"/><flow id="g" type="bike"/></
             {"penetration_rate": 0.1},
             BIKES,
             "no vehicle has one of the classes passenger, private, hov, taxi, evehicle; its types are bike "
-            "(bicycle); name cav_classes or cav_types",
+            "(bicycle); set cav_classes or cav_types",
         ),
         ({"penetration_rate": 0.1, "cav_classes": ["car"]}, TYPES, "cav_classes: 'car' is not allowed; allowed: pass"),
         ({"penetration_rate": 0.1, "human_control": "commanded"}, TYPES, "human_control: 'commanded' is not allowed"),
@@ -345,6 +345,6 @@ def test_a_vehicle_type_with_the_name_that_cavs_get_is_refused(tmp_path: Path) -
     types = '<vType id="car"/><vType id="cav_of_car"/><route id="short" edges="ab bc"/>'
     routes = f'<routes>{types}<vehicle id="v" type="car" route="short" depart="0"/></routes>'
     with pytest.raises(
-        InputError, match="file: the vehicle type 'cav_of_car' is not allowed: CAVs of type 'car' have this name"
+        InputError, match="file: the vehicle type 'cav_of_car' is not allowed: the type of CAVs that replace 'car' has"
     ):
         own(tmp_path, routes=routes, penetration_rate=1.0)

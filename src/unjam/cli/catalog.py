@@ -63,7 +63,7 @@ def scenarios_command(
     scenario = example_scenario(name)
     if picture is not None:
         _draw_scenario(scenario, name, picture)
-    facts = [*scenario.facts(), *_common_facts(scenario)]
+    facts = [*scenario.summary(), *_common_facts(scenario)]
     if json:
         print_json({"name": name, "facts": dict(facts), "parameters": scenario_recipe(scenario)})
         return
@@ -81,7 +81,7 @@ def _print_scenarios(scenarios: Mapping[str, Any]) -> None:
     table = new_table(("scenario", *headings))
     for key, scenario in scenarios.items():
         warmup = f"{scenario.warmup * scenario.simulation_step:g} s"
-        values = *map(dict(scenario.facts()).__getitem__, headings[:3]), f"{scenario.horizon:,}", warmup
+        values = *map(dict(scenario.summary()).__getitem__, headings[:3]), f"{scenario.horizon:,}", warmup
         if console.width >= MIN_TABLE_WIDTH:
             table.add_row(key, *values)
             continue

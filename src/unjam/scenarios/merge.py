@@ -151,7 +151,7 @@ class Merge(Scenario):
         """Return the ids that the vehicles of the highway have as CAVs."""
         return tuple(f"cav_{index}" for index in range(len(self._entry_times(self.inflow))))
 
-    def _fact_values(self) -> tuple[str, str, str, str]:
+    def _summary_texts(self) -> tuple[str, str, str, str]:
         cavs = f"{self.cavs} CAV" if self.cavs is not None else f"{100 * self.penetration_rate:g} % CAV"
         vehicles = f"{self.inflow:g} + {self.ramp_flow:g} veh/h ({cavs})"
         reason = "the mean speed of undisturbed traffic on the highway"

@@ -321,7 +321,7 @@ class Motorway(Scenario):
 
     @property
     def human_description(self) -> str:
-        """How human drivers drive, as one phrase."""
+        """The model of the human drivers, as one phrase."""
         model = f"as {self.population_description}" if self.driver_population else self.car_following
         return f"{HUMAN_TYPE_COUNT} different human drivers, {model}, with SUMO's lane changes"
 
@@ -329,7 +329,7 @@ class Motorway(Scenario):
         """Return the ids of all vehicles: each can be a CAV."""
         return tuple(f"vehicle_{index}" for index in range(int(self.max_vehicles)))
 
-    def _fact_values(self) -> tuple[str, str, str, str]:
+    def _summary_texts(self) -> tuple[str, str, str, str]:
         lanes = "one lane" if self.lanes == 1 else f"{self.lanes} lanes"
         ramps = {0: "without ramps", 1: "with a ramp"}.get(len(self.ramps), f"with {len(self.ramps)} ramps")
         peak, off_peak = (

@@ -272,7 +272,7 @@ class Recorded(Scenario):
         part_index = int(generator.integers(len(parts)))
         return {"file": float(file_index), "part": float(part_index)}, parts[part_index]
 
-    def _fact_values(self) -> tuple[str, str, str, str]:
+    def _summary_texts(self) -> tuple[str, str, str, str]:
         source = f"recordings of {self.recordings}" if self.recordings else "artificial waves"
         road = f"one lane behind a vehicle with the speeds of {source}"
         return road, f"{len(self.vehicle_kinds)} ({self.cavs} CAV)", "that vehicle's", "the mean speed of that vehicle"

@@ -131,7 +131,7 @@ class LoopScenario(Scenario):
         """Return the ids of the CAVs, in their order along the road."""
         return tuple(vehicle_id for vehicle_id in self._vehicle_ids() if vehicle_id.startswith("cav"))
 
-    def _fact_values(self) -> tuple[str, str, str, str]:
+    def _summary_texts(self) -> tuple[str, str, str, str]:
         sizes = dict.fromkeys(self._size_range)
         road = self.description.format("-".join(map(str, sizes)))
         speeds = "-".join(f"{self.limit_speed(size):.2f}" for size in sizes)

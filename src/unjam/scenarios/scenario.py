@@ -1,4 +1,4 @@
-"""What all scenarios share: the settings of a road's traffic, how an episode starts and when it ends."""
+"""The base class of all scenarios: settings of traffic, of CAVs, and of the start and the end of an episode."""
 
 import sys
 from collections.abc import Sequence
@@ -36,9 +36,9 @@ from unjam.scenarios.road_checks import check_road
 from unjam.text import format_count
 
 UNLIMITED_ACCELERATION = 20.0
-"""acceleration limit of a CAV's vehicle type in SUMO [m/s2]: far above any command, so that only safety clips"""
+"""acceleration limit of a CAV's vehicle type in SUMO [m/s2], above all commands: only safety checks limit them"""
 VEHICLE_LENGTH = 5.0
-"""length of every vehicle [m]"""
+"""default length of vehicles [m]"""
 SUMO_ACCELERATION = 2.6
 """acceleration limit of commanded human drivers and of cars [m/s2], SUMO's default"""
 MIN_CAV_GAP = 0.5
@@ -48,11 +48,11 @@ MIN_SET_SPEED = 0.1
 IDM_SUBSTEP = 0.25
 """approximate length of the steps into which SUMO's IDM divides a simulation step [s]"""
 MAX_HORIZON = 10_000_000
-"""control steps of the longest episode: twelve days of 0.1 s; more would fill the memory"""
+"""control steps of the longest episode, twelve days of 0.1 s; a longer one would fill the memory"""
 MAX_EPISODE_STEPS = 10 * MAX_HORIZON
 """simulation steps of the longest episode"""
 MAX_EPISODE_VEHICLES, MAX_EPISODE_DISTANCE = 1_000_000, 1_000_000_000
-"""most vehicles that want to drive in an episode, and longest distance that the fastest could drive [m]"""
+"""maximum number of vehicles that want to enter in an episode, and maximum distance at top speed [m]"""
 
 Actuation = Literal["shielded", "raw", "flow", "cruise"]
 HumanControl = Literal["native", "commanded"]
@@ -60,10 +60,10 @@ HumanControl = Literal["native", "commanded"]
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class CruiseControl(Subclassable):
-    """A CAV's own ACC, an IDM as SUMO computes it, and its motivation to change lanes.
+    """A CAV's own ACC, which is SUMO's IDM, and the CAV's motivation to change lanes.
 
-    Weak acceleration, not a long time gap, makes an ACC worse than human drivers. With 1 s its time gap falls below
-    0.8 s at times.
+    An ACC is worse than human drivers if its acceleration is low, not if its time gap is long. With a setting of 1 s,
+    the time gap sometimes falls below 0.8 s.
     """
 
     time_gap: Positive = 1.1
@@ -75,11 +75,11 @@ class CruiseControl(Subclassable):
     minimum_gap: Positive = 2.0
     """gap to a standing leader [m]"""
     keep_right: NonNegative | None = None
-    """eagerness to keep right; None: that of the vehicle, mostly 1; 0: none"""
+    """eagerness to keep right; None: that of the replaced vehicle, mostly 1; 0: none"""
     speed_gain: NonNegative | None = None
-    """eagerness to change lanes for a higher speed, likewise"""
+    """eagerness to change lanes for a higher speed; None: that of the replaced vehicle"""
     cooperation: Annotated[float, Field(ge=0, le=1)] | None = None
-    """willingness to change lanes and to slow down for vehicles that must change lanes, likewise"""
+    """willingness to change lanes and slow down for mandatory lane changes; None: that of the replaced vehicle"""
 
     def set_speed(
         self,
@@ -89,11 +89,16 @@ class CruiseControl(Subclassable):
         step: float,
         vehicle_limits: tuple[Array, Array] | None = None,
     ) -> Array:
-        """Return the set speed with which the ACC accelerates as commanded on a free road [m/s]; arrays (n,).
+        """Return the set speed with which the ACC accelerates as commanded on a free road [m/s], shape (n,).
 
-        It is infinite where the command is `max_acceleration` [m/s2]: then there is no cap. `target_speed` is that
-        after a `step` [s]; `vehicle_limits` are acceleration and comfortable deceleration for an ACC without its own
-        [m/s2].
+        The set speed is infinite where the command reaches `max_acceleration` or the acceleration of the ACC.
+
+        Args:
+            speed: current speeds [m/s], shape (n,).
+            target_speed: commanded speeds after a step [m/s], shape (n,).
+            max_acceleration: largest acceleration that a CAV can command [m/s2].
+            step: simulation step [s].
+            vehicle_limits: acceleration and comfortable deceleration of an ACC for which the settings are None [m/s2].
         """
         xp, command = namespace(speed), (target_speed - speed) / step
         vehicle_acceleration, vehicle_deceleration = vehicle_limits or (0.0, 0.0)
@@ -102,17 +107,17 @@ class CruiseControl(Subclassable):
         is_capped = command < clamp_max(acceleration, max_acceleration) - 1e-6
         acc = IDMArrays(0.0, self.time_gap, acceleration, deceleration, IDMParameters().exponent, self.minimum_gap)
         desired = desired_speed_from_acceleration(xp.where(is_capped, command, 0.0 * command), speed, acc)
-        rising = clamp_min(xp.maximum(target_speed, desired), MIN_SET_SPEED)
-        # SUMO's IDM overshoots low set speeds within a step, brakes, and may then stand forever.
+        set_speed = clamp_min(xp.maximum(target_speed, desired), MIN_SET_SPEED)
+        # SUMO's IDM overshoots a low set speed within a step, brakes, and may then stand forever.
         substeps = max(1, int(step / IDM_SUBSTEP + 0.5))
-        speed_after, steady = speed, 2.0 * acceleration * step / substeps
-        acc = acc._replace(desired_speed=rising)
+        next_speeds, min_rising_speed = speed, 2.0 * acceleration * step / substeps
+        acc = acc._replace(desired_speed=set_speed)
         for _ in range(substeps):
-            acceleration_now = idm_acceleration(speed_after, speed_after, inf, acc)
-            speed_after = next_speed(speed_after, acceleration_now, step / substeps)
-        rising = xp.where(speed_after <= speed, clamp_min(rising, steady), rising)
-        capped = clamp_min(xp.where(command <= 0.0, target_speed, rising), MIN_SET_SPEED)
-        return xp.where(is_capped, capped, 0.0 * capped + inf)
+            substep_acceleration = idm_acceleration(next_speeds, next_speeds, inf, acc)
+            next_speeds = next_speed(next_speeds, substep_acceleration, step / substeps)
+        set_speed = xp.where(next_speeds <= speed, clamp_min(set_speed, min_rising_speed), set_speed)
+        set_speed = clamp_min(xp.where(command <= 0.0, target_speed, set_speed), MIN_SET_SPEED)
+        return xp.where(is_capped, set_speed, 0.0 * set_speed + inf)
 
 
 def check_milliseconds(step: float) -> float:
@@ -129,18 +134,18 @@ Horizon = Annotated[PositiveInt, Field(le=MAX_HORIZON)]
 
 
 def sumo_seed(seed: Sequence[int]) -> int:
-    """Return the value of SUMO's option `--seed` in the episode of a seed."""
+    """Return the value of SUMO's option `--seed` in the episode with this seed."""
     return int(_spawn_seeds(seed)[3].generate_state(1)[0]) % 2**31
 
 
 def _spawn_seeds(seed: Sequence[int]) -> list[np.random.SeedSequence]:
-    """Return the seeds of road, noise, exploration, simulator and sensors."""
+    """Return the seeds of road, noise, exploration, simulator and sensors of an episode."""
     return np.random.SeedSequence(list(seed)).spawn(5)
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class Scenario(Subclassable):
-    """The settings that all scenarios share; each kind of road adds its own."""
+    """The settings that all scenarios share; each kind of road adds settings."""
 
     title: ClassVar[str]
     reward: ClassVar[str]
@@ -152,11 +157,11 @@ class Scenario(Subclassable):
     road_model: ClassVar[str] = ""
     """world model of the whole road, a key of `unjam.models.registry`; empty: none"""
     has_route_position: ClassVar[bool] = True
-    """whether vehicles have a position along the road"""
+    """whether vehicles have a position along a common route"""
     has_vehicle_types: ClassVar[bool] = False
     """whether the user defines vehicle types; a CAV keeps the properties of its type"""
     reads_user_files: ClassVar[bool] = False
-    """whether the road is made of the user's own SUMO files, which are simulated in a sandbox"""
+    """whether the road consists of SUMO files of the user, which are simulated in a sandbox"""
     sumo_human_gap: ClassVar[float] = 0.0
     """gap that SUMO keeps for commanded human drivers [m]"""
 
@@ -167,57 +172,57 @@ class Scenario(Subclassable):
     horizon: Horizon = 3000
     """control steps in an episode"""
     warmup: NonNegativeInt = 0
-    """simulation steps with human drivers alone, before the CAVs take over"""
+    """human-only simulation steps before the drivers of the CAVs take over"""
     remember_warmup: bool = True
-    """whether a driver's memory includes the warm-up, which it observed but did not drive"""
+    """whether the memory of a driver includes observations of the warm-up"""
     action_limit: Positive = 1.0
     """largest acceleration that a CAV can command, in either direction [m/s2]"""
     actuation: Actuation = "shielded"
-    """how SUMO carries out a CAV's command: `shielded` exactly until it is unsafe, then SUMO brakes, and the override
-    is counted; `raw` exactly, and a collision ends the episode; `flow`, as in Flow, limited by SUMO's human model;
-    `cruise` limited by the CAV's own ACC, which keeps its distance: commands only reduce its set speed. `cruise`
-    suits roads with several lanes, where SUMO makes room for vehicles that change lanes"""
+    """how SUMO carries out the commands of a CAV. `shielded`: exactly, but SUMO brakes if a command is unsafe, and the
+    override is counted; `raw`: exactly, and a collision ends the episode; `flow`: limited by SUMO's human model, as in
+    Flow; `cruise`: the CAV's own ACC keeps the distance, and commands only reduce its set speed, which suits roads with
+    several lanes, where SUMO makes room for vehicles that change lanes"""
     cruise: CruiseControl = field(default_factory=CruiseControl)
-    """the CAV's own ACC, for `cruise`"""
+    """the CAV's own ACC, used with the actuation `cruise`"""
     safety: SafetyFilter = field(default_factory=SafetyFilter)
-    """the filter between driver and road, of every CAV, in every simulation step"""
+    """safety filter of each CAV, which checks commands in every simulation step"""
     actuator: Actuator = field(default_factory=Actuator)
-    """delay with which a CAV follows its commands"""
+    """delay and lag of a CAV's response to commands"""
     sensors: Sensors = field(default_factory=Sensors)
-    """errors with which a CAV measures its neighbors"""
+    """measurement errors of a CAV's sensors"""
     enforce_human_limits: bool = True
-    """whether commanded human drivers respect the limits of brakes and engine, in an emergency too"""
+    """whether the limits of brakes and engine also apply to commanded human drivers in an emergency"""
     humans: IDMParameters = field(default_factory=IDMParameters)
     """parameters of human drivers"""
     population: str = ""
     """calibrated human drivers: a file of `unjam fit-drivers`, `unjam:ngsim` or `unjam:astazero`; empty: `humans`"""
     human_control: HumanControl = "native"
-    """computation of the motion of human drivers: `native` SUMO's own IDM plus noise on its speeds; `commanded`
-    the same IDM and noise as a speed command in every step, as in Flow, on top of a quicker model of SUMO that keeps
-    vehicles safe and obeys the right of way. SUMO's IDM with the paper's parameters is too timid where roads cross"""
+    """computation of the motion of human drivers. `native`: SUMO's own IDM with noise on its speeds; `commanded`: the
+    same IDM and noise as a speed command in every step, as in Flow, while another model of SUMO keeps vehicles safe and
+    obeys the right of way. With the paper's parameters, SUMO's own IDM hardly enters crossings"""
     right_of_way: bool = True
-    """whether vehicles obey the right of way where roads meet; if not, SUMO only prevents collisions"""
+    """whether vehicles obey the right of way where roads meet; otherwise SUMO only prevents collisions"""
     impatience: Annotated[float, Field(ge=0, le=1)] = 0.0
     """readiness of vehicles that must yield to accept a gap in crossing traffic (SUMO's `impatience`)"""
     noise: NonNegative = 0.2
     """standard deviation of the acceleration noise of human drivers [m/s2]"""
     noise_scaling: Literal["sqrt-step", "none"] = "sqrt-step"
-    """`sqrt-step`: the noise of a step is `noise` times the square root of its duration, as in Flow; `none`: it is
-    `noise`, as Table B1 of the paper reads"""
+    """standard deviation of the noise in a step. `sqrt-step`: `noise` times the square root of the step's duration, as
+    in Flow; `none`: `noise`, as in Table B1 of the paper"""
     emission_class: str = "HBEFA4/PC_petrol_Euro-6ab"
-    """SUMO's emission class of every vehicle, for fuel"""
+    """SUMO's emission class of all vehicles, which determines fuel"""
 
     @model_validator(mode="after")
-    def _check_parts(self) -> Self:
+    def _check_nested_settings(self) -> Self:
         for parameter in fields(self):
             value = getattr(self, parameter.name)
-            for part in value if isinstance(value, tuple) else (value,):
-                check_part(f"scenario {type(self).__name__}.{parameter.name}", part)
+            for settings in value if isinstance(value, tuple) else (value,):
+                check_part(f"scenario {type(self).__name__}.{parameter.name}", settings)
         return self
 
     @model_validator(mode="after")
     def _check_extent(self) -> Self:
-        """Refuse episodes that would take years, or more vehicles than fit into memory."""
+        """Raise `ValueError` for episodes that would take years or need too much memory."""
         steps = self.warmup + self.horizon * self.steps_per_control_step
         for name, value, largest in (
             ("steps_per_control_step, warmup", steps, MAX_EPISODE_STEPS),
@@ -235,9 +240,9 @@ class Scenario(Subclassable):
                 raise ValueError(f"cruise.{name}: None is not allowed on {self.title}; allowed: > 0")
         self.actuator.check_step(self.simulation_step)
         for name in ("gap_error", "speed_error"):
-            known, largest = getattr(self.safety, name), getattr(self.sensors, name)
-            if self.safety.active and known < largest:
-                raise ValueError(f"safety.{name}: {known:g} is not allowed; allowed: >= sensors.{name}, {largest:g}")
+            assumed, actual = getattr(self.safety, name), getattr(self.sensors, name)
+            if self.safety.active and assumed < actual:
+                raise ValueError(f"safety.{name}: {assumed:g} is not allowed; allowed: >= sensors.{name}, {actual:g}")
         return self
 
     @property
@@ -247,32 +252,32 @@ class Scenario(Subclassable):
 
     @property
     def max_leader_speed(self) -> float:
-        """Largest speed of recorded vehicles that others follow [m/s]; 0 without any."""
+        """Largest speed of the recorded vehicles [m/s]; 0 without recorded vehicles."""
         return 0.0
 
     @property
     def user_files(self) -> list[Path]:
-        """Files with data that episodes depend on, apart from the code of a user's class."""
+        """Data files that episodes depend on, without the Python file of a user's class."""
         return [population_file(self.population)] if self.population else []
 
     @property
     def interface(self) -> RoadInterface:
-        """What it provides to drivers."""
+        """The properties of this road that drivers may require."""
         fields = frozenset(self.provided_fields)
         return RoadInterface(self.title, self.is_closed, self.has_route_position, fields, self.control_step)
 
     def plain_sumo_command(self, seed: int) -> str:
-        """Return the command by which plain SUMO has the same traffic without CAVs; empty on built-in roads."""
+        """Return a command that runs the same traffic without CAVs in plain SUMO; empty on built-in roads."""
         return ""
 
     @property
     def notes(self) -> list[str]:
-        """What a user must know about this road in addition to the results."""
+        """Notes on this road for users, shown with results."""
         return []
 
     @property
     def training_notes(self) -> list[str]:
-        """What a user must know about the results of a training on this road."""
+        """Notes for users on the results of a training on this road."""
         return []
 
     @property
@@ -287,7 +292,7 @@ class Scenario(Subclassable):
 
     @property
     def cav_max_braking(self) -> float:
-        """Strongest braking of a CAV [m/s2]: that of a car's brakes if the safety filter is active."""
+        """Strongest braking of a CAV [m/s2]; an active safety filter limits it to that of a car's brakes."""
         return self.safety.braking if self.safety.active else UNLIMITED_ACCELERATION
 
     @property
@@ -297,12 +302,12 @@ class Scenario(Subclassable):
 
     @property
     def max_vehicles(self) -> float:
-        """Number of vehicles that want to drive in an episode, as far as the settings alone say; 0: unknown."""
+        """Number of vehicles that want to enter in an episode, according to the settings; 0: unknown."""
         return 0.0
 
     @property
     def max_episode_steps(self) -> int:
-        """Most control steps of an episode; fewer than the horizon if the road ends it earlier."""
+        """Maximum number of control steps of an episode; below the horizon if the road ends the episode earlier."""
         return self.horizon
 
     @property
@@ -312,7 +317,7 @@ class Scenario(Subclassable):
 
     @cached_property
     def driver_population(self) -> Population | None:
-        """The human drivers of `population`, read once."""
+        """The human drivers of the file `population`."""
         return read_population(self.population) if self.population else None
 
     @property
@@ -322,17 +327,19 @@ class Scenario(Subclassable):
         return population.max_desired_speed if population else self.humans.desired_speed
 
     def check_native_humans(self, context: str) -> None:
-        """Raise `ValueError` unless SUMO itself can drive the human drivers, as it must on this road, `context`."""
+        """Raise `ValueError` unless SUMO can simulate the human drivers itself; messages name the road, `context`."""
         if self.driver_population and self.driver_population.residual is not None:
-            reason = "SUMO's own IDM drives them there"
-            raise ValueError(f"population: one with a residual network is not allowed {context}: {reason}")
+            reason = "SUMO computes the motion of human drivers itself"
+            raise ValueError(f"population: a residual network is not allowed {context}: {reason}")
         if self.human_control != "native":
             raise ValueError(f"human_control: 'commanded' is not allowed {context}; allowed: 'native'")
 
-    def draw_humans(self, names: Sequence[str], generator: np.random.Generator) -> dict[str, IDMParameters]:
-        """Return the parameters of each vehicle's human driver; empty if all drive as `humans` says."""
+    def draw_humans(self, vehicle_ids: Sequence[str], generator: np.random.Generator) -> dict[str, IDMParameters]:
+        """Return the parameters of the human driver of each vehicle; empty if all drivers have those of `humans`."""
         population = self.driver_population
-        return dict(zip(names, population.draw(len(names), generator), strict=True)) if population else {}
+        if population is None:
+            return {}
+        return dict(zip(vehicle_ids, population.draw(len(vehicle_ids), generator), strict=True))
 
     @property
     def population_description(self) -> str:
@@ -342,17 +349,17 @@ class Scenario(Subclassable):
 
     @property
     def human_description(self) -> str:
-        """How human drivers drive, as one phrase."""
+        """The model of the human drivers, as one phrase."""
         if self.driver_population:
             return self.population_description
         return f"IDM with acceleration noise of std {self.noise_per_step:.3f} m/s2 a step"
 
     def draw(self, generator: np.random.Generator) -> Road:
-        """Return the road of one episode; everything random about it comes from `generator`."""
+        """Return the road of one episode; all random draws come from `generator`."""
         raise NotImplementedError
 
     def scale_drawn_values(self, drawn_values: dict[str, float]) -> tuple[float, ...]:
-        """Return the drawn values of an episode, each scaled to [-1, 1] over its range: inputs of a critic."""
+        """Return the drawn values of an episode as inputs of a critic, scaled from their ranges to [-1, 1]."""
         return tuple(
             (drawn_values[name] - (low + high) / 2) / max((high - low) / 2, 1e-9)
             for name, (low, high) in self.drawn_ranges.items()
@@ -364,27 +371,28 @@ class Scenario(Subclassable):
         return {}
 
     def stratum(self, index: int, count: int) -> Self:
-        """Return this scenario with one of `count` parts of its drawn ranges: few episodes cover all of them evenly."""
+        """Return this scenario with part `index` of `count` parts of its drawn ranges, for stratified sampling."""
         return self
 
     def draw_from_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
         """Return the road of an episode's seed, and the seeds of noise, exploration, simulator and sensors."""
-        road, *other_seeds = _spawn_seeds(seed)
-        kind, generator = type(self), np.random.default_rng(road)
+        road_seed, *other_seeds = _spawn_seeds(seed)
+        kind, generator = type(self), np.random.default_rng(road_seed)
         if is_packaged(kind):
             return self.draw(generator), other_seeds
         file = getattr(sys.modules.get(kind.__module__), "__file__", None) or ""
-        drawn = UserFunction(self.draw, kind.__name__, file)(generator)  # an error is reported with its line
-        check_road(drawn, VEHICLE_LENGTH, kind.__name__)
-        return drawn, other_seeds
+        road = UserFunction(self.draw, kind.__name__, file)(generator)  # reports errors with their line
+        check_road(road, VEHICLE_LENGTH, kind.__name__)
+        return road, other_seeds
 
     def possible_cav_ids(self) -> tuple[str, ...]:
-        """Return the ids of all CAVs that an episode can have."""
+        """Return the ids of all possible CAVs of an episode."""
         raise NotImplementedError
 
-    def facts(self) -> list[tuple[str, str]]:
-        """Return a description of this road for `unjam scenarios`, as (name, value) pairs."""
-        return list(zip(("road", "vehicles", "limit", "limit is"), self._fact_values(), strict=True))
+    def summary(self) -> list[tuple[str, str]]:
+        """Return a description of this road for `unjam scenarios`, as (name, text) pairs."""
+        return list(zip(("road", "vehicles", "limit", "limit is"), self._summary_texts(), strict=True))
 
-    def _fact_values(self) -> tuple[str, str, str, str]:
+    def _summary_texts(self) -> tuple[str, str, str, str]:
+        """Return texts on the road, its vehicles, its limit speed, and the definition of the limit speed."""
         raise NotImplementedError

@@ -23,13 +23,13 @@ from unjam.sumo_files.reader import CAV_TYPE_TEMPLATE
 from unjam.text import shorten_list
 
 DEFAULT_DURATION = 3600.0
-"""duration of an episode if the configuration has no end [s]"""
+"""duration of an episode if the configuration defines no end [s]"""
 PASSENGER_CLASS = "passenger"
-"""the vehicle class of calibrated human drivers: SUMO's default"""
+"""SUMO's default vehicle class, to which calibrated human drivers belong"""
 PASSENGER_CAR_CLASSES = (PASSENGER_CLASS, "private", "hov", "taxi", "evehicle")
 """SUMO's vehicle classes that are passenger cars"""
 UNFINISHED_TRIPS_OPTIONS = "--tripinfo-output.write-unfinished", "--tripinfo-output.write-undeparted"
-"""options by which SUMO also writes the trips of vehicles that are under way or waiting at the end"""
+"""options with which SUMO also writes the trips of vehicles that are under way or waiting at the end"""
 NON_ROAD_CLASSES = ("rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car")
 NON_ROAD_CLASSES += ("ship", "aircraft", "drone", "pedestrian", "wheelchair", "container")
 """SUMO's vehicle classes that are not road vehicles"""
@@ -39,20 +39,20 @@ ROAD_CLASSES = (
 )
 """SUMO's vehicle classes that can become CAVs"""
 PLAIN_SUMO_VALUES = {"random": "false", "max-depart-delay": "-1"}
-"""values of replaced options with which plain SUMO has the same traffic"""
+"""values of replaced options with which plain SUMO simulates the same traffic"""
 DEFAULT_PENETRATION_RATE = 0.1
 """used if neither a rate nor vehicle types are set"""
 DRIVERS_PER_EPISODE = 100
 """calibrated human drivers of an episode, drawn from the population"""
 ACC_SETTINGS: dict[str, Any] = {"actuation": "cruise", "safety.active": False}
-"""CAVs have an ACC that follows and makes room for vehicles that change lanes; drivers only reduce its set speed"""
+"""settings of CAVs with an ACC, the set speed of which drivers can only reduce"""
 MAX_LOGGED_NAMES, MAX_NOTED_NAMES, MAX_NAME_LETTERS = 8, 200, 60
-"""largest number of options and elements that a line of the log names, and that a note names, and of letters of each"""
+"""maximum number of names in a line of the log and in a note, and of letters of a name"""
 DEVICE_SHARE = re.compile(r"(person-)?device\..*\.probability")
 DROPPED_DEVICE_SHARE = re.compile(rf"option {DEVICE_SHARE.pattern}")
-"""options, and items left out, by which SUMO draws the vehicles that have a device, all from one random sequence"""
+"""options and dropped items with the share of vehicles that have a device; SUMO draws them from one random sequence"""
 OPERATOR_SETTINGS = "speed_limit_control", "ramp_meter"
-"""settings of built-in motorways for what their operator does"""
+"""settings for the operator of built-in motorways"""
 ALTERNATIVES = (
     "allowed here: a fixed speed of CAVs (-d advisory-speed:advised_speed=20), or a variable speed sign or a signal in "
     "your own files"
@@ -62,12 +62,12 @@ _LOGGER = logging.getLogger(__name__)
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class UserNetwork(Scenario):
-    """A network of the user, from its .sumocfg file; human drivers drive as its vehicle types say.
+    """A network of the user, from its .sumocfg file; its vehicle types define the human drivers.
 
     Roads with several lanes, traffic lights, and routes that end are supported. A vehicle becomes a CAV at the first
-    control step after its entry; SUMO still chooses its lane and obeys traffic lights. Its neighbors are those that
-    SUMO reports. Collisions are what SUMO counts with the user's settings. A collision with a CAV ends an episode in
-    training, and SUMO's `max-num-teleports` always ends it.
+    control step after its entry; SUMO still chooses its lane and obeys traffic lights. SUMO reports the neighbors of a
+    CAV, and counts collisions with the user's settings. In training, an episode ends with a collision of a CAV. SUMO's
+    limit `max-num-teleports` ends all episodes.
     """
 
     title: ClassVar[str] = "user-network"
@@ -82,21 +82,21 @@ class UserNetwork(Scenario):
     penetration_rate: Annotated[float, Field(ge=0, le=1)] = 0.0
     """share of the vehicles of `cav_classes` that become CAVs"""
     cav_types: tuple[str, ...] = ()
-    """vehicle types of which all vehicles become CAVs, whatever their class"""
+    """vehicle types of which all vehicles become CAVs, independent of their class"""
     cav_classes: tuple[str, ...] = PASSENGER_CAR_CLASSES
     """SUMO's vehicle classes to which the penetration rate applies"""
     cruise: CruiseControl = field(default_factory=lambda: CruiseControl(acceleration=None, deceleration=None))
-    """the CAV's own ACC; by default it has the acceleration limits of its vehicle"""
+    """the CAV's own ACC, by default with the acceleration limits of its vehicle"""
     cavs: PositiveInt | None = None
     """maximum number of CAVs: the first that enter"""
     begin: NonNegative | None = None
-    """begin of the simulation [s]; None: as its configuration says. Vehicles that depart earlier are left out"""
+    """begin of the simulation [s]; None: that of the configuration. Vehicles that depart earlier are left out"""
     end: Positive | None = None
-    """end of an episode, if no horizon is given [s]; None: as its configuration says"""
+    """end of an episode, if no horizon is set [s]; None: that of the configuration"""
     roadside: RoadsideSettings = field(default_factory=RoadsideSettings)
-    """latency and smoothing of the speeds ahead that CAVs receive"""
+    """latency and smoothing of the speeds of traffic ahead that CAVs receive"""
     noise: Annotated[float, Field(ge=0, le=0)] = 0.0
-    """always 0: human drivers drive as their vehicle types say"""
+    """always 0: the vehicle types define the human drivers"""
 
     @model_validator(mode="after")
     def _check_settings(self) -> Self:
@@ -107,7 +107,7 @@ class UserNetwork(Scenario):
         used = ", ".join(sorted(files.used_types))
         for name in files.types:
             if (cav_type := CAV_TYPE_TEMPLATE.format(name)) in files.types:
-                reason = f"CAVs of type {name!r} have this name"
+                reason = f"the type of CAVs that replace {name!r} has this name"
                 raise ValueError(f"file: the vehicle type {cav_type!r} is not allowed: {reason}")
         if self.roadside.source != "vehicles":
             raise ValueError(f"roadside.source: {self.roadside.source!r} is not allowed here; allowed: 'vehicles'")
@@ -125,7 +125,7 @@ class UserNetwork(Scenario):
         if not self.cav_types and not self.eligible_types(files):
             raise ValueError(
                 f"penetration_rate: no vehicle has one of the classes {', '.join(self.cav_classes)}; its types are "
-                f"{_format_types(files, files.used_types)}; name cav_classes or cav_types"
+                f"{_format_types(files, files.used_types)}; set cav_classes or cav_types"
             )
         if self.emission_class != type(self).emission_class:
             raise ValueError("emission_class: it is not allowed on a user network: its vehicle types define it")
@@ -136,7 +136,7 @@ class UserNetwork(Scenario):
 
     @property
     def user_files(self) -> list[Path]:
-        """The files of the network and of its traffic, and that of calibrated drivers."""
+        """The files of the network, of its traffic, and of calibrated drivers."""
         return [*read_sumo_files(Path(self.file)).sources, *super().user_files]
 
     @property
@@ -168,19 +168,19 @@ class UserNetwork(Scenario):
         )
 
     def check_vehicles(self, has_entered: bool | None = None, warnings: Sequence[str] = ()) -> None:
-        """Raise `InputError` if no vehicle enters, by the first departure or a whole episode (`has_entered`)."""
+        """Raise `InputError` if no vehicle enters, by an episode (`has_entered`) or else by the first departure."""
         files = read_sumo_files(Path(self.file))
-        begin, first = self._begin(files), files.first_departure
-        end = self._end(files)
-        none = f"no vehicle entered before {_format_time(end)}"
-        if has_entered or (has_entered is None and (first is None or first < end)):
+        begin, end, departure = self._begin(files), self._end(files), files.first_departure
+        message = f"no vehicle entered before {_format_time(end)}"
+        if has_entered or (has_entered is None and (departure is None or departure < end)):
             return
-        if first is None or begin <= first < end:
-            depart = "" if first is None else f", though the first departs at {_format_time(first)}"
-            raise InputError("; ".join([none + depart, *warnings]))
-        is_late = files.end is not None and self.end is None and files.end <= first
-        more = f" --end {first + end - begin:g}" if is_late else ""
-        raise InputError(f"{none}; the first departs at {_format_time(first)}; use --begin {first:g}{more}")
+        if departure is None or begin <= departure < end:
+            detail = "" if departure is None else f", though the first departs at {_format_time(departure)}"
+            raise InputError("; ".join([message + detail, *warnings]))
+        is_late = files.end is not None and self.end is None and files.end <= departure
+        end_option = f" --end {departure + end - begin:g}" if is_late else ""
+        hint = f"use --begin {departure:g}{end_option}"
+        raise InputError(f"{message}; the first departs at {_format_time(departure)}; {hint}")
 
     def _begin(self, files: SumoFiles) -> float:
         return files.begin if self.begin is None else self.begin
@@ -189,25 +189,25 @@ class UserNetwork(Scenario):
         return self._begin(files) + self._time_before_control + self.horizon * self.control_step
 
     def _has_same_end(self, files: SumoFiles) -> bool:
-        """Return whether an episode ends with the configuration: SUMO ends with the first step that reaches its end."""
+        """Return whether an episode ends with the configuration, with the first step that reaches the end."""
         end = self._end(files)
         return files.end is not None and -1e-6 < end - files.end < self.simulation_step - 1e-6
 
     def _end_of_flows(self, files: SumoFiles) -> float:
-        """Return until when flows without an end last: to that of the configuration, and at least to the horizon."""
+        """Return the end of flows that define none: that of the configuration, but not before the horizon [s]."""
         end = self._end(files)
         return end if files.end is None else max(files.end, end)
 
     @property
     def _time_before_control(self) -> float:
-        """Warm-up, and the step in which SUMO inserts the first vehicles [s]."""
+        """Duration of the warm-up and of the step in which SUMO inserts the first vehicles [s]."""
         return (self.warmup + 1) * self.simulation_step
 
     @property
     def human_description(self) -> str:
-        """How human drivers drive, as one phrase."""
-        files = "as the vehicle types of its files say"
-        return f"in cars {super().human_description}; others {files}" if self.driver_population else files
+        """The model of the human drivers, as one phrase."""
+        others = "as the vehicle types of its files say"
+        return f"in cars {super().human_description}; others {others}" if self.driver_population else others
 
     def eligible_types(self, files: SumoFiles) -> frozenset[str]:
         """Return the used vehicle types to which the penetration rate applies."""
@@ -215,7 +215,7 @@ class UserNetwork(Scenario):
 
     @property
     def notes(self) -> list[str]:
-        """The differences from plain SUMO, and the vehicles that stay human-driven because of their class."""
+        """Notes on differences from plain SUMO, and on vehicle types that are not eligible to become CAVs."""
         files = read_sumo_files(Path(self.file))
         notes = notes_on_files(files)
         if files.has_spread_flows and files.end is not None and not self._has_same_end(files):
@@ -232,10 +232,10 @@ class UserNetwork(Scenario):
         return notes
 
     def plain_sumo_command(self, seed: int) -> str:
-        """Return the command by which plain SUMO has the same traffic without CAVs; empty with calibrated drivers.
+        """Return a command that runs the same traffic without CAVs in plain SUMO, or an empty text.
 
-        Its trips are those of the travel time: also of vehicles that are under way or waiting at the end. There is none
-        for a part of flows that have a number of vehicles: plain SUMO would spread them over that part.
+        The command writes the trips of which unjam measures the travel time. There is no command with calibrated
+        drivers, and none if an episode ends before flows with a number of vehicles, which plain SUMO would compress.
         """
         files, words = read_sumo_files(Path(self.file)), ["sumo", "-c", self.file, "--seed", str(seed)]
         begin, end = self._begin(files), self._end(files)
@@ -248,12 +248,12 @@ class UserNetwork(Scenario):
         return shlex.join([*words, "--tripinfo-output", "trips.xml", *UNFINISHED_TRIPS_OPTIONS])
 
     def possible_cav_ids(self) -> tuple[str, ...]:
-        """Return names for the maximum number of CAVs: only SUMO knows the ids. Raise `InputError` if there is none."""
+        """Return placeholders for the ids of CAVs, which SUMO defines; raise `InputError` without a maximum number."""
         if self.cavs is None:
             raise InputError("cavs: None is not allowed here on a user network; allowed: a maximum number")
-        return tuple(f"cav_{number}" for number in range(self.cavs))
+        return tuple(f"cav_{index}" for index in range(self.cavs))
 
-    def _fact_values(self) -> tuple[str, str, str, str]:
+    def _summary_texts(self) -> tuple[str, str, str, str]:
         classes, types = ", ".join(self.cav_classes), ", ".join(self.cav_types)
         share = f"{100 * self.penetration_rate:g} % CAV of {classes}" if self.penetration_rate else ""
         vehicles = f"as its files say ({', '.join(filter(None, (share, types)))})"
@@ -262,11 +262,11 @@ class UserNetwork(Scenario):
 
 
 def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
-    """Return the scenario of a .sumocfg file with `changes`; raise `InputError` about it before SUMO starts."""
-    for name in (setting for setting in OPERATOR_SETTINGS if setting in changes):
+    """Return the scenario of a .sumocfg file with `changes`; raise `InputError` for errors in its files."""
+    for name in filter(changes.__contains__, OPERATOR_SETTINGS):
         reason = "it is not allowed on your own network, only on motorways such as on-ramp"
         raise InputError(f"{name}: {reason}; {ALTERNATIVES}")
-    files = read_sumo_files(Path.cwd() / file)  # not its target: SUMO finds other files next to a link
+    files = read_sumo_files(Path.cwd() / file)  # links are not resolved: SUMO looks for other files next to the link
     _log_once(*notes_on_files(files, MAX_LOGGED_NAMES))
     if isinstance(cruise := changes.get("cruise", {}), dict):
         changes = {**changes, "cruise": {"acceleration": None, "deceleration": None, **cruise}}
@@ -282,14 +282,14 @@ def load_user_network(file: str, changes: dict[str, Any]) -> UserNetwork:
 
 
 def _control_steps_until_end(files: SumoFiles, scenario: UserNetwork) -> int:
-    """Return the number of whole control steps until the end of a configuration, or of an hour, as in plain SUMO."""
+    """Return the number of control steps until the end that the scenario or its files define, by default an hour."""
     begin = scenario._begin(files)
     end = scenario.end or (begin + DEFAULT_DURATION if files.end is None else files.end)
     duration = end - begin - scenario._time_before_control
     if duration <= 0:
-        first = f"> {begin + scenario._time_before_control:g} s, the first step after begin"
-        raise invalid_value("end", end, first + (" and the warm-up" if scenario.warmup else ""))
-    steps = ceil(duration / scenario.simulation_step - 1e-9)  # SUMO's last step may pass its end
+        allowed = f"> {begin + scenario._time_before_control:g} s, the first step after begin"
+        raise invalid_value("end", end, allowed + (" and the warm-up" if scenario.warmup else ""))
+    steps = ceil(duration / scenario.simulation_step - 1e-9)  # the last step of SUMO may exceed the end
     return max(1, steps // scenario.steps_per_control_step)
 
 
@@ -298,13 +298,14 @@ def _format_time(time: float) -> str:
 
 
 def notes_on_files(files: SumoFiles, max_names: int = MAX_NOTED_NAMES) -> list[str]:
-    """Return the differences between an episode and what plain SUMO would make of the files, one line each."""
-    lists = files.dropped_items, files.replaced_options
-    dropped, replaced = (shorten_list(names, max_names, MAX_NAME_LETTERS) for names in lists)
+    """Return a note on each difference between an episode and a run of the files in plain SUMO."""
+    dropped = shorten_list(files.dropped_items, max_names, MAX_NAME_LETTERS)
+    replaced = shorten_list(files.replaced_options, max_names, MAX_NAME_LETTERS)
     notes = [f"{files.path.name}: left out because they only write or listen: {dropped}"] if dropped else []
     notes += [f"{files.path.name}: replaced by values of unjam: {replaced}"] if replaced else []
-    shares = (DEVICE_SHARE, files.options), (DROPPED_DEVICE_SHARE, files.dropped_items)
-    if all(any(map(pattern.fullmatch, names)) for pattern, names in shares):
+    if any(map(DEVICE_SHARE.fullmatch, files.options)) and any(
+        map(DROPPED_DEVICE_SHARE.fullmatch, files.dropped_items)
+    ):
         notes.append(f"{files.path.name}: without the devices left out, SUMO equips other vehicles with the rest")
     if files.has_bicycle_lanes:
         notes.append(
@@ -321,24 +322,24 @@ def _log_once(*notes: str) -> None:
 
 
 def road_types(files: SumoFiles) -> list[str]:
-    """Return the used vehicle types that are road vehicles, sorted."""
+    """Return the sorted names of the used vehicle types that are road vehicles."""
     return sorted(name for name in files.used_types if is_road_vehicle(files, name))
 
 
 def passenger_types(files: SumoFiles) -> list[str]:
-    """Return the used types of passenger cars, SUMO's default class, sorted."""
+    """Return the sorted names of the used vehicle types of SUMO's default class, passenger cars."""
     return [name for name in road_types(files) if vehicle_class(files, name) == PASSENGER_CLASS]
 
 
-def vehicle_class(files: SumoFiles, name: str) -> str:
+def vehicle_class(files: SumoFiles, type_name: str) -> str:
     """Return SUMO's vehicle class of a type; the default is the passenger car."""
-    return files.types.get(name, {}).get("vClass", PASSENGER_CLASS)
+    return files.types.get(type_name, {}).get("vClass", PASSENGER_CLASS)
 
 
-def is_road_vehicle(files: SumoFiles, name: str) -> bool:
+def is_road_vehicle(files: SumoFiles, type_name: str) -> bool:
     """Return whether vehicles of a type are road vehicles: not trains, ships, aircraft or pedestrians."""
-    is_train = files.types.get(name, {}).get("carFollowModel") == "Rail"
-    return vehicle_class(files, name) not in NON_ROAD_CLASSES and not is_train
+    is_train = files.types.get(type_name, {}).get("carFollowModel") == "Rail"
+    return vehicle_class(files, type_name) not in NON_ROAD_CLASSES and not is_train
 
 
 def _format_types(files: SumoFiles, names: Collection[str]) -> str:

@@ -1,6 +1,6 @@
-"""The user's own scenarios: classes, instances and functions in Python files, `path.py:name`, and TOML files.
+"""Scenarios of users: classes, instances and functions in Python files, `path.py:name`, and TOML files.
 
-Python files run as `unjam.user_code` says, only when the user names them. TOML files have settings alone.
+A Python file runs only if the user names it, see `unjam.user_code`. A TOML file contains settings only.
 """
 
 from inspect import isfunction
@@ -15,20 +15,20 @@ from unjam.tree import pack
 from unjam.user_code import USER_MODULE_PREFIX
 
 CODE_ENTRY = "code"
-"""entry of a recipe with path, name and hash of the user's class"""
+"""key of the path, name and hash of a user's class in a recipe"""
 _class_recipes: dict[type[Scenario], dict[str, Any]] = {}
-"""path, name and hash of the classes that Python files define"""
+"""path, name and hash of each loaded class of a user"""
 
 
-def load_python_scenario(text: str) -> Scenario:
-    """Return the scenario `path.py:name`; a class has its default settings. Raise `InputError` if it is none."""
-    scenario = _load_object(FileReference.parse(text))
-    return build_dataclass(scenario, {}, text) if isinstance(scenario, type) else scenario
+def load_python_scenario(reference: str) -> Scenario:
+    """Return the scenario `path.py:name`, of a class with its default settings; raise `InputError` if it is invalid."""
+    scenario = _load_object(FileReference.parse(reference))
+    return build_dataclass(scenario, {}, reference) if isinstance(scenario, type) else scenario
 
 
 def _load_object(reference: FileReference) -> Scenario | type[Scenario]:
-    """Return the class or instance with a name, or that of a function; a second run would make other classes."""
-    loaded, reference = reference.load_object_once()
+    """Return the class or instance that a reference names, or that a named function returns."""
+    loaded, reference = reference.load_object_once()  # a second run of the file would define other classes
     if isfunction(loaded):
         loaded = UserFunction(loaded, str(reference), str(reference.path))()
     kind: type[Any] = loaded if isinstance(loaded, type) else type(loaded)
@@ -41,7 +41,7 @@ def _load_object(reference: FileReference) -> Scenario | type[Scenario]:
 
 
 def class_recipe(kind: type[Scenario]) -> dict[str, Any]:
-    """Return path, name and hash of a class of a Python file; raise `InputError` for others, which stay here."""
+    """Return path, name and hash of a class in a Python file; raise `InputError` for a class that is not in one."""
     if kind in _class_recipes:
         return _class_recipes[kind]
     reference = object_reference(kind)
@@ -51,14 +51,14 @@ def class_recipe(kind: type[Scenario]) -> dict[str, Any]:
 
 
 def class_reference(code: Any) -> FileReference:
-    """Return the reference to the class of a recipe, with its hash; raise `InputError` if it is none."""
+    """Return the reference to the class in a recipe, with its hash; raise `InputError` if the entry is invalid."""
     if not isinstance(code, dict) or not all(code.get(key) for key in ("path", "name", "sha256")):
         raise invalid_value("scenario.code", code, "a table with path, name and sha256")
     return FileReference(Path(str(code["path"])), str(code["name"]), sha256=str(code["sha256"]))
 
 
 def load_class(code: Any) -> type[Scenario]:
-    """Return the class of a recipe; raise `InputError` if its file has changed."""
+    """Return the class in a recipe; raise `InputError` if its file has changed."""
     kind = _load_object(class_reference(code))
     return kind if isinstance(kind, type) else type(kind)
 
