@@ -161,7 +161,7 @@ def measure_scenario(scenario: Motorway, seeds: Sequence[tuple[int, ...]], worke
     """Return the facts at the last ramp of a motorway with human drivers only, one row for each seed."""
 
     def make_row(index: int, episode: Episode, metrics: dict[str, Any]) -> dict[str, Any]:
-        facts = asdict(measure_traffic(episode, scenario, ramp_number=-1))
+        facts = asdict(measure_traffic(episode, scenario, ramp_index=-1))
         return {**facts, "delay": metrics["delay"], "status": metrics["status"]}
 
     return measure_tasks([EpisodeTask(scenario, Human(), seed) for seed in seeds], workers, make_row)

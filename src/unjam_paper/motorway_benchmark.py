@@ -107,7 +107,7 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Table:
             **{"setting": setting.number, "penetration_rate": rate},
             **{name: metrics[name] for name in EPISODE_METRICS},
             "waiting_at_entrances": float(episode.backlog[1:].sum()) * episode.control_step / demand,
-            "breakdown_time": measure_traffic(episode, scenarios[index], ramp_number=-1).breakdown_time,
+            "breakdown_time": measure_traffic(episode, scenarios[index], ramp_index=-1).breakdown_time,
         }
 
     return measure_tasks(tasks, workers, make_row)

@@ -32,8 +32,8 @@ def file_of(folder: Path, *lines: str) -> Path:
 
 number = st.floats(0, 1e6)
 measurements = st.builds(
-    lambda place, position, begin, length, flow, speed: Measurement(
-        place, position, begin, begin + length, flow, speed
+    lambda location, position, begin, length, flow, speed: Measurement(
+        location, position, begin, begin + length, flow, speed
     ),
     st.from_regex(r"[A-Za-z0-9_:#.-]{1,9}", fullmatch=True),
     *(number, number, st.floats(1, 3600), st.floats(1, 1e6), number | st.just(nan)),
@@ -42,12 +42,12 @@ measurements = st.builds(
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    rows=st.lists(measurements, min_size=1, max_size=5, unique_by=lambda row: row.place),
+    rows=st.lists(measurements, min_size=1, max_size=5, unique_by=lambda row: row.location),
     kind=st.sampled_from(["edge", "lane"]),
 )
 def test_written_measurements_are_read_back(rows: list[Measurement], kind: str, tmp_path: Path) -> None:
     texts = [["" if isnan(value) else repr(value) for value in list(vars(row).values())[1:]] for row in rows]
-    lines = [",".join([row.place, *values]) for row, values in zip(rows, texts, strict=True)]
+    lines = [",".join([row.location, *values]) for row, values in zip(rows, texts, strict=True)]
     found_kind, found = read_detectors(file_of(tmp_path, ",".join((kind, *DETECTOR_COLUMNS)), *lines))
     assert found_kind == kind
     assert str(found) == str(rows)  # NaN is not equal to itself

@@ -40,7 +40,7 @@ def test_flow_that_is_the_demand_with_all_drivers_is_noted(own: float, unfinishe
     human = rows_of(2, outflow_veh_per_h=2400.0, unfinished_trips=0, **arrived)
     driven = rows_of(2, outflow_veh_per_h=own, unfinished_trips=unfinished, **arrived)
     notes = episode_notes({"human": human, "acc": driven})
-    assert [note.startswith("flow: that of the demand") for note in notes] == [True] * has_note
+    assert [note.startswith("flow: equal to the demand") for note in notes] == [True] * has_note
     assert episode_notes({"human": human}) == []
 
 
@@ -48,14 +48,14 @@ def test_note_counts_drives_that_episodes_repeat() -> None:
     def drives(*files: int, begin: float = 0.0) -> list[dict[str, Any]]:
         return [{**row, "file": file, "part": 0, "begin": begin} for row, file in zip(rows_of(9), files, strict=False)]
 
-    alike = (
-        "those of the same drive differ in the noise of human drivers alone: in paired differences they count as one, "
-        "and intervals of single drivers are too narrow"
+    consequence = (
+        "episodes of the same drive differ only in the noise of human drivers: they count as one in paired "
+        "differences, and confidence intervals of single drivers are too narrow"
     )
     assert episode_notes({"human": drives(0, 1, 0), "pi": drives(0, 1)}) == [
-        f"3 episodes of 2 recorded drives: {alike}"
+        f"3 episodes of 2 recorded drives: {consequence}"
     ]
-    assert episode_notes({"pi": drives(2, 2)}) == [f"2 episodes of 1 recorded drive: {alike}"]
+    assert episode_notes({"pi": drives(2, 2)}) == [f"2 episodes of 1 recorded drive: {consequence}"]
     assert episode_notes({"pi": [*drives(0, 1), *drives(0, begin=9.0)]}) == []
 
 

@@ -143,12 +143,12 @@ def test_counts_of_one_are_singular() -> None:
 
 def test_infeasible_acc_vehicles_are_reported() -> None:
     braking = AccResult(0.1, replace(GOOD, feasibility="brakes with 7.0 m/s2"))
-    assert braking.summary.endswith(" They are infeasible themselves: brakes with 7.0 m/s2.")
+    assert braking.summary.endswith(" ACC vehicles are infeasible themselves: brakes with 7.0 m/s2.")
 
 
 def test_controller_that_changes_nothing_is_reported() -> None:
     idle = replace(HELPS, difference_to_acc=between(0.0, 0.0))
-    assert idle.reasons == ["it never intervened: all travel times are those of ACC vehicles alone"]
+    assert idle.reasons == ["the controller never intervened: all travel times are those of ACC vehicles alone"]
 
 
 @pytest.mark.parametrize(

@@ -41,11 +41,11 @@ def test_a_road_of_extreme_settings_is_refused_or_drawn_at_once(road: str) -> No
             try:
                 scenario = make_scenario(road, {name: extreme})
                 scenario.draw(np.random.default_rng(0))
-                ids, facts = scenario.possible_cav_ids(), scenario.facts()
+                ids, summary = scenario.possible_cav_ids(), scenario.summary()
             except (InputError, ArithmeticError):  # one line, too
                 continue
             assert len(ids) <= 1_000_000
-            assert facts
+            assert summary
             accepted += 1
     assert accepted > 10  # a setting without influence on time and memory
 

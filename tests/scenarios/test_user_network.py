@@ -227,7 +227,7 @@ def test_a_recipe_restores_the_scenario(tmp_path: Path) -> None:
     scenario = own(tmp_path, TIMES, cav_types=["car", "truck"], penetration_rate=0.25)
     assert scenario_from_recipe(scenario_recipe(scenario)) == scenario
     assert (
-        dict(scenario.facts())["vehicles"]
+        dict(scenario.summary())["vehicles"]
         == "as its files say (25 % CAV of passenger, private, hov, taxi, evehicle, car, truck)"
     )
 

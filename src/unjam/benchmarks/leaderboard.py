@@ -16,7 +16,7 @@ HEADINGS = ("driver", "gain", "unseen", "worst road", "feasible", "steps")
 
 
 def read_leaderboard(paths: Sequence[Path]) -> dict[str, BenchmarkResult]:
-    """Return the results in files by label, the best first; raise `InputError` unless they can be compared."""
+    """Return the results of files by label, the best first; raise `InputError` unless they are comparable."""
     results = list[BenchmarkResult]()
     for path in paths:
         results.append(result := read_result(path))
@@ -29,21 +29,21 @@ def read_leaderboard(paths: Sequence[Path]) -> dict[str, BenchmarkResult]:
 
 
 def _unique_labels(drivers: Sequence[str], files: Sequence[str]) -> list[str]:
-    """Return short labels of one line: the driver, with the file if others have this label, with a number if needed."""
-    labels, marks = ([short_label(text) for text in texts] for texts in (drivers, files))
-    counts = Counter(labels)
-    labels = [each if counts[each] == 1 else f"{each} ({mark})" for each, mark in zip(labels, marks, strict=True)]
+    """Return short labels: the driver, with the file if several drivers have this label, with a number if needed."""
+    labels, file_labels = ([short_label(text) for text in texts] for texts in (drivers, files))
+    counts, pairs = Counter(labels), zip(labels, file_labels, strict=True)
+    labels = [label if counts[label] == 1 else f"{label} ({file_label})" for label, file_label in pairs]
     is_unique = len(set(labels)) == len(labels)
     return labels if is_unique else [f"{number}. {label}" for number, label in enumerate(labels, 1)]
 
 
 def leaderboard_rows(results: Mapping[str, BenchmarkResult]) -> list[tuple[str, ...]]:
-    """Return the texts below `HEADINGS` for each result; gains with the 95 % CI over roads and seeds."""
+    """Return a row of texts for `HEADINGS` for each result; gains have 95 % CIs over roads and seeds."""
     rows = list[tuple[str, ...]]()
     for label, result in results.items():
         mean, unseen = result.mean_gain(), result.mean_gain("unseen").mean
-        (name, worst), steps = result.worst_road, result.training_steps
-        gains = f"{mean.mean:.2f}\n{format_ci(mean, '.2f')}", f"{unseen:.2f}", f"{worst:.2f}\n{name}"
+        (worst_road, worst), steps = result.worst_road, result.training_steps
+        gains = f"{mean.mean:.2f}\n{format_ci(mean, '.2f')}", f"{unseen:.2f}", f"{worst:.2f}\n{worst_road}"
         count = f"{result.feasible_count} of {len(result.roads)}"
         rows.append((label, *gains, count, "" if steps is None else f"{steps / 1e6:.2g} M"))
     return rows
@@ -51,7 +51,7 @@ def leaderboard_rows(results: Mapping[str, BenchmarkResult]) -> list[tuple[str, 
 
 @rc_context(PLOT_STYLE)
 def leaderboard_figure(results: Mapping[str, BenchmarkResult]) -> Figure:
-    """Draw for each result the mean gain with its CI, and the gain on each road as a dot."""
+    """Draw the mean gain of each result with its CI, and the gain on each road as a dot."""
     figure = new_figure(0.9 + 0.42 * len(results))
     axes = figure.subplots()
     for row, result in enumerate(results.values()):

@@ -1,4 +1,4 @@
-"""The result of a benchmark and its file: metrics of each road and seed, from which everything else is computed."""
+"""The result of a benchmark and its file: metrics of each road and seed, from which gains are computed."""
 
 from dataclasses import asdict, field
 from functools import cached_property
@@ -26,11 +26,11 @@ if TYPE_CHECKING:  # imported late, so that commands start quickly
 
 FILE_FORMAT, DIGITS, MAX_LABEL_CHARACTERS = 1, 7, 500
 """version of files; significant digits of stored metrics; maximum length of the name of a driver"""
-MAX_FILE_BYTES = 4 * 2**20  # maximum size of a file; one with all roads has 200 kB
+MAX_FILE_BYTES = 4 * 2**20  # maximum size of a file; a file with all roads has 200 kB
 MAX_RELATIVE_DIFFERENCE = 1e-4  # allowed relative difference to reference values of the human baseline
-TRAINING_STEPS_UNIT = "environment steps: control steps in the simulator"  # unit of `training_steps`, as files say
+TRAINING_STEPS_UNIT = "environment steps: control steps in the simulator"  # unit of `training_steps` in files
 PARTS = {"all roads": ("training", "combination", "axis"), "training": ("training",), "unseen": ("combination", "axis")}
-"""parts of the family by the name of their mean"""
+"""parts of the family of roads that are averaged, by name of the mean"""
 EPISODES_PER_ROAD = 10  # episodes of each driver on each road
 FAMILY_TEST_SEEDS = held_out_seeds(EPISODES_PER_ROAD)
 FAMILY_METRICS = (
@@ -48,22 +48,22 @@ Columns = dict[str, Annotated[Column, Field(min_length=EPISODES_PER_ROAD, max_le
 class RoadRecord:
     """The episodes of the human baseline and of the driver on one road."""
 
-    backend: StrictStr  # which simulator drove the driver's episodes
+    backend: StrictStr  # simulator of the driver's episodes
     baseline: Columns
-    driver: Columns  # empty if it cannot drive on this road: it then counts as the human baseline
-    note: StrictStr = ""  # why it cannot drive there
+    driver: Columns  # empty if the driver cannot drive on this road, and counts as the human baseline
+    note: StrictStr = ""  # reason why the driver cannot drive on this road
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class BenchmarkResult:
-    """The result of one driver in a suite: gain, feasibility and the worst road follow from the rows of its roads."""
+    """The result of one driver in a suite; gain, feasibility and worst road are computed from the rows of the roads."""
 
     suite: StrictStr
     driver: Annotated[StrictStr, Field(min_length=1, max_length=MAX_LABEL_CHARACTERS)]
     sha256: StrictStr | None
-    """hash of the driver: its controller file, or else its parameters, code and weights; None: a Python object"""
+    """hash of the controller file, or else of the driver's parameters, code and weights; None: a Python object"""
     training_steps: Annotated[StrictInt, Field(ge=0)] | None
-    """control steps in the simulator of its training or tuning, as its file or its author says; None: unknown"""
+    """control steps in the simulator for training or tuning, from the driver's file or author; None: unknown"""
     manifest: dict[str, Any] = field(repr=False)
     """versions of unjam and SUMO, machine, command"""
     roads: dict[str, RoadRecord] = field(default_factory=dict, repr=False)
@@ -76,13 +76,13 @@ class BenchmarkResult:
         return [name for name in find_suite(self.suite).roads if name not in self.roads]
 
     @cached_property
-    @np.errstate(over="ignore", invalid="ignore")  # a file may have any finite numbers
+    @np.errstate(over="ignore", invalid="ignore")  # files may contain all finite numbers
     def _gains(self) -> dict[str, tuple[Estimate, Floats, str]]:
-        """For each road the gain, the gain by seed, and the verdict of the feasibility check."""
+        """Gain, gain by seed and verdict on feasibility, by road."""
         gains: dict[str, tuple[Estimate, Floats, str]] = {}
         for name, road in self.roads.items():
-            baseline, reference = _rows(road.baseline), load_references()[name]["performance"]
-            rows = _rows(road.driver) if road.driver else baseline
+            baseline, reference = _to_rows(road.baseline), load_references()[name]["performance"]
+            rows = _to_rows(road.driver) if road.driver else baseline
             verdict = overall_feasibility(rows, baseline) if road.driver else f"not driven: {road.note}"
             arguments = rows, baseline, reference
             gains[name] = gain.normalized_gain(*arguments), gain.gain_by_seed(*arguments), verdict
@@ -93,8 +93,8 @@ class BenchmarkResult:
         """Return the mean gain over the finished roads of one of `PARTS`, with its 95 % CI over roads and seeds."""
         if not isinstance(part, str) or part not in PARTS:
             raise unknown_name("part", part, PARTS)
-        part_seeds = [seeds for name, (_, seeds, _) in self._gains.items() if FAMILY[name].part in PARTS[part]]
-        return estimate_crossed(part_seeds, allows_bimodal=True)
+        gains = [by_seed for name, (_, by_seed, _) in self._gains.items() if FAMILY[name].part in PARTS[part]]
+        return estimate_crossed(gains, allows_bimodal=True)
 
     @property
     def worst_road(self) -> tuple[str, float]:
@@ -103,47 +103,47 @@ class BenchmarkResult:
 
     @property
     def feasible_count(self) -> int:
-        """Number of roads on which no episode violates a limit; those without CAVs violate none."""
+        """Number of roads on which no episode violates a limit, including roads without CAVs."""
         return sum(verdict in ("", FEASIBLE) for *_, verdict in self._gains.values())
 
     def gains(self) -> dict[str, float]:
-        """Return the gain by finished road."""
+        """Return the gains on the finished roads by road name."""
         return {name: estimate.mean for name, (estimate, *_) in self._gains.items()}
 
     def road_rows(self) -> list[dict[str, Any]]:
-        """Return for each road its part, gain with 95 % CI over seeds, feasibility and backend; then the means."""
+        """Return rows with part, gain with 95 % CI over seeds, feasibility and backend of each road; then the means."""
         rows: list[dict[str, Any]] = [
-            {"road": name, "part": FAMILY[name].part, **_interval(estimate), "feasible": verdict}
+            {"road": name, "part": FAMILY[name].part, **_gain_columns(estimate), "feasible": verdict}
             | {"backend": self.roads[name].backend, "expert": load_references()[name]["expert"]}
             for name, (estimate, _, verdict) in self._gains.items()
         ]
         empty = {"part": "", "feasible": "", "backend": "", "expert": ""}
         parts = () if self.missing_roads else PARTS
-        return rows + [{**empty, "road": f"mean, {part}", **_interval(self.mean_gain(part))} for part in parts]
+        return rows + [{**empty, "road": f"mean, {part}", **_gain_columns(self.mean_gain(part))} for part in parts]
 
     def table(self) -> "pd.DataFrame":
-        """Return `road_rows` as a table of 80 characters: without back ends and experts."""
+        """Return `road_rows` as a table with at most 80 characters a line, without backends and experts."""
         import pandas as pd
 
         table = pd.DataFrame(self.road_rows()).set_index("road").drop(columns=["backend", "expert"])
         return table.round({"gain": 2, "low": 2, "high": 2})
 
     def summary(self) -> dict[str, Any]:
-        """Return what follows from the rows, as the file has it."""
+        """Return the computed results that the file contains."""
         return {"gains": self.road_rows(), "worst_road": self.worst_road, "feasible_roads": self.feasible_count}
 
     def document(self) -> dict[str, Any]:
-        """Return the content of the file, a JSON object; with a summary if all roads are finished."""
+        """Return the content of the file, a JSON object, with the summary if all roads are finished."""
         content = asdict(self) | {"training_steps_unit": TRAINING_STEPS_UNIT, "seeds": FAMILY_TEST_SEEDS}
         return content if self.missing_roads else {"summary": self.summary(), **content}
 
     def check_comparable(self) -> None:
-        """Raise `InputError` if roads are missing, or the human baseline is not that of the suite."""
+        """Raise `InputError` if roads are missing, or if the human baseline differs from that of the suite."""
         if self.missing_roads:
-            count, first = len(self.missing_roads), self.missing_roads[0]
-            raise InputError(f"roads: {count} are missing ({first}, ...); allowed: a finished benchmark")
+            count, example = len(self.missing_roads), self.missing_roads[0]
+            raise InputError(f"roads: {count} are missing ({example}, ...); allowed: a finished benchmark")
         for name, road in self.roads.items():
-            performances = [gain.performance(row) for row in _rows(road.baseline)]
+            performances = [gain.performance(row) for row in _to_rows(road.baseline)]
             for value, expected in zip(performances, load_references()[name]["baseline"], strict=True):
                 if not isclose(value, expected, rel_tol=MAX_RELATIVE_DIFFERENCE):
                     versions = f"unjam {self.manifest.get('unjam')!s:.20}, backend {road.backend:.40}"
@@ -152,24 +152,25 @@ class BenchmarkResult:
 
 
 def to_columns(rows: gain.EpisodeRows) -> dict[str, list[Any]]:
-    """Return rows of metrics as columns for the file, in seven significant digits; NaN becomes null."""
+    """Return rows of metrics as columns for the file, with seven significant digits; NaN becomes null."""
 
-    def stored(value: Any) -> Any:
+    def round_value(value: Any) -> Any:
         return (float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None) if type(value) is float else value
 
-    return {name: [stored(row[name]) for row in rows] for name in FAMILY_METRICS[1:] if rows}
+    return {name: [round_value(row[name]) for row in rows] for name in FAMILY_METRICS[1:] if rows}
 
 
-def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
-    seeds, values = iter(FAMILY_TEST_SEEDS), zip(*columns.values(), strict=True)
-    rows = (dict(zip(columns, row, strict=True)) for row in values)
+def _to_rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
+    """Return the rows of columns of a file, with their test seeds; null becomes NaN."""
+    rows = (dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True))
     return [
-        {"seed": next(seeds)} | {name: nan if value is None else value for name, value in row.items()} for row in rows
+        {"seed": seed} | {name: nan if value is None else value for name, value in row.items()}
+        for seed, row in zip(FAMILY_TEST_SEEDS, rows, strict=False)  # no rows if the driver cannot drive
     ]
 
 
-def _interval(value: Estimate) -> dict[str, float]:
-    return {"gain": value.mean, "low": value.low, "high": value.high}
+def _gain_columns(estimate: Estimate) -> dict[str, float]:
+    return {"gain": estimate.mean, "low": estimate.low, "high": estimate.high}
 
 
 def write_result(path: Path, result: BenchmarkResult) -> None:
@@ -182,9 +183,9 @@ def write_result(path: Path, result: BenchmarkResult) -> None:
 
 
 def read_result(path: Path) -> BenchmarkResult:
-    """Return the result in a file, which may come from a stranger: nothing in it is executed.
+    """Return the result in a file; no code in the file is executed.
 
-    Raise `InputError` if it is not a result of a suite of this version, or contradicts itself.
+    Raise `InputError` if the file is no result of a suite of this version, or is inconsistent.
     """
     with prefix_errors(f"{path}: "):
         try:
@@ -212,14 +213,14 @@ def read_result(path: Path) -> BenchmarkResult:
 
 
 def _check_roads(result: BenchmarkResult, suite: Suite) -> None:
-    """Raise `InputError` for an unknown road, or rows without metrics or with texts in place of numbers."""
+    """Raise `InputError` if a road or metric is unknown, a metric is missing, or a text is in place of a number."""
     for name, road in result.roads.items():
         if name not in suite.roads:
             raise InputError(f"roads: {name[:50]!r} is not in {suite.name}")
         for columns in (road.baseline, road.driver) if road.driver else (road.baseline,):
-            if wrong := sorted(columns.keys() ^ set(FAMILY_METRICS[1:])):
-                raise InputError(f"roads.{name}: the metric {wrong[0]:.50} is missing or unknown")
+            if unmatched := sorted(columns.keys() ^ set(FAMILY_METRICS[1:])):
+                raise InputError(f"roads.{name}: the metric {unmatched[0]:.50} is missing or unknown")
             for key, values in columns.items():
                 is_text = key == "status"
-                if unfit := [value for value in values if isinstance(value, str) is not is_text]:
-                    raise invalid_value(f"roads.{name}.{key}", unfit[0], "texts" if is_text else "numbers")
+                if invalid := [value for value in values if isinstance(value, str) is not is_text]:
+                    raise invalid_value(f"roads.{name}.{key}", invalid[0], "texts" if is_text else "numbers")

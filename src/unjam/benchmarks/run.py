@@ -47,7 +47,9 @@ from unjam.worlds.episode import check_can_drive, run_episode
 from unjam.worlds.record import Episode
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
 
-EXACT_BACKEND = "exact"  # backend of benchmarks: the batch where its episodes are those of SUMO, else SUMO
+EXACT_BACKEND = (
+    "exact"  # default backend of benchmarks: the batch if its episodes are identical to those of SUMO, else SUMO
+)
 MAX_TRAINING_STEPS = 2**53  # environment steps that a result can record
 Seeds = Sequence[tuple[int, ...]]
 
@@ -62,47 +64,47 @@ def benchmark(
     progress: Callable[[str], object] = lambda line: None,
     roads: Sequence[str] = (),
 ) -> BenchmarkResult:
-    """Drive the human baseline and a driver on the test seeds of each road of a suite, and return gains and rows.
+    """Evaluate a driver and the human baseline on the test seeds of each road of a suite.
 
     Args:
-        driver: a name as in `drive`, or a Python object, which drives in this process.
+        driver: a name as in `drive`, or a Python object, which is called in this process.
         suite: `all-roads-v1`, `closed-roads-v1` or `motorways-v1`.
         out: file for the result, written after each road; a second call continues with the missing roads.
-        workers: processes; all cores by default. The result does not depend on it.
-        backend: `exact`: the batch on rings, for drivers without user code, and SUMO elsewhere; or the simulator of all
-            episodes: `sumo`, `batch` or `path.py:name`.
-        training_steps: environment steps that made the driver, unless its file says so: control steps (decisions of the
-            driver) in the simulator, the calls of `env.step` of all environments together.
+        workers: number of processes, by default that of cores; it does not change the result.
+        backend: `exact`: the batch on rings for drivers without user code, SUMO for other roads and drivers; or the
+            simulator of all episodes: `sumo`, `batch` or `path.py:name`.
+        training_steps: control steps in the simulator, in all environments together, with which the driver was trained
+            or tuned; the number in a controller file has priority.
         progress: called with a line after each road.
-        roads: names of roads of the suite, for a trial: only these are driven, and the result cannot be compared.
+        roads: names of roads of the suite to which a trial is limited; its result cannot be compared.
 
     Raises:
-        InputError: an argument is wrong, the driver fails or can drive on no road, or `out` has another result or is
-            being written by another process.
+        InputError: an argument is wrong, the driver fails or can drive on no road, `out` has another result, or
+            another process is writing `out`.
     """
-    chosen = _check_roads(roads, find_suite(suite))
+    selected = _select_roads(roads, find_suite(suite))
     scenarios = {name: make_scenario(f"{FAMILY_PREFIX}{name}") for name in find_suite(suite).roads}
-    for name, number, *limits in (("workers", workers, 1), ("training_steps", training_steps, 0, MAX_TRAINING_STEPS)):
-        if number is not None:
-            check_integer(name, number, *limits)
+    for name, value, *limits in (("workers", workers, 1), ("training_steps", training_steps, 0, MAX_TRAINING_STEPS)):
+        if value is not None:
+            check_integer(name, value, *limits)
     if not (out is None or (isinstance(out, str | os.PathLike) and Path(out).name)):
         raise invalid_value("out", out, "the path of a file")
     if not callable(progress):
         raise invalid_value("progress", progress, "a function of a line of text")
-    drivers, reasons = _make_drivers(driver, scenarios)
+    drivers, errors = _make_drivers(driver, scenarios)
     if isinstance(driver, str):
         check_controllers(driver, "benchmark")
     if backend != EXACT_BACKEND:
-        with open_backend(backend) as simulator:
-            check_support(simulator, *scenarios.values())
-    label, first = driver if isinstance(driver, str) else "", next(iter(drivers.values()))
+        with open_backend(backend) as opened_backend:
+            check_support(opened_backend, *scenarios.values())
+    label, any_driver = driver if isinstance(driver, str) else "", next(iter(drivers.values()))
     if label.endswith(SB3_SUFFIX):
-        progress(control_step_note(label, (road.control_step for road in scenarios.values())))
+        progress(control_step_note(label, (scenario.control_step for scenario in scenarios.values())))
     origin = manifest()
     result = BenchmarkResult(
         suite=suite,
-        driver=to_one_line(strip_folders([label])[0] or first.describe(), MAX_LABEL_CHARACTERS),
-        sha256=_driver_hash(label, first),
+        driver=to_one_line(strip_folders([label])[0] or any_driver.describe(), MAX_LABEL_CHARACTERS),
+        sha256=_driver_hash(label, any_driver),
         training_steps=_recorded_steps(label) or training_steps,
         manifest={
             **origin,
@@ -120,26 +122,28 @@ def benchmark(
     with lock, WorkerPool(workers or os.cpu_count() or 1) as pool:
         if path is not None and os.path.lexists(path):
             result = _stored_result(path, result)
-            stored = len({*chosen} - {*result.missing_roads})
-            progress(f"{stored} of {format_count(len(chosen), 'road')} in {path.name}; not driven again")
-        remaining = [name for name in result.missing_roads if name in chosen]
-        for number, name in enumerate(remaining, len(chosen) - len(remaining) + 1):
+            stored_count = len({*selected} - {*result.missing_roads})
+            progress(f"{stored_count} of {format_count(len(selected), 'road')} in {path.name}; not driven again")
+        remaining = [name for name in result.missing_roads if name in selected]
+        for number, name in enumerate(remaining, len(selected) - len(remaining) + 1):
             scenario = scenarios[name]
             human = make_driver(HUMAN_LABEL, scenario.control_step)
-            used, rows = human_used, baseline = _drive_road(scenario, human, backend, pool)
+            simulator, rows = human_simulator, baseline = _drive_road(scenario, human, backend, pool)
             if (road_driver := drivers.get(name)) != human:
-                used, rows = _drive_road(scenario, road_driver, backend, pool) if road_driver else (human_used, [])
-            record = RoadRecord(used, to_columns(baseline), to_columns(rows), to_one_line(reasons.get(name, "")))
+                simulator, rows = human_simulator, []
+                if road_driver:
+                    simulator, rows = _drive_road(scenario, road_driver, backend, pool)
+            record = RoadRecord(simulator, to_columns(baseline), to_columns(rows), to_one_line(errors.get(name, "")))
             result = replace(result, roads={**result.roads, name: record})
             if path is not None:
                 write_result(path, result)
             row = result.road_rows()[len(result.roads) - 1]
-            progress(f"{number} of {len(chosen)}: {name}: gain {row['gain']:.2f}, {row['feasible']}")
+            progress(f"{number} of {len(selected)}: {name}: gain {row['gain']:.2f}, {row['feasible']}")
     return result
 
 
-def _check_roads(roads: Sequence[str], suite: Suite) -> Sequence[str]:
-    """Return the given roads of a suite, or all; `family/` may precede their names. Raise `InputError` for others."""
+def _select_roads(roads: Sequence[str], suite: Suite) -> Sequence[str]:
+    """Return the names of `roads` without `family/`, or else of all roads of a suite; `InputError` if unknown."""
     if isinstance(roads, str) or not isinstance(roads, Sequence):
         raise invalid_value("roads", roads, f"a list of names of roads of {suite.name}")
     names = [str(name).removeprefix(FAMILY_PREFIX) for name in roads]
@@ -150,32 +154,32 @@ def _check_roads(roads: Sequence[str], suite: Suite) -> Sequence[str]:
 
 
 def _make_drivers(
-    driver: str | DriverLike, roads: dict[str, Scenario]
+    driver: str | DriverLike, scenarios: dict[str, Scenario]
 ) -> tuple[dict[str, Driver], dict[str, InputError]]:
-    """Return the driver of each road, and for others the reason why it cannot drive there; `InputError` without any."""
-    drivers, reasons = dict[str, Driver](), dict[str, InputError]()
-    for name, road in roads.items():
+    """Return drivers and errors by road: the driver, or why it cannot drive; raise the error if no road is possible."""
+    drivers, errors = dict[str, Driver](), dict[str, InputError]()
+    for name, scenario in scenarios.items():
         try:
-            step = road.control_step
+            step = scenario.control_step
             road_driver = make_driver(driver, step) if isinstance(driver, str) else as_driver(driver, step)
-            check_can_drive(road_driver, road)
+            check_can_drive(road_driver, scenario)
             drivers[name] = road_driver
         except InputError as error:
-            reasons[name] = error
+            errors[name] = error
     if not drivers:
-        raise next(iter(reasons.values()))
-    return drivers, reasons
+        raise next(iter(errors.values()))
+    return drivers, errors
 
 
 def _drive_road(scenario: Scenario, driver: Driver, backend: str, pool: WorkerPool) -> tuple[str, EpisodeRows]:
-    """Return the backend that was used, and a row of metrics for each test seed; raise the first failure."""
+    """Return the simulator, and a row of metrics for each test seed; raise the error of the first failed episode."""
     is_exact = backend == EXACT_BACKEND
     simulator = "sumo" if is_exact else backend
     tasks = make_tasks(scenario, driver, FAMILY_TEST_SEEDS, simulator)
-    # Code of users may compute with all rows at once, which are CAVs of different roads in a batch.
+    # Code of users may combine rows, and the rows of a batch are CAVs of different roads.
     can_batch = is_exact and not unsupported_reason(scenario) and is_serializable(driver)
     if can_batch and not user_code_recipes(driver_recipe(driver)[0]):
-        return "batch", [_measure_episode(*numbered_episode) for numbered_episode in enumerate(run_batches(tasks))]
+        return "batch", [_measure_episode(index, episode) for index, episode in enumerate(run_batches(tasks))]
     if tasks[0].is_serializable:
         return simulator, pool.run_and_map(tasks, _measure_episode)
     return simulator, [_measure_episode(0, run_episode(**vars(task))) for task in tasks]
@@ -187,7 +191,7 @@ def _measure_episode(index: int, episode: Episode) -> dict[str, Any]:
 
 
 def make_tasks(scenario: Scenario, driver: Driver, seeds: Seeds, backend: BackendLike = "sumo") -> list[EpisodeTask]:
-    """Return the episodes of a driver; together they cover the range of sizes of the road evenly."""
+    """Return an episode task of a driver for each seed; together they cover the range of sizes of the road evenly."""
     strata = (scenario.stratum(index, len(seeds)) for index in range(len(seeds)))
     return [EpisodeTask(road, driver, seed, backend=backend) for road, seed in zip(strata, seeds, strict=True)]
 
@@ -195,60 +199,62 @@ def make_tasks(scenario: Scenario, driver: Driver, seeds: Seeds, backend: Backen
 def drive_by_label(
     scenario: Scenario, drivers: Mapping[str, str], seeds: Seeds, workers: WorkerPool, in_batches: bool
 ) -> dict[str, EpisodeRows]:
-    """Return the metrics of each driver's episodes by label; `drivers` are names of drivers by label.
+    """Return the rows of `FAMILY_METRICS` of drivers by label; `drivers` has the names of the drivers by label.
 
-    With `in_batches`, episodes run in batches if these support the scenario.
+    With `in_batches`, episodes run in batches if batches support the scenario.
     """
     drivers_by_label = {label: make_driver(name, scenario.control_step) for label, name in drivers.items()}
     tasks = {label: make_tasks(scenario, driver, seeds) for label, driver in drivers_by_label.items()}
     if in_batches and not unsupported_reason(scenario):
         return {label: list(map(_family_metrics, run_batches(road_tasks))) for label, road_tasks in tasks.items()}
-    # A whole motorway episode takes 80 MB.
+    # Workers return metrics only, because an episode of a motorway takes 80 MB.
     rows = iter(workers.run_and_map([*chain(*tasks.values())], lambda index, episode: _family_metrics(episode)))
     return {label: [next(rows) for _ in road_tasks] for label, road_tasks in tasks.items()}
 
 
 def _family_metrics(episode: Episode) -> dict[str, Any]:
-    measured = measure(episode)
-    return {key: measured[key] for key in FAMILY_METRICS}
+    row = measure(episode)
+    return {key: row[key] for key in FAMILY_METRICS}
 
 
 def _driver_hash(label: str, driver: Driver) -> str | None:
-    """Return the SHA-256 of a file of the driver, else of recipe, code and weights; None for a Python object."""
+    """Return the SHA-256 of the driver's file, or else of its recipe, code and weights; None for a Python object."""
     if sha256 := label and controller_hash(label):
         return sha256
     if not is_serializable(driver):
-        file, parameters = split_parameters(label)  # of a policy
+        file, parameters = split_parameters(label)  # the file is that of a policy of another library
         if not file or not Path(file).is_file():
             return None
         content = sha256_of_file(Path(file))
         return sha256_of(to_json([content, parameters]).encode()) if parameters else content
     recipe, arrays = driver_recipe(driver)
-    for part in user_code_recipes(recipe):  # the hash of the code is there, too
-        part["path"] = Path(part["path"]).name
+    for code_recipe in user_code_recipes(recipe):  # contains the hash of the code, too
+        code_recipe["path"] = Path(code_recipe["path"]).name
     return sha256_of(to_json(recipe).encode() + save(arrays))
 
 
 def _recorded_steps(label: str) -> int | None:
+    """Return the environment steps in a controller file, for training or tuning; None if unknown."""
     path = controller_path(label) if label else None
     if path is None:
         return None
-    content = read_controller(path).manifest
-    tuning = content.get("tuning", {})
-    return content.get("environment_steps") or tuning.get("environment_steps", 0) + tuning.get("batch_steps", 0) or None
+    stored = read_controller(path).manifest
+    tuning = stored.get("tuning", {})
+    return stored.get("environment_steps") or tuning.get("environment_steps", 0) + tuning.get("batch_steps", 0) or None
 
 
 def _stored_result(path: Path, new: BenchmarkResult) -> BenchmarkResult:
-    """Return the result in a file, to be continued; raise `InputError` unless it has the same driver and versions."""
+    """Return the result in a file to continue it; raise `InputError` unless driver and versions are the same."""
     stored = read_result(path)
 
     def identity(result: BenchmarkResult) -> dict[str, Any]:
         origin = result.manifest
         sumo = (origin.get("packages") or {}).get("eclipse-sumo")
-        names = {"suite": result.suite, "driver": result.driver, "hash of the driver": result.sha256}
-        names |= {"training steps": result.training_steps, "backend": origin.get("backend")}
-        names |= {"hash of the backend": origin.get("backend_sha256")}
-        return names | {"unjam": origin.get("unjam"), "SUMO": sumo}
+        return {
+            **{"suite": result.suite, "driver": result.driver, "hash of the driver": result.sha256},
+            **{"training steps": result.training_steps, "backend": origin.get("backend")},
+            **{"hash of the backend": origin.get("backend_sha256"), "unjam": origin.get("unjam"), "SUMO": sumo},
+        }
 
     if new.sha256 is None:
         raise invalid_value("out", str(path), "a new file: it is unknown whether a Python object has changed")

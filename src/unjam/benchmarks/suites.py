@@ -14,7 +14,7 @@ DEFAULT_SUITE = "all-roads-v1"
 
 @dataclass(frozen=True)
 class Suite:
-    """A set of roads of the family; roads, test seeds and references of a version never change."""
+    """A set of roads of the family; the roads, test seeds and reference values of a suite never change."""
 
     name: str
     description: str
@@ -40,11 +40,11 @@ _SUITES = (
         ("on-ramp-5", "on-ramp-20", "on-ramp-10", "on-ramp-10-more-demand", "one-lane-10"),
     ),
 )
-SUITES = {suite.name: suite for suite in _SUITES}  # all suites by name
+SUITES = {suite.name: suite for suite in _SUITES}
 
 
 def find_suite(name: str) -> Suite:
-    """Return the suite with a name; raise `InputError` if there is none."""
+    """Return the suite with this name; raise `InputError` if it does not exist."""
     if not isinstance(name, str) or name not in SUITES:
         raise unknown_name("suite", name, SUITES)
     return SUITES[name]
@@ -52,5 +52,5 @@ def find_suite(name: str) -> Suite:
 
 @cache
 def load_references() -> dict[str, dict[str, Any]]:
-    """Return by road the best tuned `expert`, and by test seed the `performance` of it and of the human `baseline`."""
+    """Return the best tuned `expert` of each road, its `performance` and that of the `baseline` for each test seed."""
     return json.loads((files("unjam.benchmarks") / "references.json").read_text(encoding="utf-8"))["roads"]

@@ -1,1 +1,1 @@
-"""What is measured of episodes, and what may be said of it: metrics, statistics, verdicts. Draws nothing."""
+"""Metrics of episodes, their statistics, and verdicts on drivers. Nothing here draws figures."""

@@ -1,4 +1,4 @@
-"""Detector measurements and the agreement of simulated traffic with them: GEH and root mean square errors."""
+"""Detector measurements, and the agreement of simulated traffic with them: GEH and root mean square errors."""
 
 import csv
 from collections import defaultdict
@@ -19,16 +19,16 @@ DETECTOR_COLUMNS = ("position", "begin", "end", "flow_veh_per_h", "speed")
 """columns of a file of measurements, in addition to `edge` or `lane`"""
 MAX_NUMBER = 1e9  # largest allowed number in a file
 TIME_TOLERANCE = 1e-6
-"""time by which intervals may overlap, as their ends are rounded [s]"""
+"""time by which intervals may overlap because their ends are rounded [s]"""
 GEH_LIMIT = 5.0  # GEH below which a simulated flow agrees with the measured flow
-SAME_PASSAGE_SECONDS = 10.0  # time within which a second passage of loops of the same edge is only a lane change [s]
+SAME_PASSAGE_SECONDS = 10.0  # time within which a second passage on an edge is only a lane change [s]
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Measurement of a detector in an interval."""
+    """The measurement of a detector in one interval."""
 
-    place: str  # id of an edge, all lanes of which are counted, or of a lane
+    location: str  # id of a lane, or of an edge, on which all lanes are counted
     position: float  # position on the edge or lane [m]
     begin: float  # begin of the interval, in simulation time [s]
     end: float  # end of the interval, in simulation time [s]
@@ -44,16 +44,16 @@ class Agreement:
     geh_below_5: float  # share of the intervals with a GEH below 5
     flow_rmse: float  # root mean square error of the flow [veh/h]
     speed_rmse: float  # root mean square error of the speed [m/s]; NaN if no speed was measured
-    score: float  # objective of calibration, to minimize: mean GEH over 5, plus speed error over mean measured speed
+    score: float  # objective of calibration, to minimize: mean GEH / 5 + speed RMSE / mean measured speed
 
 
 def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
-    """Return whether a CSV file names places by `edge` or by `lane`, and its measurements.
+    """Return `edge` or `lane`, the column of a CSV file that locates detectors, and the measurements of the file.
 
-    It needs that column and `DETECTOR_COLUMNS`; an empty speed is unknown, as is one of an interval without vehicles,
-    and other columns are ignored. Raise `InputError` if a value is wrong, intervals of a detector overlap or a row has
-    other cells than the header, with its line, and if the file, a column or all rows are missing, or a column is there
-    twice.
+    The file needs this column and `DETECTOR_COLUMNS`; other columns are ignored. Speeds are unknown if they are empty
+    or if the flow is 0. Raise `InputError` if the file, a column or all rows are missing, and if a column is repeated.
+    Raise it with the line if a value is wrong, a row and the header differ in length, or intervals of a detector
+    overlap.
     """
     if not path.is_file():  # reading a device would never end
         raise InputError(f"detectors: {str(path)!r} is not a file; allowed: a CSV file")
@@ -74,26 +74,29 @@ def read_detectors(path: Path) -> tuple[str, list[Measurement]]:
         raise InputError(f"detectors: {str(path)!r} cannot be read: {reason}") from None
     if not lines:
         raise InputError(f"{path.name}: has no rows; allowed: one measurement at least")
-    in_order = sorted(lines, key=lambda entry: (entry[1].place, entry[1].position, entry[1].begin, entry[0]))
-    for (first, previous_row), (line, row) in pairwise(in_order):
-        if (row.place, row.position) == (
-            previous_row.place,
-            previous_row.position,
-        ) and row.begin < previous_row.end - TIME_TOLERANCE:
+    lines_by_detector = sorted(lines, key=lambda entry: (*_detector(entry[1]), entry[1].begin, entry[0]))
+    for (previous_line, previous_row), (line, row) in pairwise(lines_by_detector):
+        if _detector(row) == _detector(previous_row) and row.begin < previous_row.end - TIME_TOLERANCE:
             allowed = "intervals of a detector that do not overlap"
-            raise InputError(f"{path.name}: line {line}: overlaps the interval of line {first}; allowed: {allowed}")
+            raise InputError(
+                f"{path.name}: line {line}: overlaps the interval of line {previous_line}; allowed: {allowed}"
+            )
     return kinds[0], [row for _, row in lines]
+
+
+def _detector(measurement: Measurement) -> tuple[str, float]:
+    return measurement.location, measurement.position
 
 
 def _parse_measurement(file: str, line: int, kind: str, row: dict[str, str | None]) -> Measurement:
     context = f"{file}: line {line}"
     surplus: Any = row.get(None) or ()  # pyright: ignore[reportArgumentType]  (the key of cells without a column)
     if any(surplus) or None in row.values():
-        number = "more" if any(surplus) else "fewer"
-        raise InputError(f"{context}: has {number} cells than the header; allowed: as many")
-    place = (row[kind] or "").strip()
-    if not place:
-        raise invalid_value(f"{context}: {kind}", place, f"the id of one {kind}")
+        relation = "more" if any(surplus) else "fewer"
+        raise InputError(f"{context}: has {relation} cells than the header; allowed: as many")
+    location = (row[kind] or "").strip()
+    if not location:
+        raise invalid_value(f"{context}: {kind}", location, f"the id of one {kind}")
     values = []
     for name in DETECTOR_COLUMNS:
         text = (row[name] or "").strip()
@@ -104,8 +107,8 @@ def _parse_measurement(file: str, line: int, kind: str, row: dict[str, str | Non
         if (text or name != "speed") and not (0 <= value <= MAX_NUMBER and "_" not in text):
             raise invalid_value(f"{context}: {name}", text, f"a number >= 0, <= {MAX_NUMBER:g}")
         values.append(value)
-    measurement = Measurement(place, *values)
-    if measurement.flow == 0:  # detectors write 0, or the limit, where no vehicle has passed
+    measurement = Measurement(location, *values)
+    if measurement.flow == 0:  # without vehicles, detectors write 0 or the speed limit
         measurement = replace(measurement, speed=nan)
     if measurement.end <= measurement.begin:
         raise invalid_value(f"{context}: end", measurement.end, f"after begin, {measurement.begin:g} s")
@@ -118,17 +121,17 @@ def aggregate_passages(
     """Return the flow [veh/h] and the mean speed [m/s] that each detector would have measured.
 
     Both arrays have the order of `measurements`; the speed is NaN without a passage of known speed. `loops` has the
-    numbers of the loops of each measurement: one, or one in each lane of an edge, where a vehicle is counted once.
+    indices of the loops of each measurement: one loop, or one in each lane of an edge, where a vehicle counts once.
     """
-    by_loop: defaultdict[int, list[DetectorPassage]] = defaultdict(list)
+    passages_by_loop: defaultdict[int, list[DetectorPassage]] = defaultdict(list)
     for passage in passages:
-        by_loop[passage.loop].append(passage)
-    unique: dict[tuple[int, ...], Floats] = {}
+        passages_by_loop[passage.loop].append(passage)
+    detectors: dict[tuple[int, ...], Floats] = {}
     flows, speeds = np.full((2, len(measurements)), np.nan)
-    for index, (row, numbers) in enumerate(zip(measurements, map(tuple, loops), strict=True)):
-        if numbers not in unique:
-            unique[numbers] = _unique_passages([passage for number in numbers for passage in by_loop[number]])
-        times, passage_speeds = unique[numbers]
+    for index, (row, detector) in enumerate(zip(measurements, map(tuple, loops), strict=True)):
+        if detector not in detectors:
+            detectors[detector] = _unique_passages([entry for loop in detector for entry in passages_by_loop[loop]])
+        times, passage_speeds = detectors[detector]
         first, last = np.searchsorted(times, (row.begin, row.end))
         flows[index] = (last - first) * 3600 / (row.end - row.begin)
         known = passage_speeds[first:last][np.isfinite(passage_speeds[first:last])]
@@ -138,9 +141,9 @@ def aggregate_passages(
 
 
 def _unique_passages(passages: Sequence[DetectorPassage]) -> Floats:
-    """Return times and speeds of passages in the order of time, shape (2, n), lane changes counted once.
+    """Return times and speeds of passages, sorted by time, shape (2, n); a lane change is no second passage.
 
-    A passage over several loops has the time of the first and the first known speed.
+    A vehicle that passes several loops has the time of the first loop and the first known speed.
     """
     last_passages: dict[str, tuple[float, int]] = {}
     rows: list[tuple[float, float]] = []
@@ -160,14 +163,14 @@ def geh(simulated: Floats, measured: Floats) -> Floats:
 
     Source: Design Manual for Roads and Bridges, volume 12, section 2, part 1 (UK, 1996).
     """
-    both = simulated + measured
-    return np.sqrt(2 * (simulated - measured) ** 2 / np.where(both > 0, both, 1.0))
+    total = simulated + measured
+    return np.sqrt(2 * (simulated - measured) ** 2 / np.where(total > 0, total, 1.0))
 
 
 def compute_agreement(measurements: Sequence[Measurement], flows: Floats, speeds: Floats) -> Agreement:
     """Return the agreement of simulated flows [veh/h] and speeds [m/s] with the measurements, in their order.
 
-    The simulated speed of an interval without vehicles is NaN and counts as 0, so that a standstill costs.
+    The simulated speed of an interval without vehicles is NaN and counts as 0, because traffic may stand still.
     """
     measured_flows = np.array([row.flow for row in measurements])
     measured_speeds = np.array([row.speed for row in measurements])

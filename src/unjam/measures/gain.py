@@ -1,6 +1,6 @@
 """Normalized gain of a driver on a road: 0 is the human baseline, 1 the best known driver.
 
-It makes roads with different metrics comparable: speed on closed roads, travel time on open ones.
+The gain makes roads with different metrics comparable: speed on closed roads, travel time on open roads.
 """
 
 from collections.abc import Sequence
@@ -15,55 +15,55 @@ from unjam.worlds.record import Floats
 
 MIN_GAIN, MAX_GAIN = -1.0, 1.5  # range to which gains are clipped
 MIN_REFERENCE_GAIN = 0.03
-"""smallest improvement by the reference, as a share of the baseline's performance; below it there is nothing to gain"""
+"""improvement by the reference, relative to the baseline's performance, below which there is nothing to gain"""
 MEAN_GAIN = "mean gain"  # name of the objective of tuning on several roads
 
 
 def performance(row: dict[str, Any]) -> float:
-    """Return the performance in a row of `measure`; larger is better.
+    """Return the performance from a row of `measure`; larger is better.
 
-    Minus the travel time, departure delay included [s], on open roads; the mean speed of all vehicles in the
-    second half of the episode [m/s] on closed ones.
+    It is minus the travel time on open roads, departure delay included [s], and the mean speed of all vehicles in the
+    second half of the episode on closed roads [m/s].
     """
     return -row["travel_time"] if np.isfinite(row["travel_time"]) else row["mean_speed_second_half"]
 
 
 def performance_bound(row: dict[str, Any]) -> float:
-    """Return an upper bound of long-run performance: that of a free road, or of one without waves."""
+    """Return an upper bound of performance: that in free flow on open roads, and without waves on closed roads."""
     if np.isfinite(row["travel_time"]):
         return row["delay"] - row["travel_time"]
     return row["mean_speed"] / row["speed_limit_ratio"]
 
 
 def is_gain_negligible(baseline: EpisodeRows, reference: Sequence[float]) -> bool:
-    """Return whether the reference is hardly better than the human baseline, so that there is nothing to gain."""
+    """Return whether the reference is so close to the human baseline that there is nothing to gain."""
     baseline_mean = float(np.mean([performance(row) for row in baseline]))
     return float(np.mean(reference)) - baseline_mean < MIN_REFERENCE_GAIN * abs(baseline_mean)
 
 
 def normalized_differences(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> Floats:
-    """Return the gain over the baseline by seed, relative to that of the reference, linearized around the mean.
+    """Return the gain over the baseline for each seed, relative to the gain of the reference and linearized.
 
     A negligible gain of the reference is replaced by `MIN_REFERENCE_GAIN`. Episodes that did not run have a gain of
     zero. The arguments are those of `normalized_gain`.
     """
     pairs = {str(row["seed"]): (performance(row), best) for row, best in zip(baseline, reference, strict=True)}
-    before, best = np.array([pairs[str(row["seed"])] for row in rows]).T
-    scales = np.abs(before) * MIN_REFERENCE_GAIN if is_gain_negligible(baseline, reference) else best - before
-    return linearized_ratio(np.nan_to_num(np.array([performance(row) for row in rows]) - before, nan=0.0), scales)
+    human, best = np.array([pairs[str(row["seed"])] for row in rows]).T
+    scales = np.abs(human) * MIN_REFERENCE_GAIN if is_gain_negligible(baseline, reference) else best - human
+    return linearized_ratio(np.nan_to_num(np.array([performance(row) for row in rows]) - human, nan=0.0), scales)
 
 
 def is_gain_capped(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> bool:
-    """Return whether positive gains are zero: the driver is infeasible or lowers flow, or nothing can be gained."""
+    """Return whether positive gains count as zero: the driver is infeasible or lowers flow, or no gain is possible."""
     flow = paired_difference(rows, baseline, FLOW_METRIC)
     lowers_flow = flow.high < -MAX_FLOW_LOSS * float(np.mean([row[FLOW_METRIC] for row in baseline]))
     return is_gain_negligible(baseline, reference) or lowers_flow or overall_feasibility(rows, baseline) != FEASIBLE
 
 
 def normalized_gain(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> Estimate:
-    """Return the gain of a driver on one road over the human baseline, same seeds paired.
+    """Return the gain of a driver over the human baseline on one road, paired by seed.
 
-    `reference` is the best known performance on each seed of the baseline, or a bound of it. The gain is at
+    `reference` is the best known performance on each seed of the baseline, or an upper bound. The gain is at
     most zero where the driver is infeasible, where it is shown to lower flow by more than 1 %, and where the
     reference is hardly better than the baseline.
     """
@@ -74,7 +74,7 @@ def normalized_gain(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequenc
 
 
 def gain_by_seed(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> Floats:
-    """Return the gain on one road by seed; the mean over the seeds is that of `normalized_gain`.
+    """Return the gain on one road for each seed; the mean over seeds is that of `normalized_gain`.
 
     The CI of a mean over roads that share seeds is computed from these values, shape (seeds,). The arguments are those
     of `normalized_gain`.

@@ -1,4 +1,4 @@
-"""The table of all metrics, for terminals and pages alike: drivers, and their differences to a baseline."""
+"""The table of metrics in terminals and on pages: values of drivers, and differences to a baseline."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -25,15 +25,15 @@ HUMAN_LABEL = "human"  # label of the human baseline
 CAV_METRICS = {name for name, metric in METRICS.items() if metric.label.startswith("CAV")} | {
     *("min_ttc", "min_time_gap", "max_jerk", "filter_override_share", "override_share", "yield_share"),
     *("shield_override_share", "shield_max_braking"),
-}  # metrics of CAVs; in the human baseline, those of the human drivers in their places
+}  # metrics of CAVs; in the human baseline, of the human drivers that CAVs would replace
 
 
 @dataclass(frozen=True)
 class TableCell:
-    """A number in a table, as text."""
+    """The text of a number in a table."""
 
     mean: str
-    interval: str = ""  # CI, or the range without a CI; with the number of episodes if some are left out
+    interval: str = ""  # CI, or else the range of values; with the number of episodes if some are left out
 
     def __str__(self) -> str:
         return f"{self.mean} {self.interval}".strip()
@@ -50,20 +50,20 @@ class TableRow:
 
 
 def driver_rank(label: str) -> int:
-    """Return the rank by which drivers are ordered: the human baseline, formulas of the package, then all others."""
-    name = label.rpartition(": ")[2]  # in a comparison, the folder of results is before it
+    """Return the rank of a driver in tables: 0 for the human baseline, 1 for formulas of the package, 2 for others."""
+    name = label.rpartition(": ")[2]  # labels in a comparison begin with the folder of results
     if name == HUMAN_LABEL:
         return 0
-    return 1 if all(part.partition(":")[0] in DRIVERS for part in name.split("+")) else 2
+    return 1 if all(formula.partition(":")[0] in DRIVERS for formula in name.split("+")) else 2
 
 
 def order_by_rank(by_driver: Mapping[str, Value]) -> dict[str, Value]:
-    """Return the entries by driver in the order of all tables and figures; drivers of one rank keep their order."""
+    """Return the entries of drivers in the order of tables and figures, by `driver_rank`."""
     return {label: by_driver[label] for label in sorted(by_driver, key=driver_rank)}
 
 
 def choose_baseline(rows_by_driver: RowsByDriver, requested: str = "") -> str:
-    """Return the driver to compare with: a requested one, the human baseline, the best expert by return, or empty."""
+    """Return the driver to compare with: the requested one, the human baseline, the best expert by return, or empty."""
     if requested and len(rows_by_driver) > 1:
         return requested
     if len(rows_by_driver) < 2 or HUMAN_LABEL in rows_by_driver:
@@ -76,10 +76,10 @@ def choose_baseline(rows_by_driver: RowsByDriver, requested: str = "") -> str:
 def metric_table(
     rows_by_driver: RowsByDriver, baseline: str, names: Iterable[str] = METRICS
 ) -> tuple[list[str], list[TableRow]]:
-    """Return the headings; and verdicts, probabilities of improvement over the baseline, and metrics by `names`.
+    """Return the headings, and the rows of verdicts, of probabilities of improvement, and of the named metrics.
 
-    A row has a cell per driver, then the paired differences to the baseline; none without a baseline. Rows about CAVs
-    are left out if there are none.
+    A row has a cell for each driver, then one for each paired difference to the baseline, if there is a baseline. Rows
+    about CAVs are left out if no driver has CAVs.
     """
     has_cavs = any(map(driver_rank, rows_by_driver))
     compared = {label: rows for label, rows in rows_by_driver.items() if baseline and label != baseline}
@@ -102,7 +102,7 @@ def metric_table(
             continue
         estimates = [(metric_estimate(rows, name), len(rows)) for rows in rows_by_driver.values()]
         if not any(estimate.count for estimate, _ in estimates):
-            continue  # it is not defined on this road
+            continue  # the metric is not defined on this road
         cells = [estimate_cell(estimate, metric.digits, episodes) for estimate, episodes in estimates]
         for rows in compared.values():
             difference, units = paired_difference(rows, reference, name), count_units(rows, reference)
@@ -112,7 +112,7 @@ def metric_table(
 
 
 def estimate_cell(estimate: Estimate, digits: int, expected_count: int | None = None, sign: str = "") -> TableCell:
-    """Return a cell: mean and CI, unless that is a point; with the count if it is below `expected_count`."""
+    """Return a cell with the mean, the CI of different values, and the count if it is below `expected_count`."""
     if estimate.count == 0:
         return TableCell("–")
     format_spec = f"{sign if estimate.mean else ''}.{display_digits(estimate, digits)}f"

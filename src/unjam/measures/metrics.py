@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from unjam.measures import platoon_metrics as platoon
-from unjam.measures.averages import mean_of_present, mean_over_cavs, per_step, row_chunks
+from unjam.measures.averages import mean_over_cavs, mean_over_vehicle_steps, reduce_steps, row_chunks
 from unjam.measures.feasibility import feasibility
 from unjam.scenarios.scenario import sumo_seed
 from unjam.worlds.audit import BRAKING_THRESHOLDS, OVERRIDE_TOLERANCE, BrakingStatistics
@@ -17,14 +17,14 @@ from unjam.worlds.record import VEHICLE_GROUPS, Episode, Floats
 from unjam.worlds.reward import episode_reward_terms, eq16_reward
 
 STEADY_STATE_STEPS = 1000
-"""number of control steps at the end of an episode that are its steady state; in a shorter episode the second half"""
+"""number of control steps at the end of an episode that count as steady state; in a shorter episode, the second half"""
 STANDING_SPEED = 0.1  # speed below which a vehicle counts as standing [m/s]: SUMO's threshold of a halting vehicle
 MAX_CALM_SPEED_STD = 0.3  # standard deviation of speed across vehicles below which there is no wave [m/s]
 MIN_CALM_SECONDS = 60.0  # time without a wave after which the wave counts as dissolved [s]
 GASOLINE_DENSITY = 742.0  # density of gasoline in SUMO's PollutantsInterface [mg/ml]
 SHARE_BOUNDS, UNBOUNDED = (0.0, 1.0), (-inf, inf)  # bounds of shares, and of metrics that can be negative
 PEAK_END_SECONDS = 600.0
-"""duration at the end of the demand peak in which flow is counted [s]; there it is the capacity, not the demand"""
+"""duration at the end of the demand peak in which flow is counted [s]; this flow is the capacity, not the demand"""
 
 EpisodeFunction = Callable[[Episode], float]
 
@@ -34,39 +34,39 @@ def _steady_state(values: Floats) -> Floats:
 
 
 def mean_speed(episode: Episode) -> float:
-    """Mean over all vehicles and all steps of the episode, start-up included [m/s]."""
-    return mean_of_present(episode.speeds[1:])
+    """Mean speed over all vehicles and all steps of the episode, start-up included [m/s]."""
+    return mean_over_vehicle_steps(episode.speeds[1:])
 
 
 def mean_speed_step_average(episode: Episode) -> float:
-    """Mean over the steps of the mean over the vehicles then on the road [m/s]: Flow's convention.
+    """Mean over the steps of the mean speed of the vehicles on the road [m/s]: Flow's convention.
 
-    On an open road a step with few vehicles counts as much as one in a jam.
+    On an open road, a step with few vehicles counts as much as a step in a jam.
     """
-    return mean_of_present(per_step(np.nanmean, episode.speeds[1:]))
+    return mean_over_vehicle_steps(reduce_steps(np.nanmean, episode.speeds[1:]))
 
 
 def mean_speed_steady(episode: Episode) -> float:
-    """Mean over all vehicles in the last 1,000 steps [m/s]; of a shorter episode, in its second half."""
-    return mean_of_present(_steady_state(episode.speeds[1:]))
+    """Mean speed over all vehicles in the last 1,000 steps [m/s]; of a shorter episode, in its second half."""
+    return mean_over_vehicle_steps(_steady_state(episode.speeds[1:]))
 
 
 def mean_speed_second_half(episode: Episode) -> float:
-    """Mean over all vehicles in the second half of the episode [m/s]."""
-    return mean_of_present(episode.speeds[1 + episode.control_steps // 2 :])
+    """Mean speed over all vehicles in the second half of the episode [m/s]."""
+    return mean_over_vehicle_steps(episode.speeds[1 + episode.control_steps // 2 :])
 
 
 def speed_std_fleet(episode: Episode) -> float:
     """Standard deviation of speed across vehicles in a step, averaged over the episode [m/s].
 
-    It is the size of the waves: zero when all vehicles have the same speed. Stern et al. 2018, section 4.
+    It measures the size of waves, and is zero if all vehicles have the same speed. Stern et al. 2018, section 4.
     """
-    return mean_of_present(per_step(np.nanstd, episode.speeds[1:]))
+    return mean_over_vehicle_steps(reduce_steps(np.nanstd, episode.speeds[1:]))
 
 
 def speed_std_fleet_steady(episode: Episode) -> float:
     """Standard deviation of speed across vehicles, averaged over the steady state [m/s]."""
-    return mean_of_present(per_step(np.nanstd, _steady_state(episode.speeds[1:])))
+    return mean_over_vehicle_steps(reduce_steps(np.nanstd, _steady_state(episode.speeds[1:])))
 
 
 def speed_std_cav(episode: Episode) -> float:
@@ -80,17 +80,17 @@ def cav_mean_speed(episode: Episode) -> float:
 
 
 def speed_limit_ratio(episode: Episode) -> float:
-    """Mean speed over the scenario's own limit; on the ring the IDM equilibrium speed of its length."""
+    """Mean speed divided by the limit speed of the road, which is the IDM's equilibrium speed on a ring."""
     return mean_speed(episode) / (episode.limit_speed or np.nan)
 
 
 def speed_limit_ratio_steady(episode: Episode) -> float:
-    """Mean speed in the steady state over the scenario's own limit."""
+    """Mean speed in the steady state divided by the limit speed of the road."""
     return mean_speed_steady(episode) / (episode.limit_speed or np.nan)
 
 
 def episode_return(episode: Episode) -> float:
-    """Sum of the reward of the episode, not discounted; all CAVs share it."""
+    """Sum of the rewards of the episode, not discounted; all CAVs have the same reward."""
     return float(episode.reward.sum())
 
 
@@ -102,7 +102,7 @@ def return_eq16(episode: Episode) -> float:
 
 
 def mean_abs_accel(episode: Episode) -> float:
-    """Mean absolute commanded acceleration of the CAV [m/s2]; of a human driver, the actual one."""
+    """Mean absolute commanded acceleration of the CAV [m/s2]; of a human driver, the actual acceleration."""
     return mean_over_cavs(episode, lambda trajectory: np.abs(trajectory.applied_acceleration).mean())
 
 
@@ -114,42 +114,42 @@ def mean_abs_jerk(episode: Episode) -> float:
 
 
 def min_ttc(episode: Episode) -> float:
-    """Minimum time to collision [s], gap over closing speed, of the CAV and of its follower.
+    """Minimum time to collision of the CAV and of its follower, gap divided by closing speed [s].
 
-    Infinite if no vehicle ever closed in. Hayward 1972.
+    Infinite if neither was ever faster than its leader. Hayward 1972.
     """
     smallest = inf
     for trajectory in episode.trajectories:
-        own, leader, gap, follower, gap_behind, *_ = trajectory.states
-        for distance, closing in ((gap, own - leader), (gap_behind, follower - own)):
-            near = closing > 0
-            smallest = min(smallest, float((distance[near] / closing[near]).min(initial=inf)))
+        speed, leader_speed, leader_gap, follower_speed, follower_gap, *_ = trajectory.states
+        for gap, closing_speed in ((leader_gap, speed - leader_speed), (follower_gap, follower_speed - speed)):
+            is_closing = closing_speed > 0
+            smallest = min(smallest, float((gap[is_closing] / closing_speed[is_closing]).min(initial=inf)))
     return smallest
 
 
 def share_standing(episode: Episode) -> float:
     """Share of vehicle-seconds spent below 0.1 m/s."""
-    return mean_of_present(episode.speeds[1:], lambda speeds: speeds < STANDING_SPEED)
+    return mean_over_vehicle_steps(episode.speeds[1:], lambda speeds: speeds < STANDING_SPEED)
 
 
 def time_to_dissolve(episode: Episode) -> float:
-    """Time until the wave at the start of the episode is dissolved [s]; NaN without a wave, or if it stays.
+    """Time until the wave at the start of the episode is dissolved [s]; NaN without a wave, or if the wave stays.
 
     The wave is dissolved when the standard deviation of speed across vehicles stays below 0.3 m/s for 60 s.
     """
-    spread = per_step(np.nanstd, episode.speeds)
-    calm = np.isnan(spread) | (spread < MAX_CALM_SPEED_STD)
+    speed_std = reduce_steps(np.nanstd, episode.speeds)
+    is_calm = np.isnan(speed_std) | (speed_std < MAX_CALM_SPEED_STD)
     steps = round(MIN_CALM_SECONDS / episode.control_step)
-    if calm[0] or len(calm) < steps:
+    if is_calm[0] or len(is_calm) < steps:
         return nan
-    dissolved = np.flatnonzero(np.convolve(calm, np.ones(steps), "valid") > steps - 0.5)
-    return float(dissolved[0] * episode.control_step) if len(dissolved) else nan
+    dissolved_steps = np.flatnonzero(np.convolve(is_calm, np.ones(steps), "valid") > steps - 0.5)
+    return float(dissolved_steps[0] * episode.control_step) if len(dissolved_steps) else nan
 
 
 def collisions(episode: Episode) -> float:
-    """Vehicles that collided, on a user's network by its own settings.
+    """Number of vehicles that collided; on a user's network its settings define collisions.
 
-    A collision of a CAV ends an episode on a built-in road, and on a user's network in training.
+    A collision of a CAV ends an episode on built-in roads, and in training also on a user's network.
     """
     return float(episode.collisions)
 
@@ -165,16 +165,16 @@ def shield_override_share(episode: Episode) -> float:
 
 
 def shield_max_braking(episode: Episode) -> float:
-    """Maximum braking that the safety check added to a command [m/s2]."""
+    """Maximum braking that SUMO's safety check added to a command [m/s2]."""
     return float(max((trajectory.shield_braking.max() for trajectory in episode.trajectories), default=np.nan))
 
 
 def fuel_ml_per_km(episode: Episode) -> float:
-    """Fuel of all vehicles per kilometer [ml/km], by the scenario's emission class; NaN without any distance.
+    """Fuel of all vehicles per kilometer by the scenario's emission class [ml/km]; NaN if no vehicle moves.
 
-    SUMO's emission model, where it was recorded: https://sumo.dlr.de/docs/Models/Emissions.html. HBEFA4 burns 2.2 l/h
-    at standstill: on closed roads most of this is time, so that less of it is no evidence of smoother driving.
-    On a user's network it is measured once per second, and diesel counts with the density of gasoline.
+    Fuel is that of SUMO's emission model, where it was recorded: https://sumo.dlr.de/docs/Models/Emissions.html. HBEFA4
+    burns 2.2 l/h at standstill: on closed roads fuel mostly depends on time, so that less fuel is no evidence of
+    smoother driving. On a user's network fuel is measured once per second, with the density of gasoline for diesel.
     """
     if episode.fuel.size == 0:
         return nan
@@ -184,16 +184,16 @@ def fuel_ml_per_km(episode: Episode) -> float:
 
 def outflow_veh_per_h(episode: Episode) -> float:
     """Flow [veh/h]. On a closed road: distance of all vehicles over length and time (Edie 1963). On an open
-    road: vehicles that left it over the time of all planned control steps; with a demand peak, in its last ten
-    minutes. Behind a recorded vehicle: distance of the platoon over its length and time.
+    road: number of vehicles that left the road over the time of all planned control steps, or over the last ten
+    minutes of a demand peak. Behind a recorded vehicle: distance of the platoon over its length and time.
     """
     step, steps = episode.control_step, episode.control_steps
     if episode.demand_peak[1] > 0:
         end, peak_start = min(round(episode.demand_peak[1] / step), steps), round(episode.demand_peak[0] / step)
         begin = max(peak_start if peak_start < end else 0, end - round(PEAK_END_SECONDS / step))
         present = ~np.isnan(episode.speeds[begin : end + 1])
-        left = (present[:-1] & ~present[1:]).sum()
-        return float(left * 3600.0 / max(end - begin, 1) / step)
+        exit_count = (present[:-1] & ~present[1:]).sum()
+        return float(exit_count * 3600.0 / max(end - begin, 1) / step)
     hours, planned = steps * step / 3600.0, np.nan_to_num(episode.planned_duration) / 3600.0
     if episode.has_recorded_leader:
         length = episode.replayed_motion[1:, 0, 0] - episode.positions[1:, 0]
@@ -207,26 +207,25 @@ def outflow_veh_per_h(episode: Episode) -> float:
 def mean_travel_time(episode: Episode) -> float:
     """Mean time of the vehicles of the demand, departure delay included [s]; NaN on a closed road.
 
-    It is the integral over time of the vehicles on the road and in the insertion backlog, over the vehicles
-    of the demand, so that keeping vehicles out is no gain. Vehicles under way at the end count with their time
-    so far, after a collision with all the planned time. On a user's network: mean `duration` plus
-    `departDelay` of SUMO's trips.
+    It is the total time of vehicles on the road and in the insertion backlog, divided by the number of vehicles of the
+    demand, so that keeping vehicles out is no gain. Vehicles under way at the end count with their time so far; after a
+    collision the remaining planned time is added. On a user's network: mean `duration` plus `departDelay` of SUMO.
     """
-    collided = episode.status == "collision"
-    if episode.trips.vehicle_ids and not collided:
+    has_crashed = episode.status == "collision"
+    if episode.trips.vehicle_ids and not has_crashed:
         return float(episode.trips.travel_time.mean())
     if not len(episode.backlog):
         return nan
     under_way = (~np.isnan(episode.speeds)).sum(axis=1) + episode.backlog
     demand = len(episode.vehicle_ids) + episode.backlog[-1] - episode.teleported - episode.removed
     remaining = episode.planned_duration - episode.control_steps * episode.control_step
-    lost = max(0.0, remaining) if collided else 0.0
-    return float((under_way[1:].sum() * episode.control_step + under_way[-1] * lost) / (demand or np.nan))
+    lost_time = max(0.0, remaining) if has_crashed else 0.0
+    return float((under_way[1:].sum() * episode.control_step + under_way[-1] * lost_time) / (demand or np.nan))
 
 
 def delay(episode: Episode) -> float:
-    """Mean delay of a trip [s]: SUMO's `timeLoss` plus `departDelay` on a user's network, elsewhere travel time
-    minus that on a free road; NaN if neither is known.
+    """Mean delay of a trip [s]: SUMO's `timeLoss` plus `departDelay` on a user's network, travel time minus that in
+    free flow on other roads; NaN if unknown.
     """
     trips = episode.trips
     return float(trips.delay.mean()) if trips.vehicle_ids else mean_travel_time(episode) - episode.free_flow_time
@@ -235,7 +234,7 @@ def delay(episode: Episode) -> float:
 def min_time_gap(episode: Episode) -> float:
     """Minimum time gap of the CAV, net gap over own speed, while it drives faster than 1 m/s [s]; NaN if never.
 
-    This and the following values of the audit cover all simulation steps; on the merge, all control steps.
+    The audit, also of the other metrics of safety, covers all simulation steps; on the merge, all control steps.
     """
     return _nan_if_infinite(episode.audit.following.min_time_gap)
 
@@ -245,12 +244,12 @@ def _nan_if_infinite(value: float) -> float:
 
 
 def cav_min_ttc(episode: Episode) -> float:
-    """Minimum time to collision of the CAV with its leader [s]; NaN if it never closed in."""
+    """Minimum time to collision of the CAV with its leader [s]; NaN if the CAV was never faster."""
     return _nan_if_infinite(episode.audit.following.min_time_to_collision)
 
 
 def share_short_time_gap(episode: Episode) -> float:
-    """Share of the CAV's time faster than 1 m/s with a time gap below one second."""
+    """Share of the time in which the CAV drives faster than 1 m/s with a time gap below one second."""
     return episode.audit.following.share_short_time_gap if episode.cav_ids else nan
 
 
@@ -275,7 +274,7 @@ def cav_max_braking(episode: Episode) -> float:
 def cut_in_max_braking(episode: Episode) -> float:
     """Maximum braking of a CAV in the 3 s after another vehicle cut in [m/s2], on roads with lanes.
 
-    It is not part of the other braking of CAVs; NaN if there were no cut-ins.
+    Other metrics of the braking of CAVs exclude these 3 s. NaN without cut-ins.
     """
     return _max_braking(episode.audit.cut_in_braking)
 
@@ -295,17 +294,17 @@ def override_share(episode: Episode) -> float:
 
 
 def yield_share(episode: Episode) -> float:
-    """Share of commands that SUMO changed near a crossing, where vehicles yield."""
+    """Share of commands that SUMO changed near a crossing, where vehicles must yield."""
     return episode.audit.following.yield_share
 
 
 def insertion_backlog_veh(episode: Episode) -> float:
-    """Vehicles in the insertion backlog at the end; zero on a closed road."""
+    """Number of vehicles in the insertion backlog at the end; zero on a closed road."""
     return float(episode.backlog[-1] - episode.removed) if len(episode.backlog) else 0.0
 
 
 def travel_time_metric(group: str) -> EpisodeFunction:
-    """Return the metric that is the travel time of one group of vehicles, departure delay included [s]."""
+    """Return the metric function of the travel time of one group of vehicles, departure delay included [s]."""
 
     def mean(episode: Episode) -> float:
         return episode.trips.mean_travel_time(group)
@@ -316,7 +315,7 @@ def travel_time_metric(group: str) -> EpisodeFunction:
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric, and how tables show it."""
+    """A metric, and its label, unit and format in tables."""
 
     function: EpisodeFunction  # computes the metric; its docstring is the description in tables
     label: str
@@ -326,20 +325,21 @@ class Metric:
 
 
 def _braking_metrics(group: Literal["CAV", "human"]) -> dict[str, Metric]:
-    """Return a metric for each of `BRAKING_THRESHOLDS`: how often a group of vehicles brakes harder."""
+    """Return the metrics of how often a group of vehicles brakes harder than each of `BRAKING_THRESHOLDS`."""
 
     def exceedance(index: int, limit: float) -> EpisodeFunction:
-        def per_million(episode: Episode) -> float:
+        def rate(episode: Episode) -> float:
             cavs, humans = episode.audit.cav_braking, episode.audit.human_braking
             braking, samples = (cavs, cavs.samples) if group == "CAV" else (humans, cavs.samples + humans.samples)
             return 1e6 * braking.exceedances[index] / samples if braking.samples else nan
 
-        person, steps = ("CAV", "those of CAVs") if group == "CAV" else ("human driver", "those of all vehicles")
-        per_million.__doc__ = (
-            f"Vehicle-steps (simulation) in which a {person} brakes beyond {limit:g} m/s2, of {steps} [per million]. "
+        driver, vehicles = ("CAV", "CAVs") if group == "CAV" else ("human driver", "all vehicles")
+        rate.__doc__ = (
+            f"Rate of vehicle-steps (simulation) with braking of a {driver} beyond {limit:g} m/s2, of all steps of "
+            f"{vehicles} [per million]. "
             "ISO 15622 allows 3.5 above 20 m/s; dry asphalt hardly allows 9."
         )
-        return per_million
+        return rate
 
     return {
         f"{group.lower()}_braking_beyond_{limit:g}".replace(".", "_"): Metric(
@@ -416,7 +416,7 @@ RECORDED_ROAD_METRICS = (
 
 
 def measure(episode: Episode) -> dict[str, Any]:
-    """Return the row of an episode: its seeds, status, steps, drawn values, all metrics, and the feasibility.
+    """Return the row of an episode: seeds, status, steps, drawn values, all metrics, and the verdict on feasibility.
 
     The metrics of a failed episode are NaN, and its row contains the reason.
     """

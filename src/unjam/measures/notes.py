@@ -10,12 +10,12 @@ from unjam.measures.feasibility import EpisodeRows, RowsByDriver
 from unjam.measures.statistics import count_teleports, has_ended_early
 from unjam.text import format_count
 
-MAX_EARLY_END_SHARE = 0.05  # share of the baseline's episodes that may end early; with more, comparisons would mislead
-MAX_WARNING_KINDS = 10  # kinds of SUMO's warnings that are shown, the most frequent first
-MAX_BACKLOG_SHARE = 0.05  # share of the vehicles in the insertion backlog at the end, above which there is a note
+MAX_EARLY_END_SHARE = 0.05  # share of the baseline's episodes that may end early in comparisons
+MAX_WARNING_KINDS = 10  # maximum number of kinds of SUMO's warnings in notes, the most frequent first
+MAX_BACKLOG_SHARE = 0.05  # share of vehicles in the insertion backlog at the end above which there is a note
 MAX_UNFINISHED_SHARE, MAX_DELAY_SHARE = 0.05, 1 / 3
-"""share of the vehicles that have not arrived at the end, above which there is a note, and share of delay in their
-travel time, above which traffic is still congested"""
+"""share of vehicles that have not arrived at the end above which there is a note, and share of delay in their travel
+time above which traffic counts as congested"""
 LOST_DEMAND_PATTERN = re.compile(
     "sorted by departure time|no (valid )?route|discard|removing vehicle|not reachable|inserted", re.IGNORECASE
 )  # pattern of SUMO's warnings about missing demand, which are listed first
@@ -23,10 +23,10 @@ LOST_DEMAND_PATTERN = re.compile(
 
 def episode_notes(rows_by_driver: RowsByDriver) -> list[str]:
     """Return all notes on the episodes of several drivers, the most serious first."""
-    lost, others = warning_notes(rows_by_driver)
+    demand_warnings, other_warnings = warning_notes(rows_by_driver)
     traffic = early_end_notes, _backlog_notes, _unfinished_trip_notes, _entrance_notes, _flow_notes
-    notes = (note(rows_by_driver) for note in (*traffic, teleport_notes, _repeated_drive_notes))
-    return [*lost, *(note for group in notes for note in group), *others]
+    groups = (find_notes(rows_by_driver) for find_notes in (*traffic, teleport_notes, _repeated_drive_notes))
+    return [*demand_warnings, *(note for group in groups for note in group), *other_warnings]
 
 
 def count_early_ends(rows: EpisodeRows) -> dict[str, int]:
@@ -35,9 +35,9 @@ def count_early_ends(rows: EpisodeRows) -> dict[str, int]:
 
 
 def early_end_notes(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return a note for each driver with episodes that ended early, with the reasons."""
-    early = ((label, rows) for label, rows in rows_by_driver.items() if count_early_ends(rows))
-    return [f"{label}: {_early_end_text(rows)}; means are over complete episodes only" for label, rows in early]
+    """Return a note with reasons for each driver with episodes that ended early."""
+    affected = ((label, rows) for label, rows in rows_by_driver.items() if count_early_ends(rows))
+    return [f"{label}: {_early_end_text(rows)}; means are over complete episodes only" for label, rows in affected]
 
 
 def _early_end_text(rows: EpisodeRows) -> str:
@@ -47,9 +47,9 @@ def _early_end_text(rows: EpisodeRows) -> str:
 
 
 def check_baseline(rows: EpisodeRows, planned_episodes: int = 0) -> None:
-    """Raise `InputError` if so many episodes of the human baseline ended early that comparisons would mislead.
+    """Raise `InputError` if too many episodes of the human baseline ended early for a comparison.
 
-    `planned_episodes` is their planned number, if it is larger than that of the `rows` so far.
+    `planned_episodes` is the planned number of episodes if `rows` do not yet have all of them.
     """
     if sum(count_early_ends(rows).values()) > MAX_EARLY_END_SHARE * max(len(rows), planned_episodes):
         reason = "because CAVs are compared with the baseline"
@@ -57,7 +57,7 @@ def check_baseline(rows: EpisodeRows, planned_episodes: int = 0) -> None:
 
 
 def teleport_notes(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return a note for each driver with teleports, which do not exist in real traffic."""
+    """Return a note for each driver with teleports, which are artifacts of the simulation."""
     counts = {label: count_teleports(rows) for label, rows in rows_by_driver.items()}
     count_texts = {label: format_count(count, "vehicle") for label, count in counts.items() if count}
     reason = "which had waited longer than time-to-teleport or collided"
@@ -70,14 +70,15 @@ def _repeated_drive_notes(rows_by_driver: RowsByDriver) -> list[str]:
     drives = {tuple(row[name] for name in ("file", "part", "begin")) for row in rows if "part" in row}
     if not drives or len(drives) == len(rows):
         return []
-    alike = (
-        "those of the same drive differ in the noise of human drivers alone: in paired differences they count as one, "
-        "and intervals of single drivers are too narrow"
+    consequence = (
+        "episodes of the same drive differ only in the noise of human drivers: they count as one in paired "
+        "differences, and confidence intervals of single drivers are too narrow"
     )
-    return [f"{format_count(len(rows), 'episode')} of {format_count(len(drives), 'recorded drive')}: {alike}"]
+    return [f"{format_count(len(rows), 'episode')} of {format_count(len(drives), 'recorded drive')}: {consequence}"]
 
 
 def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
+    """Return a note for each driver with many vehicles in the insertion backlog at the end."""
     notes = []
     for label, rows in rows_by_driver.items():
         complete = [row for row in rows if row["status"] == "completed"]
@@ -90,8 +91,8 @@ def _backlog_notes(rows_by_driver: RowsByDriver) -> list[str]:
 
 
 def _unfinished_trip_notes(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return a note if trips of many vehicles have not ended with some drivers, so that travel times are cut off."""
-    shares, delayed = dict[str, float](), list[str]()
+    """Return a note on the drivers with which many trips have not ended, so that travel times are cut off."""
+    shares, congested_drivers = dict[str, float](), list[str]()
     for label, rows in rows_by_driver.items():
         complete = [row for row in rows if row["status"] == "completed" and "unfinished_trips" in row]
         # Vehicles that wait for persons are not in the backlog.
@@ -100,32 +101,32 @@ def _unfinished_trip_notes(rows_by_driver: RowsByDriver) -> list[str]:
         if unfinished > MAX_UNFINISHED_SHARE * demand:
             shares[label] = unfinished / demand
             delay_shares = [row["delay_share_at_end"] for row in complete]
-            delayed += [label] if sum(delay_shares) > MAX_DELAY_SHARE * len(delay_shares) else []
+            congested_drivers += [label] if sum(delay_shares) > MAX_DELAY_SHARE * len(delay_shares) else []
     if not shares:
         return []
-    which = "" if delayed == [*shares] else f" with {'; '.join(delayed)}"
-    congested = f" (traffic is still congested{which})" if delayed else ""
-    most = 100 * max(shares.values())
+    drivers = "" if congested_drivers == [*shares] else f" with {'; '.join(congested_drivers)}"
+    congested = f" (traffic is still congested{drivers})" if congested_drivers else ""
+    percent = 100 * max(shares.values())
     return [
-        f"{'; '.join(shares)}: up to {most:.0f} % of the vehicles are under way or waiting at the end{congested}; "
+        f"{'; '.join(shares)}: up to {percent:.0f} % of the vehicles are under way or waiting at the end{congested}; "
         "their travel time counts until then, and a later --end shows more of it"
     ]
 
 
 def _entrance_notes(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return a note for each entrance at which vehicles wait without a jam, with its values in one episode."""
+    """Return a note for each entrance at which vehicles wait without a jam, with the values of one episode."""
     rows = (row for rows in rows_by_driver.values() for row in rows)
-    slow = {entrance["edge"]: entrance for row in rows for entrance in row.get("slow_entrances", ())}
+    slow_entrances = {entrance["edge"]: entrance for row in rows for entrance in row.get("slow_entrances", ())}
     return [
-        f"{edge}: {each['vehicles']} vehicles wait {each['depart_delay']:.0f} s on average for their insertion without "
-        f'a jam, and depart at {each["depart_speed"]:.0f} m/s; departSpeed="max" departLane="best" lets them enter '
-        "as fast as is safe, if the entrance has the capacity for the demand"
-        for edge, each in slow.items()
+        f"{edge}: {entrance['vehicles']} vehicles wait {entrance['depart_delay']:.0f} s on average for their insertion "
+        f'without a jam, and depart at {entrance["depart_speed"]:.0f} m/s; departSpeed="max" departLane="best" lets '
+        "them enter as fast as is safe, if the entrance has the capacity for the demand"
+        for edge, entrance in slow_entrances.items()
     ]
 
 
 def _flow_notes(rows_by_driver: RowsByDriver) -> list[str]:
-    """Return a note if flow is the demand with every driver, since all vehicles arrive before the end."""
+    """Return a note if flow equals the demand with all drivers, because all vehicles arrive before the end."""
     all_rows = [rows for rows in rows_by_driver.values() if rows]
     flows = dict[str, set[float]]()
     for row in (row for rows in all_rows for row in rows if row["status"] == "completed"):
@@ -134,27 +135,29 @@ def _flow_notes(rows_by_driver: RowsByDriver) -> list[str]:
     have_arrived = all(row.get("unfinished_trips", 1) == 0 for rows in all_rows for row in rows)
     if len(all_rows) < 2 or not is_demand or not have_arrived:
         return []
-    return ["flow: that of the demand with all drivers, since all vehicles arrive before the end: it says nothing here"]
+    return [
+        "flow: equal to the demand with all drivers, because all vehicles arrive before the end: it is no result here"
+    ]
 
 
 def warning_notes(rows_by_driver: RowsByDriver) -> tuple[list[str], list[str]]:
-    """Return a note with one example for each kind of SUMO's warnings: on missing demand, and others."""
+    """Return notes on missing demand, and notes on other warnings of SUMO: an example of each kind of warning."""
     rows = [row for rows in rows_by_driver.values() for row in rows if row["status"] != "failed"]
     counts, episodes, examples = Counter[str](), Counter[str](), dict[str, str]()
     for warning in (warning for row in rows for warning in row["warnings"]):
         examples.setdefault(warning["kind"], warning["example"])
         counts[warning["kind"]] += warning["count"]
         episodes[warning["kind"]] += 1
-    lost, others = list[str](), list[str]()
+    demand_notes, other_notes = list[str](), list[str]()
     for kind, count in counts.most_common():
         share = f"{episodes[kind]} of {format_count(len(rows), 'episode')}"
         frequency = f" ({format_count(count, 'warning')} of this kind in {share})"
         note = examples[kind] + (frequency if len(rows) > 1 or count > 1 else "")
         if LOST_DEMAND_PATTERN.search(kind):
-            lost.append(f"demand is missing, SUMO warns: {note}")
+            demand_notes.append(f"demand is missing, SUMO warns: {note}")
         else:
-            others.append(f"SUMO warns: {note}")
-    if len(others) > MAX_WARNING_KINDS:
-        more = len(others) - MAX_WARNING_KINDS
-        others[MAX_WARNING_KINDS:] = [f"SUMO gives {format_count(more, 'less frequent kind')} of warnings"]
-    return lost, others
+            other_notes.append(f"SUMO warns: {note}")
+    if len(other_notes) > MAX_WARNING_KINDS:
+        omitted = len(other_notes) - MAX_WARNING_KINDS
+        other_notes[MAX_WARNING_KINDS:] = [f"SUMO gives {format_count(omitted, 'less frequent kind')} of warnings"]
+    return demand_notes, other_notes

@@ -1,4 +1,4 @@
-"""Metrics of fuel by power, of the gaps of CAVs, and of a platoon behind a recorded vehicle."""
+"""Metrics of fuel by power, of gaps of CAVs, and of a platoon behind a recorded vehicle."""
 
 from collections.abc import Callable
 from math import inf, nan
@@ -10,14 +10,14 @@ from unjam.measures.averages import mean_over_cavs, row_chunks
 from unjam.physics.fuel import fuel_rate
 from unjam.worlds.record import VEHICLE_GROUPS, Episode, Floats
 
-MIN_WAVE_STD = 0.05  # std of the recorded speed below which there are no waves that could be amplified [m/s]
+MIN_WAVE_STD = 0.05  # standard deviation of the recorded speed below which there are no waves [m/s]
 
 
 def fuel_by_power(episode: Episode) -> float:
     """Fuel of all vehicles by the power that a mid-size petrol car needs [ml/km], with 0.9 l/h at standstill.
 
-    On a user's network it counts cars, trucks and buses, each as such a car. Treiber and Kesting 2013, Traffic Flow
-    Dynamics, section 20.4.
+    On a user's network cars, trucks and buses count, all with the power of this car. Treiber and Kesting 2013, Traffic
+    Flow Dynamics, section 20.4.
     """
     return _fuel_by_power(episode, np.s_[:])
 
@@ -28,26 +28,26 @@ def cav_fuel_by_power(episode: Episode) -> float:
 
 
 def human_fuel_by_power(episode: Episode) -> float:
-    """Fuel of the human drivers by power [ml/km], as `fuel_by_power`; NaN without any."""
+    """Fuel of the human drivers by power [ml/km], as `fuel_by_power`; NaN without human drivers."""
     return _fuel_by_power(episode, np.setdiff1d(np.arange(episode.speeds.shape[1]), episode.cav_columns))
 
 
 def _fuel_by_power(episode: Episode, columns: Any) -> float:
-    """Return the fuel of the vehicles in some columns; acceleration is the change of speed in a control step.
+    """Return the fuel of the vehicles in `columns` by power; acceleration is the change of speed in a control step.
 
-    The step in which a vehicle enters has no acceleration, so that neither its fuel nor its distance counts.
+    The acceleration in the step in which a vehicle enters is unknown: neither fuel nor distance of this step counts.
     """
     if episode.trips.vehicle_ids:
-        counted = episode.trips.vehicles_of(*VEHICLE_GROUPS)
+        counted_ids = episode.trips.vehicles_of(*VEHICLE_GROUPS)
         is_counted = np.zeros(episode.speeds.shape[1], bool)  # only vehicles of one class share a column
-        numbers = np.array(episode.vehicle_columns or range(len(is_counted)), np.intp)
-        is_counted[numbers] = [name in counted for name in episode.vehicle_ids]
-        numbers = np.arange(len(is_counted))[columns]
-        columns = numbers[is_counted[numbers]]
+        vehicle_columns = np.array(episode.vehicle_columns or range(len(is_counted)), np.intp)
+        is_counted[vehicle_columns] = [vehicle_id in counted_ids for vehicle_id in episode.vehicle_ids]
+        indices = np.arange(len(is_counted))[columns]
+        columns = indices[is_counted[indices]]
     speeds, fuel, distance = episode.speeds[:, columns], 0.0, 0.0
-    for before, after in zip(row_chunks(speeds[:-1]), row_chunks(speeds[1:]), strict=True):
-        fuel += float(np.nansum(fuel_rate(after, (after - before) / episode.control_step)))
-        distance += float(np.nansum(np.where(np.isnan(before), np.nan, after)))
+    for previous, current in zip(row_chunks(speeds[:-1]), row_chunks(speeds[1:]), strict=True):
+        fuel += float(np.nansum(fuel_rate(current, (current - previous) / episode.control_step)))
+        distance += float(np.nansum(np.where(np.isnan(previous), np.nan, current)))
     return fuel / (distance / 1000.0) if distance else nan
 
 
@@ -57,7 +57,7 @@ def cav_mean_gap(episode: Episode) -> float:
 
 
 def cav_gap_95(episode: Episode) -> float:
-    """Gap of the CAV to its leader that it exceeds in 5 % of the time [m]."""
+    """Gap of the CAV to its leader that is exceeded in 5 % of the time [m]."""
     return mean_over_cavs(episode, lambda trajectory: np.quantile(trajectory.states.leader_gap[1:], 0.95))
 
 
@@ -67,35 +67,35 @@ def cav_max_gap(episode: Episode) -> float:
 
 
 def time_behind_leader(episode: Episode) -> float:
-    """Time by which the last vehicle is behind the recorded one at the end [s]; NaN on other roads.
+    """Time by which the last vehicle is behind the recorded vehicle at the end [s]; NaN on other roads.
 
-    What it is longer than with human drivers is time that the platoon has lost. Where the last vehicle has not reached
-    the point at which the recording begins, the recorded vehicle is taken to have driven there with its mean speed;
-    NaN if that is zero.
+    The difference to human drivers is time that the platoon has lost. If the last vehicle has not reached the point at
+    which the recording begins, the recorded vehicle is assumed to have driven there with its mean speed; NaN if this
+    speed is zero.
     """
     if not episode.has_recorded_leader:
         return nan
-    leader, last = episode.replayed_motion[:, 0, 0], float(episode.positions[-1, 0])
-    passed = float(np.interp(last, leader, np.arange(len(episode.speeds))))
-    if last < leader[0]:
-        step_length = float(leader[-1] - leader[0]) / (len(leader) - 1)
-        passed = (last - float(leader[0])) / step_length if step_length > 0.0 else nan
-    return (episode.control_steps - passed) * episode.control_step
+    leader_positions, position = episode.replayed_motion[:, 0, 0], float(episode.positions[-1, 0])
+    leader_step = float(np.interp(position, leader_positions, np.arange(len(episode.speeds))))
+    if position < leader_positions[0]:
+        step_length = float(leader_positions[-1] - leader_positions[0]) / (len(leader_positions) - 1)
+        leader_step = (position - float(leader_positions[0])) / step_length if step_length > 0.0 else nan
+    return (episode.control_steps - leader_step) * episode.control_step
 
 
 def amplification(episode: Episode) -> float:
-    """Standard deviation over time of the last vehicle's speed over that of the recorded vehicle; NaN elsewhere.
+    """Standard deviation over time of the last vehicle's speed, divided by that of the recorded vehicle.
 
-    Above 1 the platoon amplifies the waves of the vehicle ahead, below 1 it dampens them. NaN without waves, too.
+    Above 1 the platoon amplifies waves, below 1 it dampens them. NaN without waves, and on other roads.
     """
     if not episode.has_recorded_leader:
         return nan
-    spread = float(np.std(episode.replayed_motion[1:, 0, 1]))
-    return float(np.std(episode.speeds[1:, 0])) / spread if spread > MIN_WAVE_STD else nan
+    recorded_std = float(np.std(episode.replayed_motion[1:, 0, 1]))
+    return float(np.std(episode.speeds[1:, 0])) / recorded_std if recorded_std > MIN_WAVE_STD else nan
 
 
 def period_amplification(longest: float, shortest: float) -> Callable[[Episode], float]:
-    """Return the metric that is the amplification of waves with periods between two limits [s]."""
+    """Return the metric function of the amplification of waves with periods between two limits [s]."""
 
     def ratio(episode: Episode) -> float:
         if not episode.has_recorded_leader:
@@ -111,14 +111,14 @@ def period_amplification(longest: float, shortest: float) -> Callable[[Episode],
 
     limits = f"above {shortest:g} s" if longest == inf else f"of {shortest:g} to {longest:g} s"
     ratio.__doc__ = (
-        f"Amplification of waves with periods {limits} from the recorded to the last vehicle; NaN elsewhere, and if "
-        f"the recorded vehicle has waves of less than {MIN_WAVE_STD:g} m/s."
+        f"Amplification of waves with periods {limits} from the recorded to the last vehicle; NaN on other roads, and "
+        f"if the waves of the recorded vehicle are below {MIN_WAVE_STD:g} m/s."
     )
     return ratio
 
 
 def _spectrum(speeds: Floats) -> Floats:
-    """Return the standard deviation of a speed at each frequency, without its trend, which a Hann window needs."""
+    """Return the standard deviation of a speed at each frequency; its trend is removed for the Hann window."""
     steps, window = np.arange(len(speeds)), np.hanning(len(speeds))
     trend = np.polynomial.Polynomial.fit(steps, speeds, 1)(steps)
     scale = np.sqrt(2.0 / (len(speeds) * np.sum(window**2)))

@@ -17,27 +17,26 @@ from unjam.measures.statistics import Estimate, format_difference, format_percen
 from unjam.text import format_count
 
 MAX_TELEPORT_SHARE = 0.01
-"""share of the baseline's vehicles that SUMO may teleport or remove; with more of them travel times mean nothing"""
-MAX_CAV_SLOWDOWN = 0.1  # share by which CAVs may be slower than with ACC alone: a controller must not sacrifice them
+"""share of the baseline's vehicles above which teleports and removals by SUMO make travel times meaningless"""
+MAX_CAV_SLOWDOWN = 0.1  # maximum relative loss of the CAVs' own speed compared with ACC vehicles
 NEGLIGIBLE_DELAY_SHARE = 0.05
-"""delay of the human baseline up to which there is nothing to gain, as a share of the free-flow travel time"""
-MIN_VERDICT_SEEDS = 10  # minimum number of seeds for a recommendation; with fewer the CI is not reliable
-RECOMMENDED, NOT_RECOMMENDED, UNDECIDED = "recommended", "not recommended", "not yet known"  # on a controller or road
+"""delay of the human baseline, relative to the free-flow travel time, up to which there is nothing to gain"""
+MIN_VERDICT_SEEDS = 10  # minimum number of seeds of a reliable CI
+RECOMMENDED, NOT_RECOMMENDED, UNDECIDED = "recommended", "not recommended", "not yet known"  # verdicts
 ACC_BASELINE = "ACC vehicles alone"
 
 
 def rejection_reasons(effect: Effect) -> list[str]:
-    """Return all reasons against a recommendation."""
-    time, change, flow = effect.travel_time, format_seconds(effect.travel_time), format_difference(effect.flow)
+    """Return all reasons against recommending a controller with this effect."""
+    time, flow_text = effect.travel_time, format_difference(effect.flow)
+    time_text = format_seconds(time)
     is_known = time.low > 0 or time.high < 0 or effect.is_too_small
     keeps_flow = effect.flow.high < 0 or effect.flow.low >= -MAX_FLOW_LOSS * effect.baseline_flow
     teleported = f"SUMO teleports or removes {100 * effect.baseline_teleport_share:.1f} % of the vehicles"
-    teleports, contacts = (
-        format_count(number, "more vehicle") for number in (effect.teleports, round(effect.collisions))
-    )
+    teleports, contacts = (format_count(n, "more vehicle") for n in (effect.teleports, round(effect.collisions)))
     braking = f"{format_difference(effect.hard_braking)} times in a million vehicle-steps (a positive mean counts)"
-    may = "" if effect.hard_braking.low > 0 else " may"
-    # Too few seeds give NaN, with which every comparison is false: then a check fails.
+    verb = "brake" if effect.hard_braking.low > 0 else "may brake"
+    # With too few seeds CIs are NaN, all comparisons are false, and the checks fail.
     checks = (
         (
             time.count >= MIN_VERDICT_SEEDS or effect.is_infeasible,
@@ -51,41 +50,41 @@ def rejection_reasons(effect: Effect) -> list[str]:
         ),
         (effect.teleports <= 0, f"{teleports} teleported or removed than without CAVs"),
         *((not is_worse, reason) for is_worse, reason in effect.harm_checks),
-        (not effect.is_too_small, f"travel time differs from that of the human baseline by {TOO_SMALL}: {change}"),
-        (is_known, f"travel time is not shown to be shorter than that of the human baseline: {change}"),
-        (keeps_flow, f"flow may be lower by more than {100 * MAX_FLOW_LOSS:g} %: {flow} veh/h"),
+        (not effect.is_too_small, f"travel time differs from that of the human baseline by {TOO_SMALL}: {time_text}"),
+        (is_known, f"travel time is not shown to be shorter than that of the human baseline: {time_text}"),
+        (keeps_flow, f"flow may be lower by more than {100 * MAX_FLOW_LOSS:g} %: {flow_text} veh/h"),
         (effect.feasibility == FEASIBLE, f"infeasible: {effect.feasibility or 'no CAV drove'}"),
         (effect.collisions <= 0, f"{contacts} in contact than without CAVs"),
         (
             effect.hard_braking.mean <= 0,
-            f"human drivers{may} brake beyond 4.5 m/s² more often than in the human baseline: {braking}",
+            f"human drivers {verb} beyond 4.5 m/s² more often than in the human baseline: {braking}",
         ),
     )
     return [reason for is_fine, reason in checks if not is_fine]
 
 
 def required_seeds(difference: Estimate, half_width: float) -> float:
-    """Return the number of seeds with which a CI would exclude zero or be narrower than ±`half_width`.
+    """Return the number of seeds with which a CI is expected to exclude zero or to be narrower than ±`half_width`.
 
-    The assumption is that the mean stays the same and that the width of the CI falls with the square root of the number
-    of seeds. Without a CI the result is infinite.
+    The mean is assumed to stay the same, and the width of the CI to fall with the square root of the number of seeds.
+    Without a CI the result is infinite.
     """
-    half, target = difference.half_width, max(abs(difference.mean), half_width)
-    if not isfinite(half):
+    current, target = difference.half_width, max(abs(difference.mean), half_width)
+    if not isfinite(current):
         return inf
-    return max(float(MIN_VERDICT_SEEDS), ceil(difference.count * (half / target) ** 2) if half else 0.0)
+    return max(float(MIN_VERDICT_SEEDS), ceil(difference.count * (current / target) ** 2) if current else 0.0)
 
 
 @dataclass(frozen=True)
 class AccResult:
-    """Effect of ACC vehicles alone at a penetration rate, on test seeds."""
+    """Effect of ACC vehicles without a controller at a penetration rate, on test seeds."""
 
     penetration_rate: float
     effect: Effect
     property_effect: Estimate | None = None
-    """difference of travel time to ACC vehicles with all properties of the vehicles that they replace [s]; None: these
-    ACC vehicles have the same properties"""
-    missing_seeds: float = 0.0  # number of further test seeds with which the interval is narrow enough
+    """difference of travel time to ACC vehicles with all properties of the vehicles that they replace [s]; None: the
+    ACC vehicles already have these properties"""
+    missing_seeds: float = 0.0  # number of further test seeds until the CI is narrow enough
 
     @property
     def has_enough_seeds(self) -> bool:
@@ -94,7 +93,7 @@ class AccResult:
 
     @property
     def needs_comment(self) -> bool:
-        """Whether the summary says more than the differences: ACC vehicles are infeasible, or have other properties."""
+        """Whether ACC vehicles are infeasible or have other properties than the vehicles that they replace."""
         return self.effect.feasibility != FEASIBLE or self.property_effect is not None
 
     @property
@@ -110,7 +109,7 @@ class AccResult:
         label = f"{ACC_BASELINE} at a penetration rate of {format_percent(self.penetration_rate)}"
         text = f"{label}: travel time {change} compared with the human baseline. Differences: {self.effect.summary}."
         if self.effect.feasibility != FEASIBLE:
-            text += f" They are infeasible themselves: {self.effect.feasibility or 'no CAV drove'}."
+            text += f" ACC vehicles are infeasible themselves: {self.effect.feasibility or 'no CAV drove'}."
         if self.property_effect is None:
             return text
         return f"{text} The properties set for CAVs change {format_seconds(self.property_effect)} of travel time."
@@ -118,29 +117,29 @@ class AccResult:
 
 @dataclass(frozen=True)
 class ControllerResult:
-    """Effect of the controller that was selected for a penetration rate, on test seeds."""
+    """Effect of the controller selected for a penetration rate, on test seeds."""
 
     penetration_rate: float
     driver: str
     effect: Effect
     difference_to_acc: Estimate  # difference of travel time to ACC vehicles at the same penetration rate [s]
     flow_difference_to_acc: Estimate  # difference of flow to the same ACC vehicles [veh/h]
-    missing_seeds: float = 0.0  # number of further test seeds that a verdict needs
+    missing_seeds: float = 0.0  # number of further test seeds until a verdict is possible
     cav_speed_change: Estimate | None = None
-    """relative change of the CAVs' own mean speed, compared with the same ACC vehicles; None: unknown"""
+    """difference of the mean speed of CAVs to the same ACC vehicles, relative to it; None: unknown"""
 
     @property
     def reasons(self) -> list[str]:
-        """Reasons against a recommendation."""
-        change, reasons = self.difference_to_acc, rejection_reasons(self.effect)
+        """Reasons against a recommendation, from the effect and from the comparison with ACC vehicles."""
+        difference, reasons = self.difference_to_acc, rejection_reasons(self.effect)
         acc = f"with {ACC_BASELINE} at this penetration rate"
-        if change.low == change.high == 0.0:
-            reasons.append(f"it never intervened: all travel times are those of {ACC_BASELINE}")
-        elif is_too_small(change, self.effect.baseline_travel_time):
-            reasons.append(f"travel time differs from that {acc} by {TOO_SMALL}: {format_seconds(change)}")
-        elif not change.high < 0:
-            relation = "longer than" if change.low > 0 else "not shown to be shorter than"
-            reasons.append(f"travel time is {relation} {acc}: {format_seconds(change)}")
+        if difference.low == difference.high == 0.0:
+            reasons.append(f"the controller never intervened: all travel times are those of {ACC_BASELINE}")
+        elif is_too_small(difference, self.effect.baseline_travel_time):
+            reasons.append(f"travel time differs from that {acc} by {TOO_SMALL}: {format_seconds(difference)}")
+        elif not difference.high < 0:
+            relation = "longer than" if difference.low > 0 else "not shown to be shorter than"
+            reasons.append(f"travel time is {relation} {acc}: {format_seconds(difference)}")
         if self.cav_speed_change is not None and self.cav_speed_change.high < -MAX_CAV_SLOWDOWN:
             slower = f"{-100 * self.cav_speed_change.mean:.0f} % slower than {ACC_BASELINE}"
             reasons.append(f"the CAVs themselves are {slower} (limit {100 * MAX_CAV_SLOWDOWN:g} %)")
@@ -148,7 +147,7 @@ class ControllerResult:
 
     @property
     def verdict(self) -> str:
-        """The verdict, which more test seeds may change if it is not yet known."""
+        """The verdict on the controller: `RECOMMENDED`, `NOT_RECOMMENDED` or `UNDECIDED`."""
         return RECOMMENDED if not self.reasons else UNDECIDED if self.missing_seeds else NOT_RECOMMENDED
 
     @property
@@ -158,20 +157,20 @@ class ControllerResult:
 
     @property
     def open_question(self) -> str:
-        """What is not yet known: the comparison that is worse so far, or has an interval with zero, as a clause."""
+        """The comparison that prevents a verdict, as a clause: with ACC vehicles or human drivers."""
         comparisons = (self.difference_to_acc, ACC_BASELINE), (self.effect.travel_time, "the human baseline")
-        change, baseline = max(
-            comparisons,
-            key=lambda comparison: (
-                *(comparison[0].low > 0, comparison[0].mean >= 0, comparison[0].low <= 0 <= comparison[0].high),
-                comparison[0].half_width,
-            ),
-        )
-        seeds = f"with {format_count(change.count, 'test seed')}"
-        if change.count < MIN_VERDICT_SEEDS:
+
+        def badness(comparison: tuple[Estimate, str]) -> tuple[bool, bool, bool, float]:
+            difference, _ = comparison
+            contains_zero = difference.low <= 0 <= difference.high
+            return difference.low > 0, difference.mean >= 0, contains_zero, difference.half_width
+
+        difference, baseline = max(comparisons, key=badness)
+        seeds = f"with {format_count(difference.count, 'test seed')}"
+        if difference.count < MIN_VERDICT_SEEDS:
             seeds += f", where a verdict needs {MIN_VERDICT_SEEDS}"
-        so_far = ", so far longer" if change.low > 0 else ""
-        return f"{seeds}, the difference of travel time to {baseline} is {format_seconds(change)}{so_far}"
+        longer = ", so far longer" if difference.low > 0 else ""
+        return f"{seeds}, the difference of travel time to {baseline} is {format_seconds(difference)}{longer}"
 
     @property
     def summary(self) -> str:
@@ -191,7 +190,7 @@ class ControllerResult:
 
 
 def recommended_result(results: Sequence[ControllerResult]) -> ControllerResult | None:
-    """Return the result with the shortest travel time among those without a reason against them; None without any."""
+    """Return the recommended result with the shortest travel time; None if none is recommended."""
     return _quickest([result for result in results if not result.reasons])
 
 
@@ -212,7 +211,7 @@ class RoadVerdict(NamedTuple):
 
 
 def road_verdict(results: Sequence[ControllerResult], baseline: EpisodeRows = ()) -> RoadVerdict:
-    """Return the answer of an assessment: the recommended controller, or why there is none.
+    """Return the answer of an assessment: the recommended controller, or the reason why none is recommended.
 
     `baseline` has the rows of the human baseline, which show whether traffic is nearly free-flowing.
     """
@@ -225,8 +224,8 @@ def road_verdict(results: Sequence[ControllerResult], baseline: EpisodeRows = ()
         return RoadVerdict(RECOMMENDED, f"Recommended: {best.label}, because {reason}.")
     travel_time, delay = (metric_estimate(baseline, name).mean for name in (TIME_METRIC, "delay"))
     if (delay_share := delay / (travel_time - delay)) <= NEGLIGIBLE_DELAY_SHARE:
-        within = max(1, ceil(100 * delay_share))
-        reason = f"there is nothing to gain, because human-only traffic is within {within} % of free flow"
+        percent = max(1, ceil(100 * delay_share))
+        reason = f"there is nothing to gain, because human-only traffic is within {percent} % of free flow"
     elif undecided := [result for result in results if result.verdict == UNDECIDED]:
         best, fastest = _quickest(undecided) or undecided[0], ", the fastest so far" if len(undecided) > 1 else ""
         sentence = f"Not yet known whether to recommend {best.label}{fastest}: {best.open_question}."
@@ -244,14 +243,15 @@ def acc_finding(results: Sequence[AccResult]) -> str:
 
 
 def _acc_effect(results: Sequence[AccResult]) -> str:
-    """Return the predicate of a sentence about ACC vehicles alone: their largest gain, else their largest loss."""
-    key = attrgetter("effect.relative_travel_time")
+    """Return the predicate of a sentence on ACC vehicles alone: the largest gain, or else the largest loss."""
+    relative_time = attrgetter("effect.relative_travel_time")
     gains = [result for result in results if result.effect.travel_time.high < 0 and not result.effect.is_too_small]
     losses = [result for result in results if result.effect.is_longer]
     if gains or losses:
-        verb, most = ("shorten", min(gains, key=key)) if gains else ("lengthen", max(losses, key=key))
-        time, change = format_seconds(most.effect.travel_time), 100 * most.effect.relative_travel_time
-        return f"{verb} travel time: {time} ({change:+.1f} %) at {format_percent(most.penetration_rate)}"
+        verb = "shorten" if gains else "lengthen"
+        result = min(gains, key=relative_time) if gains else max(losses, key=relative_time)
+        time, percent = format_seconds(result.effect.travel_time), 100 * result.effect.relative_travel_time
+        return f"{verb} travel time: {time} ({percent:+.1f} %) at {format_percent(result.penetration_rate)}"
     if results and all(result.effect.is_too_small for result in results):
         return f"change travel time by {TOO_SMALL}"
     return "are not shown to shorten travel time" if results else f"have fewer than {MIN_VERDICT_SEEDS} test seeds"

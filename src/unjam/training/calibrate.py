@@ -129,7 +129,7 @@ def load_corridor(file: str, detectors: Path, begin: float | None = None, end: f
 
 
 def _edge_id(kind: str, measurement: Measurement) -> str:
-    return measurement.place if kind == "edge" else measurement.place.rpartition("_")[0]
+    return measurement.location if kind == "edge" else measurement.location.rpartition("_")[0]
 
 
 def _check_speed_unit(network: Path, kind: str, measurements: Sequence[Measurement], file: str) -> None:
@@ -147,7 +147,7 @@ def _check_speed_unit(network: Path, kind: str, measurements: Sequence[Measureme
 def _detector_loops(network: Path, kind: str, measurement: Measurement) -> list[InductionLoop]:
     """Return the loops of a detector, one per lane; raise `InputError` if the network has no such edge or lane."""
     _, lengths, lane_counts, _ = network_geometry(network)
-    edge, place, position = _edge_id(kind, measurement), measurement.place, measurement.position
+    edge, place, position = _edge_id(kind, measurement), measurement.location, measurement.position
     all_lanes = [f"{edge}_{index}" for index in range(lane_counts.get(edge, 0))]
     lanes = all_lanes if kind == "edge" else [lane for lane in all_lanes if lane == place]
     if not lanes:
