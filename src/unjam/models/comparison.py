@@ -1,4 +1,4 @@
-"""Comparison of model and environment: replayed accelerations, one-step errors, returns, and waves."""
+"""Comparison of a row model and the environment: replayed accelerations and one-step errors."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -19,20 +19,20 @@ from unjam.worlds.record import Floats
 
 
 class OpenLoopErrors(NamedTuple):
-    """Model states compared with recorded states under the same accelerations; H control steps."""
+    """Errors of model states relative to recorded states under the same accelerations; H control steps."""
 
     error: dict[str, Floats]
-    """root mean squared error of a member, by name of `STATE_FIELDS` [m/s, m], shape (H,)"""
+    """root mean squared error of the members by name of `STATE_FIELDS` [m/s, m], shape (H,)"""
     spread: dict[str, Floats]
-    """standard deviation of the members around their mean [m/s, m], shape (H,); zero for one member"""
+    """standard deviation of the members around their mean by name [m/s, m], shape (H,); zero for one member"""
     change: dict[str, Floats]
-    """root mean square of the recorded change since the start [m/s, m], shape (H,)"""
+    """root mean square of the recorded change since the start by name [m/s, m], shape (H,)"""
 
 
 def open_loop_errors(
     model: RowModel, data: EnvironmentData, start_indices: StartIndices, control_steps: int, scenario: Scenario
 ) -> OpenLoopErrors:
-    """Replay recorded accelerations in the model, and compare; arguments as of `replay_accelerations`."""
+    """Replay recorded accelerations in the model, and return its errors; arguments as in `replay_accelerations`."""
     recorded = recorded_states(data, start_indices, control_steps)
     error, spread, change = {}, {}, {}
     for name, predicted in replay_accelerations(model, data, start_indices, control_steps, scenario).items():
@@ -44,22 +44,23 @@ def open_loop_errors(
 
 def recorded_states(data: EnvironmentData, start_indices: StartIndices, control_steps: int) -> dict[str, Floats]:
     """Return the recorded states from each start on, by name of `STATE_FIELDS` [m/s, m], shape (n, H + 1)."""
-    windows = [(data.recordings[index].states, slice(at, at + control_steps + 1)) for index, at in start_indices]
-    return {name: np.stack([getattr(states, name)[at] for states, at in windows]) for name in STATE_FIELDS}
+    slices = [(data.recordings[index].states, slice(step, step + control_steps + 1)) for index, step in start_indices]
+    return {name: np.stack([getattr(states, name)[window] for states, window in slices]) for name in STATE_FIELDS}
 
 
 @dataclass(frozen=True)
 class ReplayDriver(Driver):
-    """Applies recorded accelerations, step by step."""
+    """A driver that applies recorded accelerations step by step."""
 
     accelerations: Array
+    """accelerations of n CAVs [m/s2], shape (steps, n)"""
 
     def initial_memory(self, n: int) -> Memory:
         """Return the index of the first step."""
         return {"index": np.zeros(n)}
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return the accelerations of this step."""
+        """Return the recorded accelerations of the step in the memory."""
         return self.accelerations[int(memory["index"][0])], {"index": memory["index"] + 1.0}
 
 
@@ -67,7 +68,7 @@ class ReplayDriver(Driver):
 def replay_accelerations(
     model: RowModel, data: EnvironmentData, start_indices: StartIndices, control_steps: int, scenario: Scenario
 ) -> dict[str, Floats]:
-    """Replay H recorded accelerations in the model, without noise, each member separately; a new model is the base.
+    """Replay H recorded accelerations in each member of the model without noise; an unfitted model is the base.
 
     Returns states by name of `STATE_FIELDS` [m/s, m], shape (members, n, H).
     """
@@ -76,8 +77,9 @@ def replay_accelerations(
     recordings = [data.recordings[index] for index in indices[:, 0]]
     states = data.states_at(indices).map(lambda values: to_device(values, device))
     drawn_values = to_device(np.stack([recording.drawn_values for recording in recordings]), device)
-    windows = zip(recordings, indices[:, 1], strict=True)
-    accelerations = np.stack([each.applied_acceleration[at : at + control_steps] for each, at in windows], 1)
+    steps, applied = indices[:, 1], [recording.applied_acceleration for recording in recordings]
+    windows = [values[step : step + control_steps] for values, step in zip(applied, steps, strict=True)]
+    accelerations = np.stack(windows, 1)
     generator = torch_generator((0,), device)  # not used
     members = torch.arange(model.members, device=device)
     dynamics = ModelDynamics(model, scenario, "", generator, add_noise=False, members=members)
@@ -92,7 +94,7 @@ def replay_accelerations(
 
 
 def one_step_errors(model: RowModel, transitions: Transitions, scenario: Scenario, reward: str) -> OneStepErrors:
-    """Return the errors of base and model in predicting each of the transitions."""
+    """Return the errors of base and model in the prediction of each transition."""
     targets, change = (residual_targets(transitions, base, scenario, reward) for base in (model.base, "none"))
     inputs = torch.as_tensor(model_inputs(transitions.states, transitions.response, transitions.drawn_values))
     predictions = model.member_predictions(inputs.to(model.input_mean.device))

@@ -1,4 +1,4 @@
-"""Rings in torch through which gradients flow: from rewards and states back to the CAVs' accelerations."""
+"""Rings in torch, with gradients of rewards and states with respect to the accelerations of CAVs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -27,12 +27,12 @@ from unjam.worlds.reward import RewardLike, check_tensor_terms, make_reward
 
 
 class DifferentiableRings(RingBatch):
-    """W rings that torch steps together, and through which autograd computes gradients.
+    """W rings that torch simulates together, with gradients by autograd.
 
-    The episodes are those of `run_episode` with the same seeds, except for rounding. `local_state()` returns what the
-    CAVs observe: tensors of shape (CAVs * W,), with the first CAV of each ring, then the second one, and so on.
-    `speeds` [m/s] has the shape (vehicles, W). `crashed_roads` marks rings with a collision, and `has_ended` whether
-    the episode is over.
+    Episodes are equal to those of `run_episode` with the same seeds, except for rounding. `local_state()` returns the
+    observations of the CAVs: tensors of shape (CAVs * W,), with the first CAV of all rings, then the second, and so on.
+    `speeds` [m/s] has the shape (vehicles, W). `crashed_roads` marks rings with a collision, and `has_ended` says
+    whether the episodes are over.
     """
 
     reward_terms: Mapping[str, Tensor] = MappingProxyType({})
@@ -47,26 +47,26 @@ class DifferentiableRings(RingBatch):
         reward: RewardLike = "",
         generator: torch.Generator | None = None,
     ) -> None:
-        """Start an episode on each ring, after its warm-up.
+        """Start an episode on each ring after the warm-up.
 
         Args:
             scenario: a ring, its class, or its name.
-            seeds: one for each ring, as for `run_episode`; it also draws the length.
-            device: of all tensors.
-            dtype: of all tensors; in `torch.float32` episodes differ from those of `run_episode` after some minutes.
-            reward: a name, or a function of an `Outcome` of tensors; empty: that of the scenario.
-            generator: draws the human drivers' noise, for speed, instead of the seeds. Human drivers then follow only
-                the vehicle ahead, and not also the last one on the next lane of SUMO's ring, which changes little.
+            seeds: a seed for each ring, as in `run_episode`; it also determines the length.
+            device: device of all tensors.
+            dtype: type of all tensors; in `torch.float32` episodes differ from `run_episode` after some minutes.
+            reward: a name, or a function of an `Outcome` of tensors; empty: the reward of the scenario.
+            generator: generator of the noise of human drivers that replaces the seeds and is faster. Human drivers then
+                do not also follow the last vehicle on the next lane of SUMO's ring, which changes little.
 
         Raises:
-            InputError: there are no seeds, the scenario is not a ring that a batch supports, or sensors have errors.
+            InputError: there are no seeds, the scenario is no ring that batches support, or sensors have errors.
             MissingPartError: the device is not available.
         """
         check_device(device)
         if dtype not in (torch.float32, torch.float64):
             raise invalid_value("dtype", str(dtype), "torch.float32, torch.float64")
         road = make_scenario(scenario)
-        if not isinstance(seeds, Iterable) or not (numbers := [as_seed(seed) for seed in seeds]):
+        if not isinstance(seeds, Iterable) or not (seed_numbers := [as_seed(seed) for seed in seeds]):
             raise invalid_value("seeds", seeds, "one or more")
         if not isinstance(road, Ring):
             raise invalid_value("scenario", road.title, "a ring")
@@ -76,16 +76,16 @@ class DifferentiableRings(RingBatch):
             raise InputError("sensors: errors have no gradient; allowed: exact sensors")
         draw = generator and partial(torch.randn, generator=generator, dtype=dtype, device=device)
         to_tensor = partial(torch.as_tensor, dtype=dtype, device=device)
-        super().__init__([road] * len(numbers), numbers, to_tensor, keep_record=False, draw=draw)
+        super().__init__([road] * len(seed_numbers), seed_numbers, to_tensor, keep_record=False, draw=draw)
         self._reward = make_reward(reward or road.reward)
         if road.warmup and generator is None:
-            self.warm_up_states = warm_up_states([(road, seed, frozenset()) for seed in numbers], ())
+            self.warm_up_states = warm_up_states([(road, seed, frozenset()) for seed in seed_numbers], ())
         with torch.no_grad():
             self._history = self.start(is_controlled=True)
 
     @property
     def positions(self) -> Tensor:
-        """Front bumpers of all vehicles along the road [m], not wrapped, shape (vehicles, W)."""
+        """Positions of all front bumpers along the road [m], not wrapped, shape (vehicles, W)."""
         return self._position
 
     @property
@@ -99,10 +99,9 @@ class DifferentiableRings(RingBatch):
         return self._loop_lengths
 
     def set_state(self, speeds: Tensor, positions: Tensor) -> None:
-        """Move all vehicles [m/s, m], shapes as of `speeds` and `positions`; gradients flow back to both.
+        """Set the speeds [m/s] and positions [m] of all vehicles, shape (vehicles, W); gradients flow back to both.
 
-        Raise `InputError` for another shape, a number that is not finite, a negative speed, or a vehicle not behind its
-        leader.
+        Raise `InputError` if a shape is wrong, a number is not finite, a speed is negative, or the order is wrong.
         """
         shape = self._position.shape
         speeds, positions = self._as_tensor("speeds", speeds, shape), self._as_tensor("positions", positions, shape)
@@ -116,25 +115,25 @@ class DifferentiableRings(RingBatch):
         self._speed, self._position, self._gap = torch.cat([speeds, speeds[:1]]), positions, gaps
 
     def _as_tensor(self, name: str, values: Any, shape: Sequence[int]) -> Tensor:
-        """Return numbers of the user as a tensor; raise `InputError` unless they are finite and have the shape."""
+        """Return numbers of the user as a tensor; raise `InputError` unless they are finite and of this shape."""
         allowed = f"finite numbers of shape {tuple(shape)}"
         tensor = cast(Tensor, as_numbers(values, name, allowed, self._to_array))
         if tensor.shape != tuple(shape):
             raise invalid_value(f"{name}: shape", tuple(tensor.shape), str(tuple(shape)))
         if not bool((is_finite := tensor.isfinite()).all()):
             index = int((~is_finite).flatten().nonzero()[0])
-            value, ring = float(tensor.flatten()[index]), index % len(self.roads)  # the last axis, or its blocks
+            value, ring = float(tensor.flatten()[index]), index % len(self.roads)  # rings vary fastest
             raise InputError(f"{name}: {value} of ring {ring} is not allowed; allowed: {allowed}")
         return tensor
 
     def initial_memory(self, driver: Any) -> Memory:
-        """Return the memory after the warm-up as tensors, of a driver or of an object with `initial_memory(n)`.
+        """Return the memory of a driver, or of an object with `initial_memory(n)`, after the warm-up, as tensors.
 
-        Raise `InputError` for a driver that takes only NumPy arrays, or an object without memory.
+        Raise `InputError` for a driver that only accepts NumPy arrays, or an object without `initial_memory`.
         """
         is_array_driver = isinstance(driver, Driver) and driver.requirements().needs_numpy
         if is_array_driver or not hasattr(driver, "initial_memory"):
-            allowed = "one that takes tensors, like 'pi' or policy_driver(module)"
+            allowed = "a driver that takes tensors, like 'pi' or policy_driver(module)"
             name = driver.describe() if is_array_driver else object_label(driver)
             raise invalid_value("driver", name, allowed)
         memory = initial_batch_memory(driver, len(self.roads), self.cav_count)
@@ -142,10 +141,10 @@ class DifferentiableRings(RingBatch):
         return map_leaves(self._to_array, memory)
 
     def step(self, acceleration: Tensor) -> Tensor:
-        """Simulate one control step, and return the reward of each ring, shape (W,); `reward_terms` are its terms.
+        """Simulate one control step, and return the reward of each ring, shape (W,), the sum of `reward_terms`.
 
-        `acceleration` [m/s2], shape (CAVs * W,), is limited by the scenario and its filter; else raise `InputError`.
-        After a collision (`crashed_roads`) or the horizon, the rewards of a ring are zero.
+        The scenario and its safety filter limit `acceleration` [m/s2], shape (CAVs * W,). After a collision or the
+        horizon, the rewards of a ring are zero. Raise `InputError` if the shape is wrong or a number is not finite.
         """
         was_running = self._is_running
         self.advance(Command(self._as_tensor("step: acceleration", acceleration, (self.cav_count,))))
@@ -155,6 +154,6 @@ class DifferentiableRings(RingBatch):
         return torch.stack([*self.reward_terms.values()]).sum(0)
 
     def detach(self, memory: Memory | None = None) -> Memory:
-        """Let no gradients flow to earlier steps from here on; return the driver's `memory` without them, too."""
+        """Stop gradients to earlier steps, and return the driver's `memory` without gradients."""
         self.detach_state()
         return map_leaves(lambda values: values.detach(), memory or {})

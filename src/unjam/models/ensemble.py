@@ -1,4 +1,4 @@
-"""An ensemble of small networks, computed as one: the learned part of a model, its fit, and its error eps_m."""
+"""An ensemble of small networks, the learned part of a model: its computation, its fit, and its error eps_m."""
 
 import itertools
 from collections.abc import Sequence
@@ -24,26 +24,26 @@ ROWS_PER_MEMBER = 64
 
 Seed = Sequence[int]
 Layers = list[tuple[Tensor, Tensor]]
-"""(weight of shape (members, inputs, outputs), bias of shape (members, 1, outputs)) of each layer"""
+"""weight, shape (members, inputs, outputs), and bias, shape (members, 1, outputs), of each layer"""
 
 
 def torch_generator(seed: Seed, device: torch.device | str) -> torch.Generator:
-    """Return a random number generator on `device` that depends on `seed` alone."""
+    """Return a random number generator on `device` with a state that depends only on `seed`."""
     state = np.random.SeedSequence(list(seed)).generate_state(1, np.uint64)[0]
     return torch.Generator(device).manual_seed(int(state >> np.uint64(1)))
 
 
 def predict(layers: Layers, inputs: Tensor, members: Tensor) -> Tensor:
-    """Return the residual, (n, outputs), for `inputs`, (n, inputs), in SI units; each member has a block of rows."""
-    n, blocks = len(inputs), len(members)
-    size = -(-n // blocks)
-    blocked = pad(inputs, (0, 0, 0, blocks * size - n)).view(blocks, size, -1)
-    selected = [(weight[members], bias[members]) for weight, bias in layers]
-    return _apply_layers(selected, blocked).view(blocks * size, -1)[:n]
+    """Return the residuals of n rows of inputs, shape (n, outputs), SI units; each of `members` predicts a block."""
+    n, block_count = len(inputs), len(members)
+    size = -(-n // block_count)
+    blocks = pad(inputs, (0, 0, 0, block_count * size - n)).view(block_count, size, -1)
+    member_layers = [(weight[members], bias[members]) for weight, bias in layers]
+    return _apply_layers(member_layers, blocks).view(block_count * size, -1)[:n]
 
 
 def random_members(members: int, rows: int, generator: torch.Generator) -> Tensor:
-    """Return a random member for each block of `ROWS_PER_MEMBER` of `rows` rows."""
+    """Return a random member of the ensemble for each block of `ROWS_PER_MEMBER` rows."""
     return torch.randint(members, (-(-rows // ROWS_PER_MEMBER),), generator=generator, device=generator.device)
 
 
@@ -55,7 +55,7 @@ def _apply_layers(layers: Layers, inputs: Tensor) -> Tensor:
 
 
 class Ensemble(nn.Module):
-    """Networks that each predict the residual of a base, at first zero with `fallback_to_base`."""
+    """Networks, each of which predicts the residual of a base; the residual starts at zero with `fallback_to_base`."""
 
     input_mean: Tensor
     input_scale: Tensor
@@ -71,7 +71,7 @@ class Ensemble(nn.Module):
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for fan_in, fan_out in itertools.pairwise([inputs, *settings.hidden, outputs]):
             draws = torch.rand((self.members, fan_in + 1, fan_out), generator=generator) * 2.0 - 1.0
-            draws /= sqrt(fan_in)  # as torch.nn.Linear starts
+            draws /= sqrt(fan_in)  # the initialization of torch.nn.Linear
             self.weights.append(nn.Parameter(draws[:, :-1].contiguous()))
             self.biases.append(nn.Parameter(draws[:, -1:].contiguous()))
         if settings.fallback_to_base:
@@ -88,14 +88,14 @@ class Ensemble(nn.Module):
         return _apply_layers(layers, inputs.expand(self.members, -1, -1))
 
     def normalize_inputs(self, inputs: Tensor) -> Tensor:
-        """Return inputs in SI units as the networks take them."""
+        """Return inputs in SI units as normalized inputs of the networks."""
         return (inputs.float() - self.input_mean) / self.input_scale
 
     @torch.no_grad()
     def set_normalization(self, inputs: Tensor, targets: Tensor) -> None:
-        """Normalize by mean and standard deviation of `inputs` and `targets`, (rows, ...); predictions stay the same.
+        """Normalize by mean and standard deviation of `inputs` and `targets`, (rows, ...), with the same predictions.
 
-        Inputs that vary by less than `MIN_CHANGE` count as zero: Adam would make long steps of rounding errors.
+        Inputs that vary by less than `MIN_CHANGE` become zero; otherwise rounding errors would cause large steps.
         """
         varies = inputs.std(0) >= MIN_CHANGE
         mean = torch.where(varies, inputs.mean(0), inputs[0]).float()
@@ -115,7 +115,7 @@ class Ensemble(nn.Module):
 
     @torch.no_grad()
     def layers(self) -> Layers:
-        """Return the layers for `predict`, in SI units; outputs that the base predicts better are zero."""
+        """Return the layers for `predict` in SI units; outputs that the base predicts better are zero."""
         weights = [weight.detach() for weight in self.weights]
         biases = [bias.detach() for bias in self.biases]
         biases[0] = biases[0] - (self.input_mean / self.input_scale)[None] @ weights[0]
@@ -126,7 +126,7 @@ class Ensemble(nn.Module):
 
     @torch.no_grad()
     def member_predictions(self, inputs: Tensor) -> Floats:
-        """Return each member's unmasked predictions for the same rows, SI units, shape (members, rows, outputs)."""
+        """Return unmasked predictions of all members for the same rows, SI units, shape (members, rows, outputs)."""
         predictions = self(self.normalize_inputs(inputs)) * self.target_scale + self.target_mean
         return predictions.double().cpu().numpy()
 
@@ -137,7 +137,7 @@ class EnsembleFit(NamedTuple):
     targets: Floats
     """residuals of the base on the holdout, shape (rows, outputs)"""
     predictions: Floats
-    """prediction of the targets by each member; zero where the base is better, shape (members, rows, outputs)"""
+    """predictions of the targets, zero for outputs with a better base, shape (members, rows, outputs)"""
     holdout_indices: NDArray[np.int64]
     loss: float
     """mean squared training error of the last epoch, in units of the targets' variance"""
@@ -153,11 +153,11 @@ def fit_ensemble(
     settings: ModelSettings,
     generator: np.random.Generator,
 ) -> EnsembleFit:
-    """Train `ensemble` further on `inputs`, (rows, inputs), and residuals of the base `targets`, (rows, outputs).
+    """Continue to train `ensemble` on `inputs`, (rows, inputs), and residuals `targets`, (rows, outputs), in SI units.
 
-    Units are SI. Each network is trained on a bootstrap sample of the rows that are not `is_holdout`, and keeps the
-    weights that were best on the holdout. With `fallback_to_base`, outputs that are predicted no better there than by
-    zero are masked. Raises `UnjamError` if a loss is not finite.
+    Each network is trained on a bootstrap sample of the rows that are not `is_holdout`, and keeps the weights that were
+    best on the holdout. With `fallback_to_base`, outputs are masked if zero predicts the holdout as well. Raise
+    `UnjamError` if a loss is not finite.
     """
     training = generator.permutation(np.flatnonzero(~is_holdout))[: settings.max_fit_rows]
     max_holdout_rows = max(1, round(settings.max_fit_rows * settings.holdout))
@@ -182,14 +182,14 @@ def _train(
     settings: ModelSettings,
     generator: np.random.Generator,
 ) -> tuple[float, int]:
-    """Train until the holdout loss stops improving; return the last training loss and the number of epochs."""
+    """Train the ensemble until the holdout loss stops improving; return the last training loss and number of epochs."""
     inputs, targets = training_set
     device, rows = inputs.device, inputs.shape[1]
     parameters = [*ensemble.weights, *ensemble.biases]
     optimizer = Adam(parameters, lr=settings.learning_rate, fused=True)
     best = [parameter.detach().clone() for parameter in parameters]
-    best_loss, waited, epochs, last_loss = _member_losses(ensemble, *holdout_set), 0, 0, float("nan")
-    while epochs < settings.epochs and waited < settings.patience:
+    best_loss, epochs_without_gain, epochs, last_loss = _member_losses(ensemble, *holdout_set), 0, 0, float("nan")
+    while epochs < settings.epochs and epochs_without_gain < settings.patience:
         order = torch.as_tensor(generator.permutation(rows)).to(device)
         total = torch.zeros((), device=device)
         for batch in order.split(settings.batch_size):
@@ -205,12 +205,12 @@ def _train(
             raise UnjamError(f"model: the loss of its fit is not finite in epoch {epochs}")
         is_better = losses < best_loss
         best_loss = torch.where(is_better, losses, best_loss)
-        waited = 0 if is_better.any() else waited + 1
-        for stored, parameter in zip(best, parameters, strict=True):
-            stored.copy_(torch.where(is_better[:, None, None], parameter.detach(), stored))
+        epochs_without_gain = 0 if is_better.any() else epochs_without_gain + 1
+        for best_parameter, parameter in zip(best, parameters, strict=True):
+            best_parameter.copy_(torch.where(is_better[:, None, None], parameter.detach(), best_parameter))
     with torch.no_grad():
-        for stored, parameter in zip(best, parameters, strict=True):
-            parameter.copy_(stored)
+        for best_parameter, parameter in zip(best, parameters, strict=True):
+            parameter.copy_(best_parameter)
     return last_loss, epochs
 
 
@@ -224,30 +224,30 @@ class OneStepRMSE(NamedTuple):
 
     base: float
     model: float
-    """error of a member of the ensemble; that of the base where it is better"""
+    """error of the members of the ensemble; that of the base if it is better"""
     change: float
-    """standard deviation of what is predicted: the change in the step, or the reward"""
+    """standard deviation of the predicted quantity: the change in the step, or the reward"""
 
 
 @dataclass(frozen=True)
 class ModelFit:
-    """The result of a fit."""
+    """The result of fitting a model."""
 
     errors: dict[str, float]
     """the model error eps_m by estimator
 
     `unexplained_variance`: holdout mean squared error divided by the variance of the change, mean over `STATE_FIELDS`.
-    `transitions`: total variation between the next speeds of leader and follower as predicted by a member and as
-    drawn, see `transition_variation`. `total_variation`: between the distributions of the next state predicted by a
-    member and by the ensemble mean, averaged over the holdout; NaN for a single member. `training_loss`: mean squared
-    training error of the last epoch, in units of the targets' variance, as in the authors' code.
+    `transitions`: total variation between the next speeds of leader and follower as predicted by a member and as drawn
+    in the environment, see `transition_variation`. `total_variation`: mean over the holdout of the total variation
+    between the next states as predicted by a member and by the ensemble mean; NaN for a single member. `training_loss`:
+    mean squared training error of the last epoch, in units of the targets' variance, as in the authors' code.
     """
     one_step: dict[str, OneStepRMSE]
-    """errors one step ahead, by name of `TARGET_NAMES`"""
+    """one-step errors by name of `TARGET_NAMES`"""
     learned_targets: tuple[str, ...]
-    """targets that the networks predict better than the base; the others are left to the base"""
+    """targets that the networks predict better than the base; the base predicts the others"""
     training_rows: int
-    """per network"""
+    """number of training rows of each network"""
     holdout_rows: int
     epochs: int
 
@@ -258,15 +258,15 @@ def root_mean_square(values: Floats) -> float:
 
 
 def transition_variation(errors: Floats, noise: float) -> float:
-    """Return eps_m of the paper's theorem A3: Gaussians of std `noise`, means with `errors`, (..., quantities)."""
+    """Return eps_m of the paper's theorem A3 for Gaussians of std `noise` with mean `errors`, (..., quantities)."""
     return _gaussian_variation(np.sqrt(np.square(errors).sum(-1)) / max(noise, MIN_CHANGE))
 
 
 def total_variation(predictions: Floats, noise: Floats) -> float:
-    """Return the mean total variation, in [0, 1], between Gaussians around a member's prediction and around the mean.
+    """Return the mean total variation, in [0, 1], between Gaussians around the predictions of a member and their mean.
 
-    `predictions`: (members, rows, quantities); `noise`, the standard deviation of both: (quantities,). NaN for one
-    member.
+    `predictions` have the shape (members, rows, quantities); `noise` is the standard deviation of all Gaussians,
+    shape (quantities,). The result is NaN for one member.
     """
     if len(predictions) == 1:
         return float("nan")

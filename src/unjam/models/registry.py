@@ -1,4 +1,4 @@
-"""The world models by kind of road, and that of rows: the paper's virtual environment."""
+"""The world models of all kinds of roads, and the world model of rows, the paper's virtual environment."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,10 +13,10 @@ from unjam.scenarios.scenario import Scenario
 
 
 class RowWorldModel(WorldModel[RowModel, None]):
-    """Rows, each of which is a CAV with its leader and follower, and continues from a recorded state."""
+    """The world model of rows: a CAV, its leader and its follower, which continue from a recorded state."""
 
     def new_ensemble(self) -> RowModel:
-        """Return the ensemble before any fit."""
+        """Return an unfitted ensemble."""
         return RowModel(self.settings, len(self.scenario.drawn_ranges), self.seed, self.settings.device)
 
     def fit(self, seed: Seed) -> ModelFit:
@@ -40,9 +40,9 @@ class RowWorldModel(WorldModel[RowModel, None]):
 
 
 ROAD_MODELS: dict[str, type[WorldModel[Any, Any]]] = {"closed": ClosedRoadModel, "motorway": MotorwayModel}
-"""world models of whole roads by `Scenario.road_model`; none of them supports other roads"""
+"""world models of whole roads by `Scenario.road_model`"""
 
 
 def world_model_class(scenario: Scenario, settings: ModelSettings) -> type[WorldModel[Any, Any]]:
-    """Return the world model for a scenario with these settings; its `check` says whether it supports them."""
+    """Return the class of the world model for a scenario and settings; its `check` refuses those without support."""
     return RowWorldModel if settings.kind == "row" else ROAD_MODELS.get(scenario.road_model, WholeRoadModel)

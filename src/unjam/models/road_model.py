@@ -1,7 +1,8 @@
-"""The road model: samples of whole closed roads, and the human drivers on them as a base plus one learned ensemble.
+"""The road model: samples of whole closed roads, and human drivers that follow a base plus a learned residual.
 
-SUMO's drivers add noise after they have moved, so that their distance gives the intended speed. Noise moves commanded
-drivers too: only its strength is known. Steps in which the right of way constrains a driver are not used.
+SUMO's own drivers add noise to speeds after they have moved, so that the driven distance gives the intended speed. The
+noise of commanded drivers also changes the distance, and only its strength is known. Steps in which the right of way
+constrains a driver are not used.
 """
 
 from collections.abc import Sequence
@@ -33,20 +34,20 @@ from unjam.worlds.record import Episode, Floats
 ROAD_MODEL_INPUTS = 4
 """inputs of the networks: speed, leader speed, gap, and the speed after the step according to the base"""
 MIN_NOISE_SPEED = 0.5
-"""intended speed above which noise is not cut off at standstill [m/s]"""
+"""intended speed above which noise is not clipped at standstill [m/s]"""
 MAX_NOISE_STDS = 3.0
-"""standard deviations of noise for which the right of way must leave room in steps used for training"""
+"""number of standard deviations of noise that the right of way must allow in steps used for training"""
 
 
 @dataclass(frozen=True)
 class RoadSamples:
-    """N vehicles of a closed road, in its order, at M steps at which a residual was due; arrays (M, N), SI units."""
+    """N vehicles of a closed road, in order, at M steps with a new action; arrays of shape (M, N), SI units."""
 
     episode: int
     interval: int
     """control steps between samples"""
     size: int
-    """drawn by the episode: length of the ring, radius of the figure eight [m]"""
+    """drawn value of the episode: length of the ring or radius of the figure eight [m]"""
     length: float
     is_human: Floats
     """1 for human drivers, 0 for CAVs, shape (N,)"""
@@ -54,14 +55,14 @@ class RoadSamples:
     positions: Floats
     """front bumpers, not wrapped"""
     intended_speeds: Floats
-    """distance divided by time in the next control step: the speed before noise"""
+    """driven distance divided by time in the next control step: the speed before noise"""
     next_speeds: Floats
     crossing_memory: crossing.CrossingMemory | None
     """waiting times and entry steps on a road that crosses itself"""
 
 
 def with_size(scenario: LoopScenario, size: int) -> LoopScenario:
-    """Return a scenario of which all episodes draw the same size [m], without a warm-up."""
+    """Return a scenario without warm-up in which all episodes draw the same size [m]."""
     return replace(scenario, **{scenario.size_parameter: (size, size)}, warmup=0)
 
 
@@ -69,23 +70,23 @@ def _road_of_size(scenario: LoopScenario, size: int) -> ClosedRoad:
     return cast(ClosedRoad, with_size(scenario, size).draw_from_seed((0,))[0])
 
 
-def road_samples(episode: Episode, number: int, scenario: LoopScenario) -> RoadSamples:
-    """Return the samples of an environment episode with this number."""
+def road_samples(episode: Episode, index: int, scenario: LoopScenario) -> RoadSamples:
+    """Return the samples of the environment episode `index`."""
     interval, size = episode.trajectories[0].action_repeat, round(episode.drawn_values[scenario.size_parameter])
-    at, sampled_memory = np.arange(0, episode.control_steps, interval), None
+    steps, sampled_memory = np.arange(0, episode.control_steps, interval), None
     if episode.crossings:
         memory = crossing.crossing_memories(scenario, _road_of_size(scenario, size), episode.speeds, episode.positions)
-        sampled_memory = crossing.CrossingMemory(memory.waiting_time[at], memory.entry_step[at])
+        sampled_memory = crossing.CrossingMemory(memory.waiting_time[steps], memory.entry_step[steps])
     return RoadSamples(
-        episode=number,
+        episode=index,
         interval=interval,
         size=size,
         length=episode.loop_length,
-        is_human=np.array([float(name not in episode.cav_ids) for name in episode.vehicle_ids]),
-        speeds=episode.speeds[at],
-        positions=episode.positions[at],
-        intended_speeds=(episode.positions[at + 1] - episode.positions[at]) / episode.control_step,
-        next_speeds=episode.speeds[at + 1],
+        is_human=np.array([float(vehicle_id not in episode.cav_ids) for vehicle_id in episode.vehicle_ids]),
+        speeds=episode.speeds[steps],
+        positions=episode.positions[steps],
+        intended_speeds=(episode.positions[steps + 1] - episode.positions[steps]) / episode.control_step,
+        next_speeds=episode.speeds[steps + 1],
         crossing_memory=sampled_memory,
     )
 
@@ -99,13 +100,13 @@ class HumanRows(NamedTuple):
     base_speed: Floats
     """speed after the step according to the base"""
     intended_speed: Floats
-    """speed of the movement, before noise except for commanded drivers"""
+    """driven distance divided by time: the speed before noise, but with noise for commanded drivers"""
     next_speed: Floats
     episode: Floats
 
 
 class RoadEnsemble(ensemble.Ensemble):
-    """An ensemble for the residual of a base of human drivers, and the strength of their noise."""
+    """An ensemble for the residual of a base model of human drivers, with the strength of their noise."""
 
     noise: Tensor
     """standard deviation of the noise of a speed [m/s]"""
@@ -117,13 +118,13 @@ class RoadEnsemble(ensemble.Ensemble):
 
 
 def base_human_model(base: str, scenario: Scenario) -> HumanSpeedModel:
-    """Return the human drivers of a base in `BASE_DRIVERS`."""
+    """Return the human speed model of a base in `BASE_DRIVERS`."""
     make_driver, step = BASE_DRIVERS[base], scenario.simulation_step
     if base == "idm":
         follow = crossing.commanded_speed if scenario.human_control == "commanded" else human_idm_speed
         return partial(follow, parameters=scenario.humans, step=step)
     if make_driver is None:
-        return lambda speed, leader_speed, gap: speed + 0.0  # a copy: the caller writes into it
+        return lambda speed, leader_speed, gap: speed + 0.0  # a copy, which the caller changes
     driver = make_driver(scenario)
 
     def human_speed(speed: Array, leader_speed: Array, gap: Array) -> Array:
@@ -133,19 +134,20 @@ def base_human_model(base: str, scenario: Scenario) -> HumanSpeedModel:
     return human_speed
 
 
-def _inputs(*columns: Array) -> Tensor:
-    flat = [values.ravel() for values in columns]
+def _stack_inputs(*columns: Array) -> Tensor:
+    """Return inputs of the networks from columns of any shape, shape (rows, columns)."""
+    flat = [column.ravel() for column in columns]
     return torch.from_numpy(np.stack(flat, 1)) if isinstance(flat[0], np.ndarray) else torch.stack(flat, 1)
 
 
 def residual_function(model: RoadEnsemble, generator: torch.Generator) -> LearnedCorrection | None:
-    """Return the learned residual, with a random member for each 64 vehicles; None if the base alone is used."""
+    """Return the learned residual with a random member for each block of vehicles; None if only the base is used."""
     if not model.output_mask.any():
         return None
     layers = model.layers()
 
     def residual(speed: Array, leader_speed: Array, gap: Array, base_speed: Array) -> Array:
-        inputs = _inputs(speed, leader_speed, gap, base_speed).float()
+        inputs = _stack_inputs(speed, leader_speed, gap, base_speed).float()
         predicted = ensemble.predict(layers, inputs, ensemble.random_members(model.members, len(inputs), generator))
         return (predicted.numpy() if isinstance(speed, np.ndarray) else predicted).reshape(speed.shape)
 
@@ -153,7 +155,7 @@ def residual_function(model: RoadEnsemble, generator: torch.Generator) -> Learne
 
 
 def learned_human_model(model: RoadEnsemble, scenario: Scenario, generator: torch.Generator) -> HumanSpeedModel:
-    """Return the human drivers of the model: the base plus the residual of random members."""
+    """Return the human speed model of the ensemble: the base plus the residual of random members."""
     base_model, residual = base_human_model(model.base, scenario), residual_function(model, generator)
     if residual is None:
         return base_model
@@ -166,17 +168,17 @@ def learned_human_model(model: RoadEnsemble, scenario: Scenario, generator: torc
 
 
 def _has_right_of_way(samples: RoadSamples, scenario: Scenario, desired_speeds: Floats) -> NDArray[np.bool_]:
-    """Return whether the right of way allows human drivers these speeds [m/s], shape (M, N)."""
+    """Return whether the right of way allows the desired speeds of human drivers [m/s], shape (M, N)."""
     road = _road_of_size(cast(LoopScenario, scenario), samples.size)
     is_human, memory = samples.is_human > 0.0, cast(crossing.CrossingMemory, samples.crossing_memory)
     desired_speeds = np.where(is_human, desired_speeds, samples.next_speeds).clip(0.0)
-    cav_columns, moving = np.flatnonzero(~is_human).tolist(), (samples.speeds, samples.positions)
-    return crossing.may_follow_commands(scenario, road, cav_columns, memory, moving, desired_speeds)
+    cav_columns, motion = np.flatnonzero(~is_human).tolist(), (samples.speeds, samples.positions)
+    return crossing.may_follow_commands(scenario, road, cav_columns, memory, motion, desired_speeds)
 
 
 def human_rows(samples: Sequence[RoadSamples], base: str, scenario: Scenario) -> HumanRows:
-    """Return the steps of human drivers that no right of way constrains, a row each."""
-    base_model, parts = base_human_model(base, scenario), []
+    """Return a row for each step of a human driver that the right of way does not constrain."""
+    base_model, tables = base_human_model(base, scenario), []
     max_noise = MAX_NOISE_STDS * scenario.noise_per_step * scenario.simulation_step
     for sample in samples:
         gap = gap_on_loop(sample.positions, np.roll(sample.positions, -1, 1), sample.length, VEHICLE_LENGTH)
@@ -186,8 +188,8 @@ def human_rows(samples: Sequence[RoadSamples], base: str, scenario: Scenario) ->
         if sample.crossing_memory is not None:
             is_used = is_used & _has_right_of_way(sample, scenario, base_speed + max_noise)
         columns = (*inputs, base_speed, sample.intended_speeds, sample.next_speeds, episode)
-        parts.append(np.stack([values[is_used] for values in columns]))
-    return HumanRows(*np.concatenate(parts, 1))
+        tables.append(np.stack([column[is_used] for column in columns]))
+    return HumanRows(*np.concatenate(tables, 1))
 
 
 def fit_road_model(
@@ -197,7 +199,7 @@ def fit_road_model(
     scenario: Scenario,
     seed: ensemble.Seed,
 ) -> ensemble.ModelFit:
-    """Measure the noise of human drivers' speeds, unless they are commanded, and fit `model`, see `fit_human_model`."""
+    """Fit `model` with `fit_human_model`; the noise is measured, or that of the scenario for commanded drivers."""
     rows = human_rows(samples, model.base, scenario)
     if scenario.human_control == "commanded":
         noise = scenario.noise_per_step * scenario.simulation_step
@@ -216,19 +218,21 @@ def fit_human_model(
     is_noise_known: bool,
     min_error_reduction: float = 0.0,
 ) -> ensemble.ModelFit:
-    """Fit `model` further, in place, to the residual of the base of the rows' intended speeds, see `fit_ensemble`.
+    """Continue to fit `model` in place to the residual of intended speeds relative to the base, see `fit_ensemble`.
 
-    `sigma` is the standard deviation of the rows' noise [m/s]; unless the intended speeds are without noise, its
-    variance is subtracted from squared errors. Networks must reduce the base's squared error by the share
-    `min_error_reduction`.
+    `sigma` is the standard deviation of noise in the rows [m/s]. With `is_noise_known`, intended speeds have no noise;
+    otherwise its variance is subtracted from squared errors. `min_error_reduction` is the relative reduction of the
+    base's squared error that networks must reach.
     """
     generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
     is_holdout = is_holdout_episode(rows.episode, settings.holdout)
-    if is_holdout.all() or not is_holdout.any():  # too few episodes: the last part of the rows
+    if is_holdout.all() or not is_holdout.any():  # too few episodes: hold out the last rows
         is_holdout = np.arange(len(is_holdout)) >= (1.0 - settings.holdout) * len(is_holdout)
     model.noise.fill_(sigma)
     targets = torch.from_numpy((rows.intended_speed - rows.base_speed)[:, None])
-    fit = ensemble.fit_ensemble(model, _inputs(*rows[:ROAD_MODEL_INPUTS]), targets, is_holdout, settings, generator)
+    fit = ensemble.fit_ensemble(
+        model, _stack_inputs(*rows[:ROAD_MODEL_INPUTS]), targets, is_holdout, settings, generator
+    )
     base_error = ensemble.root_mean_square(fit.targets)
     model_error = ensemble.root_mean_square(fit.targets - fit.predictions)
     is_base_enough = base_error < ensemble.MIN_CHANGE or model_error**2 > (1.0 - min_error_reduction) * base_error**2

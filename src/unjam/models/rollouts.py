@@ -1,4 +1,4 @@
-"""Model rollouts of rows: their dynamics, how long they may be (Eq. 15), and how the full policy is driven in them."""
+"""Model rollouts of rows: their dynamics, their length (Eq. 15), and rollouts of the full policy."""
 
 from dataclasses import dataclass, replace
 from math import floor, isfinite
@@ -34,42 +34,42 @@ CLIPPED_QUANTITIES = ("speed", "gap", "reward")
 
 
 def check_device(device: Device, name: str = "device") -> None:
-    """Raise `MissingPartError` if a device is not available; `name` is the setting that asks for it."""
+    """Raise `MissingPartError` if a device is not available; `name` is the setting with the device."""
     if device == "cuda" and not torch.cuda.is_available():
         raise MissingPartError(f"{name}: cuda is not available; allowed: cpu")
 
 
 def to_device(values: NDArray[Any], device: torch.device | str) -> Tensor:
-    """Return values in single precision on `device`, as model rollouts use them."""
+    """Return values as a tensor on `device` in single precision, the precision of model rollouts."""
     return torch.as_tensor(values, dtype=torch.float32, device=device)
 
 
-def tensor_reward(text: str) -> Reward:
-    """Return the reward for a name or for `path.py:name`; a user's function is called with NumPy arrays."""
-    reward = make_reward(text)
-    if not is_file_reference(text):
+def tensor_reward(name: str) -> Reward:
+    """Return the reward of a name or of `path.py:name` for tensors; a user's function is called with NumPy arrays."""
+    reward = make_reward(name)
+    if not is_file_reference(name):
         return reward
 
     def reward_through_numpy(outcome: Outcome) -> dict[str, Tensor]:
         terms = reward(Outcome(*(values.cpu().numpy() for values in outcome)))
-        return {name: to_device(np.asarray(term), outcome.speeds.device) for name, term in terms.items()}
+        return {term: to_device(np.asarray(values), outcome.speeds.device) for term, values in terms.items()}
 
     return reward_through_numpy
 
 
 def tensor_driver(driver: Driver, device: torch.device | str) -> Driver:
-    """Return a driver that takes tensors on `device`: the same, or an adapter that calls it with NumPy arrays."""
+    """Return a driver that takes tensors on `device`: the given one, or an adapter that calls it with NumPy arrays."""
     return NumPyDriverAdapter(driver, torch.device(device)) if driver.requirements().needs_numpy else driver
 
 
 def tensor_memory(driver: Driver, memory: Memory, device: torch.device | str) -> Memory:
-    """Return NumPy `memory` as a driver of `tensor_driver` takes it, in single precision on `device`."""
+    """Return NumPy `memory` for a driver of `tensor_driver`, in single precision on `device`."""
     return memory if isinstance(driver, NumPyDriverAdapter) else map_leaves(lambda v: to_device(v, device), memory)
 
 
 @dataclass(frozen=True)
 class NumPyDriverAdapter(Driver):
-    """Calls a driver that does not take tensors with NumPy arrays; its memory stays in NumPy."""
+    """A driver for tensors that calls another driver with NumPy arrays; the memory stays in NumPy."""
 
     class_requirements: ClassVar[Requirements] = Requirements(needs_arrays=True)
     driver: Driver
@@ -80,7 +80,7 @@ class NumPyDriverAdapter(Driver):
         return self.driver.initial_memory(n)
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Tensor, Memory]:
-        """Return the driver's acceleration as a tensor, and its memory; `InputError` if it is not finite."""
+        """Return acceleration, as a tensor, and memory of the driver; raise `InputError` if not finite."""
         arrays = state.map(lambda values: values.double().cpu().numpy())
         acceleration, memory = self.driver.act(arrays, memory)
         return to_device(check_acceleration(acceleration, len(state.speed), "model rollout"), self.device), memory
@@ -101,16 +101,16 @@ class ModelTransition(NamedTuple):
     state: LocalState
     reward: Tensor
     crashed: Tensor
-    """whether a gap ahead or behind is used up, shape (n,)"""
+    """whether the gap to the leader or of the follower is zero or negative, shape (n,)"""
     clipped: Tensor
-    """which of `CLIPPED_QUANTITIES` were clipped, shape (3, n)"""
+    """whether each of `CLIPPED_QUANTITIES` was clipped, shape (3, n)"""
     actuators: ActuatorState = AT_REST
 
 
 class ModelDynamics:
-    """Base plus residual of a random member of the ensemble in each step, Eq. 4, for state and reward.
+    """Steps of state and reward: the base plus the residual of a random member of the ensemble, Eq. 4.
 
-    Noise is a random holdout error of the model for each row and step; it alone never causes a collision.
+    The noise of each row and step is a random holdout error of the model; noise never causes a collision by itself.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class ModelDynamics:
         add_noise: bool = True,
         members: Tensor | None = None,
     ) -> None:
-        """Make the dynamics on the generator's device; each of `members`, if given, always predicts the same rows."""
+        """Create the dynamics on the generator's device; `members`, if given, predict fixed blocks of rows."""
         self._model, self._layers, self._fixed_members = model, model.layers(), members
         self._scenario, self._generator, self._add_noise = scenario, generator, add_noise
         self._reward = tensor_reward(reward or scenario.reward)
@@ -132,11 +132,12 @@ class ModelDynamics:
     ) -> ModelTransition:
         """Return the transitions under commands `acceleration` [m/s2], (n,), with `drawn_values`, (n, m), of episodes.
 
-        The filter limits the commands, which the vehicles follow as their `actuators` let them.
+        The safety filter limits the commands, and the actuators respond with their delay and lag.
         """
         scenario, following = self._scenario, FollowingState(*state[:3])
-        setup = scenario.safety, scenario.actuator
-        acceleration, actuators = actuate(*setup, acceleration, following, actuators, scenario.control_step)
+        acceleration, actuators = actuate(
+            scenario.safety, scenario.actuator, acceleration, following, actuators, scenario.control_step
+        )
         response = actuators.acceleration
         base_state = row_model.base_step(self._model.base, scenario, state, response)
         expected = torch.stack([getattr(base_state, name) for name in row_model.STATE_FIELDS])
@@ -151,7 +152,7 @@ class ModelDynamics:
         is_missing = gaps >= largest_gap
         speed = speeds[0]
         distance = distance_driven(state.speed, speed, scenario.simulation_step, scenario.steps_per_control_step)
-        position, to_crossing = state.route_position + distance, state.distance_to_crossing
+        position, crossing_distance = state.route_position + distance, state.distance_to_crossing
         next_state = LocalState(
             speed=speed,
             leader_speed=torch.where(is_missing[0], speed, speeds[1]),
@@ -160,8 +161,10 @@ class ModelDynamics:
             follower_gap=gaps[1],
             route_position=torch.where(state.loop_length.isnan(), position, position % state.loop_length),
             loop_length=state.loop_length,
-            # Behind a crossing the next one is assumed a lap away: rows do not know other crossings.
-            distance_to_crossing=None if to_crossing is None else (to_crossing - distance) % state.loop_length,
+            # Rows contain one crossing: after it, the next crossing is assumed to be a lap away.
+            distance_to_crossing=(
+                None if crossing_distance is None else (crossing_distance - distance) % state.loop_length
+            ),
             penetration_rate=state.penetration_rate,
         )
         reward = row_model.base_reward(self._model.base, self._reward, next_state, acceleration, crashed)
@@ -170,7 +173,7 @@ class ModelDynamics:
         return ModelTransition(next_state, reward + residual_reward * ~crashed, crashed, clipped, actuators)
 
     def _residual(self, state: LocalState, acceleration: Tensor, drawn_values: Tensor, expected_gaps: Tensor) -> Tensor:
-        """Return the residual of the base with noise, shape (n, 6); `expected_gaps`, (2, n), are the base's."""
+        """Return the residual with noise, shape (n, 6); `expected_gaps` are the gaps of the base, shape (2, n)."""
         rows, members, generator = len(acceleration), self._fixed_members, self._generator
         if members is None:
             members = random_members(self._model.members, rows, generator)
@@ -178,24 +181,24 @@ class ModelDynamics:
         if not self._add_noise:
             return residual
         samples = torch.randint(row_model.NOISE_SAMPLES, (rows,), generator=generator, device=generator.device)
-        noisy = residual + self._model.noise.index_select(0, samples)
-        # Vehicles that change lanes or merge make gaps jump; they do so only where they fit.
-        is_collision = (expected_gaps + noisy.T[GAP_SLICE] <= 0.0).any(0)
-        return torch.where(is_collision[:, None], residual, noisy)
+        noisy_residual = residual + self._model.noise.index_select(0, samples)
+        # Noise contains jumps of gaps by lane changes and merging, which vehicles only do if the gap is sufficient.
+        is_collision = (expected_gaps + noisy_residual.T[GAP_SLICE] <= 0.0).any(0)
+        return torch.where(is_collision[:, None], residual, noisy_residual)
 
 
 def rollout_length(eps_m: float, settings: ModelSettings) -> int:
-    """Return k* = min(k_max, floor(kappa / eps_m)) [control steps], Eq. 15; 0: the model must not be used."""
+    """Return k* = min(k_max, floor(kappa / eps_m)) [control steps], Eq. 15; 0 if the model must not be used."""
     if not isfinite(eps_m):
         return 0
     return settings.k_max if eps_m * settings.k_max <= settings.kappa else floor(settings.kappa / eps_m)
 
 
 def return_bound(eps_pi: float, eps_m: float, k: int, gamma: float, max_reward: float) -> float:
-    """Return C, the bound on model return minus environment return (paper, below Eq. 13).
+    """Return C, the bound of the difference between model return and environment return (paper, below Eq. 13).
 
-    `eps_pi` is the total variation of the policy since the data, `eps_m` that of next states in the model; `k` the
-    rollout length, `gamma` the discount of control steps.
+    `eps_pi` is the total variation of the policy since the data were recorded, and `eps_m` that of next states in the
+    model. `k` is the rollout length, and `gamma` the discount factor of a control step.
     """
     horizon = 1.0 / (1.0 - gamma)
     policy_term = gamma ** (k + 1) * eps_pi * horizon**2 + gamma**k * eps_pi * horizon
@@ -206,31 +209,31 @@ class RolloutStarts(NamedTuple):
     """Recorded states from which model rollouts start; n rows."""
 
     state: LocalState
-    """tensors of shape (n,)"""
+    """states as tensors of shape (n,)"""
     actuators: ActuatorState
-    """tensors of shape (n,)"""
+    """actuator states as tensors of shape (n,)"""
     memory: Memory
-    """memory of the expert, as its `tensor_driver` takes it"""
+    """memory of the expert for its `tensor_driver`"""
     drawn_values: Tensor
-    """scaled values that the episodes drew, shape (n, m)"""
+    """scaled drawn values of the episodes, shape (n, m)"""
 
 
 @dataclass(frozen=True)
 class RolloutBatch:
-    """Model rollouts: n rows, each with the same number of actions of the network; tensors."""
+    """Model rollouts of n rows with the same number of actions of the network; tensors."""
 
     observations: Tensor
     """observations of the network at each action and at the end, shape (n, actions + 1, inputs)"""
     actions: Tensor
     """residuals with exploration noise, not clipped [m/s2], shape (n, actions)"""
     rewards: Tensor
-    """sums while each residual was held, zero after a crash, shape (n, actions)"""
+    """sums of the rewards during each action, zero after a crash, shape (n, actions)"""
     lengths: Tensor
-    """valid actions of each row, up to its crash, shape (n,)"""
+    """number of actions of each row up to its crash, shape (n,)"""
     terminated: Tensor
-    """whether the row crashed; otherwise it was truncated, shape (n,)"""
+    """whether each row crashed instead of being truncated, shape (n,)"""
     drawn_values: Tensor
-    """scaled values that the episodes drew, shape (n, m)"""
+    """scaled drawn values of the episodes, shape (n, m)"""
     control_steps: int
     clipped_share: dict[str, float]
     """share of the control steps in which each of `CLIPPED_QUANTITIES` was clipped"""
@@ -245,7 +248,7 @@ def draw_starts(
     *,
     episode_starts_only: bool = False,
 ) -> StartIndices:
-    """Return `rows` random `start_indices`, or none; with `episode_starts_only`, only first steps of recordings."""
+    """Return `rows` random start indices, none without data; `episode_starts_only`: only first steps of recordings."""
     indices = data.start_indices(min_control_steps, first_episode)
     if episode_starts_only:
         indices = indices[indices[:, 1] == 0]
@@ -257,19 +260,19 @@ def draw_starts(
 def prepare_starts(
     data: EnvironmentData, start_indices: StartIndices, expert: Driver, device: torch.device | str
 ) -> RolloutStarts:
-    """Return the starts of rollouts at `start_indices`, with the expert's memory at these steps."""
-    drawn = np.stack([data.recordings[index].drawn_values for index in start_indices[:, 0]])
+    """Return the starts of rollouts at `start_indices`, with the expert's memory before these steps."""
+    drawn_values = np.stack([data.recordings[index].drawn_values for index in start_indices[:, 0]])
     memory = reconstruct_memory(expert, data.recordings, start_indices)
     return RolloutStarts(
         state=data.states_at(start_indices).map(lambda values: to_device(values, device)),
         actuators=data.actuator_states_at(start_indices).map(lambda values: to_device(values, device)),
         memory=tensor_memory(tensor_driver(expert, device), memory, device),
-        drawn_values=to_device(drawn, device),
+        drawn_values=to_device(drawn_values, device),
     )
 
 
 class ModelWorld:
-    """n rows of the model as a world to drive in, from recorded states; after a crash a row no longer counts."""
+    """A world of n rows of the model that start from recorded states; a row does not count after its crash."""
 
     is_scalar, entered_count, remaining_rows = False, 0, None
 
@@ -283,22 +286,22 @@ class ModelWorld:
     ) -> None:
         self.limits, self.cav_count = limits, len(starts.state.speed)
         self.states = [starts.state]
-        """states at each step; the last one is the present state"""
+        """states at all steps so far; the last is the present state"""
         self._dynamics, self._starts, self._control_steps, self._generator = dynamics, starts, control_steps, generator
         self._actuators = starts.actuators
         speed = starts.state.speed
         self._is_running, self._running_log, self._rewards = torch.ones_like(speed), [], []
         self._episode_noise: Tensor | None = None
-        # Single precision counts to 2^24 only.
+        # Sums in single precision are exact only up to 2^24.
         self._step_total = torch.zeros((), dtype=torch.float64, device=speed.device)
         self._clipped_totals = torch.zeros(len(CLIPPED_QUANTITIES), dtype=torch.float64, device=speed.device)
 
     def start(self, is_controlled: bool, on_progress: ProgressCallback | None = None) -> None:
-        """Do nothing: the memory of the driver comes with the starts."""
+        """Do nothing: the starts contain the memory of the driver."""
 
     @property
     def has_ended(self) -> bool:
-        """Whether all control steps are made."""
+        """Whether all control steps have been simulated."""
         return len(self._rewards) >= self._control_steps
 
     def local_state(self) -> LocalState:
@@ -306,7 +309,7 @@ class ModelWorld:
         return self.states[-1]
 
     def advance(self, command: Command | None) -> None:
-        """Make one model step in each row."""
+        """Simulate one model step in each row."""
         assert command is not None
         acceleration = self.limits.clip(command.acceleration)
         transition = self._dynamics.step(self.states[-1], acceleration, self._starts.drawn_values, self._actuators)
@@ -319,7 +322,7 @@ class ModelWorld:
         self._is_running = self._is_running * ~transition.crashed
 
     def noise(self, episode_noise_size: int = 0) -> Tensor:
-        """Return standard normal noise, shape (n,), or (n, episode_noise_size): each row is a road of its own."""
+        """Return standard normal noise, independent for each row, shape (n,) or (n, episode_noise_size)."""
         speed = self.states[-1].speed
         if not episode_noise_size:
             return torch.randn(len(speed), generator=self._generator, dtype=torch.float32, device=speed.device)
@@ -330,7 +333,7 @@ class ModelWorld:
         return self._episode_noise
 
     def record(self, driver_log: DriverLog) -> RolloutBatch:
-        """Return the rollouts, action by action; `UnjamError` if some value is not finite."""
+        """Return the rollouts by action; raise `UnjamError` if a value is not finite."""
         repeat, empty = driver_log.action_repeat, self.states[0].speed.new_zeros((self.cav_count, 0))
         steps = range(0, len(self._rewards), repeat)
         actions = [driver_log.decisions[step][1] for step in steps]
@@ -365,7 +368,8 @@ def roll_out(
 ) -> RolloutBatch:
     """Drive the full policy in the model for `control_steps`, rounded down to whole actions of the network.
 
-    `generator` draws the exploration noise, if any. Raises `UnjamError` or `InputError` for values that are not finite.
+    `generator` draws the exploration noise; None: no exploration. Raise `UnjamError` or `InputError` if values are not
+    finite.
     """
     speed, repeat = starts.state.speed, driver.action_repeat
     driver = replace(driver, expert=tensor_driver(driver.expert, speed.device))

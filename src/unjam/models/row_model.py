@@ -1,10 +1,10 @@
-"""The row model: a base model of a CAV, its leader and its follower, and an ensemble for its residual; Eq. 4."""
+"""The row model: a base model of a CAV, its leader and its follower, and an ensemble for the residual, Eq. 4."""
 
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from math import nan
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -39,9 +39,9 @@ SPEED_FIELDS = ("speed", "leader_speed", "follower_speed")
 GAP_FIELDS = ("leader_gap", "follower_gap")
 STATE_FIELDS = (*SPEED_FIELDS, *GAP_FIELDS)
 TARGET_NAMES = (*STATE_FIELDS, "reward")
-"""outputs of the networks: the difference of each quantity to the base's prediction [m/s, m, reward]"""
+"""outputs of the networks: differences to the predictions of the base [m/s, m, reward]"""
 NOISE_SAMPLES = 4096
-"""stored errors on the holdout, from which the noise of model steps is drawn"""
+"""number of stored errors on the holdout, from which the noise of model steps is drawn"""
 BASE_DRIVERS: dict[str, Callable[[Scenario], Driver] | None] = {
     "idm": lambda scenario: IDM(**asdict(scenario.humans)),
     "population": lambda scenario: TypicalDriver(scenario),
@@ -49,11 +49,11 @@ BASE_DRIVERS: dict[str, Callable[[Scenario], Driver] | None] = {
     "ovm": lambda scenario: OVM(max_speed=scenario.humans.desired_speed),
     "none": None,
 }
-"""assumed driver of the follower, without memory; None: no base"""
+"""assumed driver of the follower by name of the base, without memory; None: no base"""
 
 
 def model_inputs(state: LocalState, acceleration: Array, drawn_values: Array) -> Array:
-    """Return the inputs of the networks: `STATE_FIELDS`, acceleration and m drawn values, SI units, (n, 6 + m)."""
+    """Return inputs of the networks, shape (n, 6 + m), SI units: `STATE_FIELDS`, acceleration and m drawn values."""
     xp = namespace(acceleration)
     columns = [getattr(state, name) for name in STATE_FIELDS]
     return xp.concatenate([xp.stack([*columns, acceleration], 1), drawn_values], 1)
@@ -67,15 +67,15 @@ def max_gap(state: LocalState) -> Array:
 
 def missing_neighbors(state: LocalState) -> tuple[Array, Array]:
     """Return whether there is no leader, and whether there is no follower, shape (n,) each."""
-    largest = max_gap(state)
-    return state.leader_gap >= largest, state.follower_gap >= largest
+    limit = max_gap(state)
+    return state.leader_gap >= limit, state.follower_gap >= limit
 
 
 def base_step(base: str, scenario: Scenario, state: LocalState, acceleration: Array) -> LocalState:
-    """Return the state after one control step under `acceleration` [m/s2] according to the base; Eq. 2 of the paper.
+    """Return the state after one control step under `acceleration` [m/s2] according to the base, Eq. 2 of the paper.
 
-    The follower moves by the base's car-following model, and the leader keeps its speed. Missing neighbors stay
-    missing. The base `none` predicts no change.
+    The follower moves by the car-following model of the base, and the leader keeps its speed. Missing neighbors are
+    still missing after the step. The base `none` predicts no change.
     """
     make_driver = BASE_DRIVERS[base]
     if make_driver is None:
@@ -101,7 +101,7 @@ def base_step(base: str, scenario: Scenario, state: LocalState, acceleration: Ar
 
 
 def base_reward(base: str, reward: Reward, next_state: LocalState, acceleration: Array, crashed: Array) -> Array:
-    """Return the reward in the next state, (n,), with the mean speed of CAV and neighbors for all; 0 for `none`."""
+    """Return the reward in the next state, (n,), of the CAV and its neighbors instead of all vehicles; 0 for `none`."""
     if BASE_DRIVERS[base] is None:
         return acceleration * 0.0
     xp = namespace(acceleration)
@@ -110,19 +110,19 @@ def base_reward(base: str, reward: Reward, next_state: LocalState, acceleration:
     follower_speed = xp.where(no_follower, nan, next_state.follower_speed)
     speeds = stack_columns((next_state.speed, leader_speed, follower_speed))
     gap = as_column(time_gap(next_state.leader_gap, next_state.speed))
-    own_speed, no_backlog = as_column(next_state.speed), 0.0 * acceleration
-    outcome = Outcome(speeds, as_column(acceleration), gap, crashed, no_backlog, own_speed)
+    cav_speed, no_backlog = as_column(next_state.speed), 0.0 * acceleration
+    outcome = Outcome(speeds, as_column(acceleration), gap, crashed, no_backlog, cav_speed)
     return sum(reward(outcome).values())
 
 
 @dataclass(frozen=True)
 class TypicalDriver(Driver):
-    """The typical driver of a road's calibrated population, with its residual; without a population, its IDM."""
+    """The typical driver of a road's population with the residual; without a population, the road's human driver."""
 
     scenario: Scenario
 
     def act(self, state: LocalState, memory: Memory) -> tuple[Array, Memory]:
-        """Return its acceleration; the memory is not used."""
+        """Return the acceleration of the typical driver; the memory is not used."""
         gap = clamp_min(state.leader_gap, MIN_IDM_GAP)
         inputs = (state.speed, state.leader_speed, gap)
         acceleration = idm_acceleration(*inputs, self.scenario.humans)
@@ -130,11 +130,12 @@ class TypicalDriver(Driver):
 
 
 class RowModel(Ensemble):
-    """An ensemble for the residual of a base of rows, with the noise and the reward bounds of model steps."""
+    """An ensemble for the residual of the base of rows, with noise and bounds of the reward for model steps."""
 
     noise: Tensor
     """errors on the holdout, shape (NOISE_SAMPLES, 6)"""
     reward_range: Tensor
+    """smallest and largest residual of the reward in the data, shape (2,)"""
 
     def __init__(
         self, settings: ModelSettings, drawn_count: int, seed: Seed, device: torch.device | str = "cpu"
@@ -152,9 +153,9 @@ class OneStepErrors(NamedTuple):
     base: Floats
     """errors of the base alone, shape (R, 6)"""
     predictions: Floats
-    """prediction of these errors by each member of the ensemble, shape (members, R, 6)"""
+    """predictions of the errors of the base by the members of the ensemble, shape (members, R, 6)"""
     change: Floats
-    """targets of the prediction: the change in the step, and the reward, shape (R, 6)"""
+    """predicted quantities: the change in the step, and the reward, shape (R, 6)"""
 
     @property
     def model(self) -> Floats:
@@ -163,23 +164,23 @@ class OneStepErrors(NamedTuple):
 
     def rmse_by_target(self) -> dict[str, OneStepRMSE]:
         """Return the root mean squared errors, by name of `TARGET_NAMES`."""
-        parts = (np.moveaxis(values, -1, 0) for values in (self.base, self.model, self.change))
+        errors_by_target = (np.moveaxis(errors, -1, 0) for errors in (self.base, self.model, self.change))
         return {
             name: OneStepRMSE(root_mean_square(base), root_mean_square(model), float(change.std()))
-            for name, base, model, change in zip(TARGET_NAMES, *parts, strict=True)
+            for name, base, model, change in zip(TARGET_NAMES, *errors_by_target, strict=True)
         }
 
 
 def fit_row_model(
     model: RowModel, transitions: Transitions, settings: ModelSettings, scenario: Scenario, reward: str, seed: Seed
 ) -> ModelFit:
-    """Fit `model` further, in place, see `fit_ensemble`; the result depends on the arguments alone."""
+    """Continue to fit `model` in place, see `fit_ensemble`; the result depends only on the arguments."""
     generator = np.random.default_rng(np.random.SeedSequence(list(seed)))
-    to_device: Any = {"device": model.input_mean.device}
+    device = model.input_mean.device
     columns = model_inputs(transitions.states, transitions.response, transitions.drawn_values)
-    targets = torch.as_tensor(residual_targets(transitions, model.base, scenario, reward), **to_device)
+    targets = torch.as_tensor(residual_targets(transitions, model.base, scenario, reward), device=device)
     model.reward_range.copy_(torch.stack([targets[:, -1].min(), targets[:, -1].max()]))
-    inputs = torch.as_tensor(columns, **to_device)
+    inputs = torch.as_tensor(columns, device=device)
     fit = fit_ensemble(model, inputs, targets, transitions.is_holdout, settings, generator)
     error = fit.targets - fit.predictions.mean(0)
     noise = error[generator.integers(len(error), size=NOISE_SAMPLES)] - error.mean(0)
@@ -199,7 +200,7 @@ def fit_row_model(
 
 
 def residual_targets(transitions: Transitions, base: str, scenario: Scenario, reward: str) -> Floats:
-    """Return the residuals of `base`, (rows, 6), SI units; of `none`, the change of the state, and the reward."""
+    """Return the residuals of `base`, (rows, 6), SI units: for `none`, the changes of the state, and the reward."""
     states, next_states, acceleration = transitions.states, transitions.next_states, transitions.acceleration
     predicted = base_step(base, scenario, states, transitions.response)
     reward_function = make_reward(reward or scenario.reward)
@@ -209,30 +210,30 @@ def residual_targets(transitions: Transitions, base: str, scenario: Scenario, re
 
 
 def unexplained_variance(one_step: Sequence[OneStepRMSE]) -> float:
-    """Return the mean ratio of squared error to variance; a constant quantity counts as predicted."""
-    ratios = [(step.model / step.change) ** 2 if step.change > MIN_CHANGE else 0.0 for step in one_step]
+    """Return the mean ratio of squared error to variance; it is zero for a constant quantity."""
+    ratios = [(rmse.model / rmse.change) ** 2 if rmse.change > MIN_CHANGE else 0.0 for rmse in one_step]
     return sum(ratios) / len(ratios)
 
 
 def recorded_noise(transitions: Transitions, scenario: Scenario) -> Floats | None:
-    """Return what noise added to the speeds of leader and follower in each control step, shape (rows, 2).
+    """Return the noise of the speeds of leader and follower in each control step [m/s], shape (rows, 2).
 
-    SUMO's drivers add it after they have moved; None for commanded drivers, whom it moves.
+    SUMO's own drivers add noise after they have moved, so that the distance shows it. None if this is not so.
     """
     if scenario.human_control != "native" or scenario.steps_per_control_step > 1:
         return None
-    state, following, step = transitions.states, transitions.next_states, scenario.simulation_step
-    leader_intended = following.speed + (following.leader_gap - state.leader_gap) / step
-    follower_intended = following.speed - (following.follower_gap - state.follower_gap) / step
-    return np.column_stack([following.leader_speed - leader_intended, following.follower_speed - follower_intended])
+    state, next_state, step = transitions.states, transitions.next_states, scenario.simulation_step
+    leader_intended = next_state.speed + (next_state.leader_gap - state.leader_gap) / step
+    follower_intended = next_state.speed - (next_state.follower_gap - state.follower_gap) / step
+    return np.column_stack([next_state.leader_speed - leader_intended, next_state.follower_speed - follower_intended])
 
 
 def _row_transition_variation(fit: EnsembleFit, transitions: Transitions, scenario: Scenario) -> float:
-    """Return `transition_variation` of leader and follower; unknown noise is subtracted from the errors' variance."""
+    """Return `transition_variation` of the speeds of leader and follower; unknown noise is subtracted as variance."""
     columns = [TARGET_NAMES.index("leader_speed"), TARGET_NAMES.index("follower_speed")]
     errors = (fit.targets - fit.predictions)[..., columns]
     noise, sigma = recorded_noise(transitions, scenario), scenario.noise_per_step * scenario.simulation_step
     if noise is not None:
         return transition_variation(errors - noise, sigma)
-    excess = np.square(errors).mean((0, 1)) - sigma**2
-    return transition_variation(np.sqrt(excess.clip(0.0)), sigma)
+    model_variance = np.square(errors).mean((0, 1)) - sigma**2
+    return transition_variation(np.sqrt(model_variance.clip(0.0)), sigma)

@@ -110,7 +110,7 @@ def trained_model_facts(trained: TrainedModel) -> dict[str, Any]:
     facts = {"iteration": progress_row["iteration"], "base": settings.base, "members": settings.members}
     if settings.kind == "road":
         run = partial(_run_episode, config.backend)
-        return _round_values(facts | cast(WholeRoadModel[Any], rollouts.world_model).waves(run))
+        return _round_values(facts | cast(WholeRoadModel[Any], rollouts.world_model).compare_waves(run))
     return _round_values(facts | _row_model_facts(rollouts, config, progress_row))
 
 
