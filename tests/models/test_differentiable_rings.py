@@ -307,7 +307,7 @@ def test_a_torch_module_drives_as_in_numpy_and_passes_gradients() -> None:
     (gradient,) = torch.autograd.grad(found.sum(), speeds)
     assert (gradient.abs().sum(1) > 0.0).tolist() == [True, True, False, False, False, True]
     for name, other in {"<lambda>": policy_driver(lambda rows: rows[:, 0]), "mine": as_driver(mine)}.items():
-        with pytest.raises(InputError, match=f"driver: '{name}' is not allowed; allowed: one that takes tensors"):
+        with pytest.raises(InputError, match=f"driver: '{name}' is not allowed; allowed: a driver that"):
             rings.initial_memory(other)
 
 

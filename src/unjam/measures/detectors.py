@@ -132,11 +132,11 @@ def aggregate_passages(
         if detector not in detectors:
             detectors[detector] = _unique_passages([entry for loop in detector for entry in passages_by_loop[loop]])
         times, passage_speeds = detectors[detector]
-        first, last = np.searchsorted(times, (row.begin, row.end))
-        flows[index] = (last - first) * 3600 / (row.end - row.begin)
-        known = passage_speeds[first:last][np.isfinite(passage_speeds[first:last])]
-        if known.size:
-            speeds[index] = known.mean()
+        begin, end = np.searchsorted(times, (row.begin, row.end))
+        flows[index] = (end - begin) * 3600 / (row.end - row.begin)
+        known_speeds = passage_speeds[begin:end][np.isfinite(passage_speeds[begin:end])]
+        if known_speeds.size:
+            speeds[index] = known_speeds.mean()
     return flows, speeds
 
 
@@ -175,10 +175,10 @@ def compute_agreement(measurements: Sequence[Measurement], flows: Floats, speeds
     measured_flows = np.array([row.flow for row in measurements])
     measured_speeds = np.array([row.speed for row in measurements])
     errors = geh(flows, measured_flows)
-    known = np.isfinite(measured_speeds)
-    speed_errors = np.nan_to_num(speeds[known]) - measured_speeds[known]
-    speed_rmse = float(np.sqrt(np.mean(speed_errors**2))) if known.any() else nan
-    mean_speed = float(np.mean(measured_speeds[known])) if known.any() else 0.0
+    is_measured = np.isfinite(measured_speeds)
+    speed_errors = np.nan_to_num(speeds[is_measured]) - measured_speeds[is_measured]
+    speed_rmse = float(np.sqrt(np.mean(speed_errors**2))) if is_measured.any() else nan
+    mean_speed = float(np.mean(measured_speeds[is_measured])) if is_measured.any() else 0.0
     score = float(np.mean(errors)) / GEH_LIMIT + (speed_rmse / mean_speed if mean_speed else 0.0)
     flow_rmse = float(np.sqrt(np.mean((flows - measured_flows) ** 2)))
     return Agreement(float(np.mean(errors)), float(np.mean(errors < GEH_LIMIT)), flow_rmse, speed_rmse, score)

@@ -67,10 +67,10 @@ def normalized_gain(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequenc
     most zero where the driver is infeasible, where it is shown to lower flow by more than 1 %, and where the
     reference is hardly better than the baseline.
     """
-    result = estimate(normalized_differences(rows, baseline, reference).tolist())
+    gain = estimate(normalized_differences(rows, baseline, reference).tolist())
     limit = 0.0 if is_gain_capped(rows, baseline, reference) else MAX_GAIN
-    mean, low, high = (float(np.clip(value, MIN_GAIN, limit)) for value in (result.mean, result.low, result.high))
-    return Estimate(mean, low, high, result.count)
+    mean, low, high = (float(np.clip(value, MIN_GAIN, limit)) for value in (gain.mean, gain.low, gain.high))
+    return Estimate(mean, low, high, gain.count)
 
 
 def gain_by_seed(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> Floats:
@@ -80,5 +80,5 @@ def gain_by_seed(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[f
     of `normalized_gain`.
     """
     limit = 0.0 if is_gain_capped(rows, baseline, reference) else MAX_GAIN
-    values = np.clip(normalized_differences(rows, baseline, reference), MIN_GAIN, limit)
-    return normalized_gain(rows, baseline, reference).mean + (values - values.mean())
+    gains = np.clip(normalized_differences(rows, baseline, reference), MIN_GAIN, limit)
+    return normalized_gain(rows, baseline, reference).mean + (gains - gains.mean())

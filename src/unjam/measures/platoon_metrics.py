@@ -100,13 +100,11 @@ def period_amplification(longest: float, shortest: float) -> Callable[[Episode],
     def ratio(episode: Episode) -> float:
         if not episode.has_recorded_leader:
             return nan
-        recorded, last = episode.replayed_motion[1:, 0, 1], episode.speeds[1:, 0]
-        frequencies = np.fft.rfftfreq(len(last), episode.control_step)
+        recorded_speeds, last_speeds = episode.replayed_motion[1:, 0, 1], episode.speeds[1:, 0]
+        frequencies = np.fft.rfftfreq(len(last_speeds), episode.control_step)
         is_in_band = (frequencies > 1.0 / longest) & (frequencies <= 1.0 / shortest)
-        recorded_spectrum, last_spectrum = (_spectrum(speeds)[is_in_band] for speeds in (recorded, last))
-        recorded_std, last_std = (
-            float(np.sqrt(np.sum(spectrum**2))) for spectrum in (recorded_spectrum, last_spectrum)
-        )
+        spectra = (_spectrum(speeds)[is_in_band] for speeds in (recorded_speeds, last_speeds))
+        recorded_std, last_std = (float(np.sqrt(np.sum(spectrum**2))) for spectrum in spectra)
         return last_std / recorded_std if recorded_std > MIN_WAVE_STD else nan
 
     limits = f"above {shortest:g} s" if longest == inf else f"of {shortest:g} to {longest:g} s"

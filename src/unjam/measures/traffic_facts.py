@@ -50,7 +50,7 @@ class TrafficFacts:
         nan  # time at which traffic upstream of the merging section becomes slow for several minutes [s]
     )
     flow_before: float = nan  # flow downstream in the minutes before the breakdown [veh/h per lane]
-    highest_flow: float = nan  # highest downstream flow, before a breakdown if there is one [veh/h per lane]
+    highest_flow: float = nan  # highest mean downstream flow of 5 minutes before a breakdown, if any [veh/h per lane]
     discharge: float = nan  # downstream flow in congestion, without the first minutes [veh/h per lane]
     congested_speed: float = nan  # mean speed at the upstream detector in the same period [m/s]
     wave_speed: float = nan  # speed of stop-and-go waves; negative upstream [m/s]

@@ -56,7 +56,7 @@ COMMON_METRICS = ("min_time_gap", "cav_max_braking", "human_max_braking", "colli
 
 
 def road_metrics(rows_by_driver: RowsByDriver) -> RoadMetrics:
-    """Return the key metrics of the road, whose kind follows from the metrics in its rows."""
+    """Return the key metrics of a road; the metrics in its rows show the kind of road."""
     rows = [row for driver_rows in rows_by_driver.values() for row in driver_rows]
     if is_measured(rows, LAG_METRIC):
         return RECORDED_ROAD

@@ -1,4 +1,4 @@
-"""Environment data (D_a in the paper), to which models are fitted, and from whose states rollouts start."""
+"""Environment data (D_a in the paper): models are fitted to these data, and rollouts start from their states."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
@@ -170,9 +170,9 @@ def reconstruct_memory(expert: Driver, recordings: Sequence[Recording], start_in
     indices, rows = np.unique(start_indices[:, 0], return_inverse=True)
     started = [recordings[index] for index in indices]
     memory = map_leaves(lambda *values: np.stack(values), *(recording.initial_memory for recording in started))
-    result = map_leaves(lambda values: np.empty((len(start_indices), *values.shape[1:])), memory)
-    if not result:
-        return result
+    start_memory = map_leaves(lambda values: np.empty((len(start_indices), *values.shape[1:])), memory)
+    if not start_memory:
+        return start_memory
     last_step = int(start_indices[:, 1].max())
     steps = [np.arange(last_step).clip(0, len(recording.applied_acceleration)) for recording in started]
     states = [recording.states.select(step_indices) for recording, step_indices in zip(started, steps, strict=True)]
@@ -182,10 +182,10 @@ def reconstruct_memory(expert: Driver, recordings: Sequence[Recording], start_in
     def store(step: int, memory: Memory) -> None:
         starts = order[bounds[step] : bounds[step + 1]]
         if len(starts):
-            map_leaves(lambda target, values: target.__setitem__(starts, values[rows[starts]]), result, memory)
+            map_leaves(lambda target, values: target.__setitem__(starts, values[rows[starts]]), start_memory, memory)
 
     store(0, memory)
     world = RecordedWorld(states[0].map(lambda *values: np.stack(values, 1), *states[1:]), Limits(-inf, inf))
     for step, decision in enumerate(DriveLoop(world, expert, memory=memory), start=1):
         store(step, decision.memory if decision else memory)
-    return result
+    return start_memory

@@ -89,11 +89,11 @@ def _sample_vehicles(episode: Episode, steps: Index) -> tuple[Index, Index, Inde
     index_in_column = np.cumsum(has_entered, 0) - 1
     columns = np.array(episode.vehicle_columns or range(is_present.shape[1]))
     order = np.argsort(columns, kind="stable")
-    first = np.searchsorted(columns[order], np.arange(is_present.shape[1]))
+    first_in_column = np.searchsorted(columns[order], np.arange(is_present.shape[1]))
     sample, column = np.nonzero(is_present[steps])
     rows = np.lexsort((-episode.positions[steps[sample], column], sample))
     sample, column = sample[rows], column[rows]
-    return sample, column, order[first[column] + index_in_column[steps[sample], column]]
+    return sample, column, order[first_in_column[column] + index_in_column[steps[sample], column]]
 
 
 def _batch_vehicles(

@@ -328,8 +328,8 @@ class ModelWorld:
             return torch.randn(len(speed), generator=self._generator, dtype=torch.float32, device=speed.device)
         if self._episode_noise is None:
             shape = len(speed), episode_noise_size
-            like = {"dtype": torch.float32, "device": speed.device}
-            self._episode_noise = torch.randn(shape, generator=self._generator, **like).to(speed.dtype)
+            noise = torch.randn(shape, generator=self._generator, dtype=torch.float32, device=speed.device)
+            self._episode_noise = noise.to(speed.dtype)
         return self._episode_noise
 
     def record(self, driver_log: DriverLog) -> RolloutBatch:

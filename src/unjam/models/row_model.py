@@ -151,7 +151,7 @@ class OneStepErrors(NamedTuple):
     """One-step prediction errors [m/s, m, reward]; R rows, columns as `TARGET_NAMES`."""
 
     base: Floats
-    """errors of the base alone, shape (R, 6)"""
+    """errors of the base, shape (R, 6)"""
     predictions: Floats
     """predictions of the errors of the base by the members of the ensemble, shape (members, R, 6)"""
     change: Floats

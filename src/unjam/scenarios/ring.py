@@ -124,8 +124,8 @@ class LoopScenario(Scenario):
         """Return this road with part `index` of `count` equal parts of its range of sizes, both ends included."""
         low, high = self._size_range
         borders = np.linspace(low, high + 1, count + 1).astype(int)
-        first, last = int(borders[index]), int(borders[index + 1]) - 1
-        return replace(self, **{self.size_parameter: (first, max(first, last))})
+        low, high = int(borders[index]), int(borders[index + 1]) - 1
+        return replace(self, **{self.size_parameter: (low, max(low, high))})
 
     def possible_cav_ids(self) -> tuple[str, ...]:
         """Return the ids of the CAVs, in their order along the road."""
