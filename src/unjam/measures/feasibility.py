@@ -38,9 +38,7 @@ def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tup
     required, has_lanes = row.get("required_time_gap") or DEFAULT_REQUIRED_TIME_GAP, row.get("has_lanes", False)
     time_gap, human_braking = row["min_time_gap"], row[HARD_BRAKING_METRIC]
     min_time_gap = MIN_TIME_GAP_WITH_LANES if has_lanes else MIN_TIME_GAP_FRACTION * required
-    short_share, cut_in_braking = (
-        row[name] if has_lanes else 0.0 for name in ("share_short_time_gap", "cut_in_max_braking")
-    )
+    short, cut_in = (row[name] if has_lanes else 0.0 for name in ("share_short_time_gap", "cut_in_max_braking"))
     baseline = "unknown, -d human measures it" if baseline_braking is None else _rate_text(baseline_braking)
     rate = f"{_rate_text(human_braking)} times in a million vehicle-steps (without CAVs: {baseline})"
     has_crashed, contacts, braking = row["status"] == "collision", float(row.get("contacts", 0)), row["cav_max_braking"]
@@ -48,12 +46,8 @@ def _violations(row: dict[str, Any], baseline_braking: float | None) -> list[tup
         (has_crashed * (1.0 + row["collisions"]), 0.0, f"{format_count(row['collisions'], 'vehicle')} in contact"),
         (contacts, 0.0, f"{format_count(contacts, 'CAV')} in contact"),
         (-time_gap, TOLERANCE - min_time_gap, f"time gap {time_gap:.2f} s (limit {min_time_gap:g} s)"),
-        (
-            short_share,
-            MAX_SHORT_TIME_GAP_SHARE,
-            f"time gap below {required:g} s in {100 * short_share:.2g} % of the time",
-        ),
-        (cut_in_braking, TOLERANCE + MAX_CUT_IN_BRAKING, f"brakes with {cut_in_braking:.1f} m/s2 after a cut-in"),
+        (short, MAX_SHORT_TIME_GAP_SHARE, f"time gap below {required:g} s in {100 * short:.2g} % of the time"),
+        (cut_in, TOLERANCE + MAX_CUT_IN_BRAKING, f"brakes with {cut_in:.1f} m/s2 after a cut-in"),
         (-row["cav_min_ttc"], TOLERANCE - MIN_FEASIBLE_TTC, f"{row['cav_min_ttc']:.2f} s to a collision"),
         (braking, TOLERANCE + MAX_FEASIBLE_BRAKING, f"brakes with {braking:.1f} m/s2"),
         (row["override_share"], 0.0, f"the simulator overrides {100 * row['override_share']:.2g} % of its commands"),

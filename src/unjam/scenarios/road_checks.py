@@ -30,7 +30,7 @@ def check_road(road: object, vehicle_length: float, context: str) -> None:
         raise InputError(f"{context}: road.{error}") from None
 
 
-def _raise_not_allowed(field: str, value: object, allowed: str) -> None:
+def _refuse(field: str, value: object, allowed: str) -> None:
     raise ValueError(f"{field}: {value} is not allowed; allowed: {allowed}")
 
 
@@ -38,14 +38,14 @@ def _check_length(
     field: str, length: float, expected: float, meaning: str, tolerance: float = LENGTH_TOLERANCES[1]
 ) -> None:
     if not (np.isfinite(length) and length > 0):
-        _raise_not_allowed(field, f"{length:g} m", "> 0 m")
+        _refuse(field, f"{length:g} m", "> 0 m")
     if abs(length - expected) > LENGTH_TOLERANCES[0] + tolerance * expected:
-        _raise_not_allowed(field, f"{length:.1f} m", f"{expected:.1f} m, {meaning}")
+        _refuse(field, f"{length:.1f} m", f"{expected:.1f} m, {meaning}")
 
 
 def _check_name(field: str, name: str, names: Collection[str]) -> None:
     if name not in names:
-        _raise_not_allowed(field, repr(name), shorten_list(names))
+        _refuse(field, repr(name), shorten_list(names))
 
 
 def _line_length(points: Floats) -> float:
@@ -66,16 +66,12 @@ def _check_network(road: BuiltRoad) -> None:
             _check_name(f"routes.{name}.edges", edge_name, edges)
         for edge_name, next_name in pairwise(route.edges):
             if edges[edge_name].to_node != edges[next_name].from_node:
-                _raise_not_allowed(
-                    f"routes.{name}.edges", f"{next_name} after {edge_name}", "edges that meet at a node"
-                )
+                _refuse(f"routes.{name}.edges", f"{next_name} after {edge_name}", "edges that meet at a node")
     for entry in road.entries:
         _check_name(f"entries.{entry.name}.route", entry.route, routes)
         length = edges[routes[entry.route].edges[0]].length
         if not 0 <= entry.position <= length:
-            _raise_not_allowed(
-                f"entries.{entry.name}.position", f"{entry.position:g} m", f"0 to {length:g} m, on its first edge"
-            )
+            _refuse(f"entries.{entry.name}.position", f"{entry.position:g} m", f"0 to {length:g} m, on its first edge")
 
 
 def _check_loop(road: ClosedRoad, vehicle_length: float) -> None:
@@ -86,22 +82,18 @@ def _check_loop(road: ClosedRoad, vehicle_length: float) -> None:
     _check_length("loop_length", loop, sum(edge.length for edge in lap), "the sum of its edges", tolerance)
     line = np.asarray(road.center_line, np.float64)
     if line.ndim != 2 or line.shape[1] != 3 or not np.isfinite(line).all():
-        _raise_not_allowed("center_line", f"an array of shape {line.shape}", "finite rows (position, x, y)")
+        _refuse("center_line", f"an array of shape {line.shape}", "finite rows (position, x, y)")
     _check_length("center_line", _line_length(line[:, 1:]), loop, "the length of the loop", tolerance)
     _check_length("center_line", float(line[-1, 0] - line[0, 0]), loop, "the length of the loop")
     ids, positions = road.vehicle_ids, np.asarray(road.start_positions, np.float64)
     for name in road.cav_ids:
         _check_name("cav_ids", name, ids)
     if positions.shape != (len(ids),) or not np.isfinite(positions).all():
-        _raise_not_allowed(
-            "start_positions", f"an array of shape {positions.shape}", format_count(len(ids), "finite position")
-        )
+        _refuse("start_positions", f"an array of shape {positions.shape}", format_count(len(ids), "finite position"))
     gaps = gap_on_loop(positions, np.roll(positions, -1), loop, vehicle_length)
     if len(ids) > 1 and (gaps.min() < 0 or gaps.sum() > loop):
         row = int(gaps.argmin())
-        _raise_not_allowed(
-            "start_positions", f"{positions[row]:.1f} m of {ids[row]}", "vehicles in their order, without contact"
-        )
+        _refuse("start_positions", f"{positions[row]:.1f} m of {ids[row]}", "vehicles in their order, without contact")
     if not road.network.has_internal_links:
         _check_entries(road, lap)
 
@@ -116,6 +108,4 @@ def _check_entries(road: ClosedRoad, lap: list[Edge]) -> None:
         position, start = edge_starts[routes[entry.route].edges[0]] + entry.position, starts[entry.name]
         offset = (position - start) % road.loop_length
         if min(offset, road.loop_length - offset) > LENGTH_TOLERANCES[0]:
-            _raise_not_allowed(
-                f"entries.{entry.name}", f"{position:.1f} m on the loop", f"{start:.1f} m, as in start_positions"
-            )
+            _refuse(f"entries.{entry.name}", f"{position:.1f} m on the loop", f"{start:.1f} m, as in start_positions")
