@@ -63,7 +63,7 @@ def following_statistics(gaps: list[float], speeds: list[float]) -> FollowingSta
         log.record_step(vehicles, np.array([1, -1]), no_vehicles, np.array([0]))
     rows = np.concatenate(log._steady_following, 1)
     assert (rows[0] == 1).all()
-    return log._audit(1, [], rows[1:]).following
+    return log._make_audit(1, [], rows[1:]).following
 
 
 def test_a_batch_excludes_the_recovery_and_nothing_after_it() -> None:

@@ -220,8 +220,8 @@ class BatchMotorways:
         max_speed = np.where(vehicles.is_eidm, vehicles.speed_cap, allowed)
         safe = np.minimum(np.minimum(speed + vehicles.max_acceleration * step, max_speed), follow)
         may_be_free = as_rows(safe > speed - LEADER_BRAKING_THRESHOLD * step)
-        free_arguments = (values[may_be_free] for values in (speed, free_gap, next_allowed))
-        free = drivers.select(may_be_free).desired_speed(*free_arguments, step)
+        free_speeds, free_gaps, free_limits = (values[may_be_free] for values in (speed, free_gap, next_allowed))
+        free = drivers.select(may_be_free).desired_speed(free_speeds, free_gaps, free_limits, step)
         # Drivers follow the leader or the allowed speed, depending on which requires more braking without coolness.
         is_free = np.zeros(len(speed), bool)
         is_free[may_be_free] = free.uncooled_acceleration < uncooled[may_be_free] + eidm.EIDM_EPSILON

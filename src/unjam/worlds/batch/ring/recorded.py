@@ -69,8 +69,9 @@ class RecordedBatch(RingBatch):
         if scenario.steps_per_control_step > 1:
             scenario = replace(scenario, simulation_step=scenario.control_step, steps_per_control_step=1)
         mean_speeds = np.diff(positions, axis=0) / scenario.control_step
-        no_commands = [np.zeros((0, len(drawn_road.cav_ids)))] * 3
-        log = OrderedRoadLog(scenario, drawn_road, positions[0], mean_speeds, speeds, *no_commands)
+        no_commands = np.zeros((0, len(drawn_road.cav_ids)))
+        motion_log = scenario, drawn_road, positions[0], mean_speeds, speeds
+        log = OrderedRoadLog(*motion_log, no_commands, no_commands, no_commands)
         fields = common_fields(scenario, drawn_road, (), bool(self.crashed_roads[road]))
         return log.episode((speeds.T, positions.T), fields, DriverLog(), None)
 
