@@ -25,8 +25,21 @@ ORDER = (
 )
 """each may import those before it, and none after it"""
 EVERYWHERE = {
-    *("", "adam", "child_processes", "errors", "file_names", "files", "folders", "kernels", "manifest", "onnx_models"),
-    *("parameters", "plugins", "processes", "road_family", "sandbox", "seeds", "text", "tree", "trust", "user_code"),
+    *("", "adam", "child_processes", "errors", "file_names", "files", "folders", "interruptions", "kernels"),
+    *(
+        "manifest",
+        "onnx_models",
+        "parameters",
+        "plugins",
+        "processes",
+        "road_family",
+        "sandbox",
+        "seeds",
+        "text",
+        "tree",
+        "trust",
+        "user_code",
+    ),
 }
 """modules that every part may import: they import none of the layers"""
 ALLOWED = {
@@ -328,6 +341,7 @@ PROCESS_WIDE = {
 CHANGES_THE_PROCESS = {
     "processes": "functions for processes of unjam",
     "sandbox": "functions for processes of unjam",
+    "interruptions": "in the command line",
     "kernels": "when unjam is imported",
     "trust": "for the length of a block that the user writes, under a lock",
     "child_processes": "in the command line, and while Ray or multiprocessing starts processes",

@@ -6,6 +6,7 @@ import pytest
 import typer
 
 from unjam import cli
+from unjam.interruptions import TerminationSignal
 
 
 def caused_by(cause: BaseException, as_context: bool) -> RuntimeError:
@@ -28,7 +29,7 @@ def raising(error: BaseException) -> Callable[..., None]:
         (KeyboardInterrupt(), 130, "interrupted"),
         (caused_by(KeyboardInterrupt(), as_context=False), 130, "interrupted"),
         (caused_by(caused_by(KeyboardInterrupt(), as_context=False), as_context=True), 130, "interrupted"),
-        (caused_by(cli._TerminationSignal(15), as_context=False), 143, "terminated"),
+        (caused_by(TerminationSignal(15), as_context=False), 143, "terminated"),
         (MemoryError(), 2, "memory: there is not enough for this command"),
         (RuntimeError("can't start new thread"), 2, "memory: there is not enough for this command"),
         (RecursionError("maximum recursion depth exceeded"), 2, "input: it is nested too deeply"),

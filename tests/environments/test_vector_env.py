@@ -240,9 +240,17 @@ def test_tensors_are_what_arrays_are(name: str) -> None:
         assert all(isinstance(values, torch.Tensor) for values in tensor_info["reward_terms"].values())
 
 
+def to_half_precision(values: Any) -> Any:
+    return values.half() if isinstance(values, torch.Tensor) else values.astype(np.float16)
+
+
 BAD_REWARDS: dict[str, tuple[Callable[[Outcome], Any], str]] = {
     "NaN": (lambda outcome: {"bad": outcome.speeds.mean(-1) * nan}, "term 'bad' is nan; allowed: finite, at most 1e"),
     "infinite": (lambda outcome: {"bad": outcome.speeds.mean(-1) - inf}, "term 'bad' is -inf; allowed: finite"),
+    "infinite, of half precision": (
+        lambda outcome: {"bad": to_half_precision(outcome.speeds.mean(-1)) - inf},
+        "term 'bad' is -inf; allowed: finite",
+    ),
     "large": (lambda outcome: {"bad": 0.0 * outcome.speeds.mean(-1) + 1e300}, r"term 'bad' is 1e\+300; allowed"),
     "opposite infinities": (
         lambda outcome: {"good": outcome.speeds.mean(-1) + 1e200, "bad": outcome.speeds.mean(-1) - 1e200},

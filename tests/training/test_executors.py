@@ -2,6 +2,7 @@
 
 import hashlib
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -75,6 +76,29 @@ def test_stop_ends_running_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     thread.join(timeout=10)
     assert codes == [-signal.SIGTERM]
     assert (tmp_path / "log").read_text().count("$ ") == 1
+
+
+@pytest.mark.parametrize("is_starting", [True, False])
+def test_stop_reaches_a_process_that_is_being_started(
+    is_starting: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(CommandLine, "argv", lambda self: [sys.executable, "-c", "import time; time.sleep(60)"])
+    processes = LocalExecutor()
+    stopping = threading.Thread(target=processes.stop)
+
+    class SlowPopen(subprocess.Popen[bytes]):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            assert is_starting
+            stopping.start()
+            time.sleep(0.2)
+            super().__init__(*arguments, **options)
+
+    if not is_starting:
+        processes.stop()
+    monkeypatch.setattr(executors.subprocess, "Popen", SlowPopen)
+    start = time.monotonic()
+    assert processes.run(CommandLine([], tmp_path / "log")) == -signal.SIGTERM
+    assert time.monotonic() - start < 30
 
 
 def test_missing_ray_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

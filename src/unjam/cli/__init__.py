@@ -8,7 +8,6 @@ import warnings
 from importlib import import_module
 from io import TextIOWrapper
 from itertools import pairwise
-from types import FrameType
 from typing import Annotated, Any
 
 import typer
@@ -19,6 +18,7 @@ from unjam import __version__, errors
 from unjam.child_processes import isolate_children, isolate_matplotlib
 from unjam.cli.options import with_trust_option
 from unjam.errors import InputError, UnjamError, invalid_value, missing_package_error, unknown_name
+from unjam.interruptions import TerminationSignal, mark_as_handled, raise_signals
 from unjam.plugins import load_plugins, plugin_names
 from unjam.processes import exit_with_parent, mark_as_command_line
 from unjam.text import printable
@@ -43,6 +43,12 @@ CODE_RUNNING_COMMANDS = {
 
 class _CommandGroup(TyperGroup):
     """Commands of unjam and of plugins, imported on demand."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        finally:
+            mark_as_handled()  # what follows only prints the error, and typer replaces a signal by an exit code
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [*COMMANDS, *plugin_names("unjam.commands")]
@@ -87,14 +93,6 @@ def _global_options(
     pass
 
 
-class _TerminationSignal(BaseException):
-    """The process received SIGTERM, or SIGHUP because its terminal was closed."""
-
-
-def _terminate(signum: int, frame: FrameType | None) -> None:
-    raise _TerminationSignal(signum)
-
-
 class _LineFormatter(logging.Formatter):
     """Formats a log message as one line without the control characters that names in files can have."""
 
@@ -122,10 +120,7 @@ def main() -> None:
         logging.lastResort.setFormatter(_LineFormatter())
     warnings.formatwarning = _format_warning
     mark_as_command_line()
-    for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and nohup ignores it
-        signum = getattr(signal, name, None)
-        if signum is not None and signal.getsignal(signum) != signal.SIG_IGN:
-            signal.signal(signum, _terminate)
+    raise_signals()
     isolate_children()
     isolate_matplotlib()
     sys.exit(_run_app())
@@ -159,8 +154,8 @@ def _run_app() -> int:
         return _print_error(TOO_LITTLE_MEMORY, InputError.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return _print_error("interrupted", INTERRUPTED_EXIT_CODE)
-    except _TerminationSignal as error:
-        return _print_error("terminated", 128 + error.args[0])
+    except TerminationSignal as error:
+        return _print_error("terminated", 128 + error.signum)
     except Exception as error:
         if isinstance(error, RuntimeError) and "start new thread" in str(error):
             return _print_error(TOO_LITTLE_MEMORY, InputError.exit_code)
@@ -176,7 +171,7 @@ def _call_app() -> int:
     except Exception as error:
         cause: BaseException | None = error
         while cause := cause.__cause__ or cause.__context__:  # Python replaces errors while it defines classes
-            if isinstance(cause, KeyboardInterrupt | _TerminationSignal):
+            if isinstance(cause, KeyboardInterrupt | TerminationSignal):
                 raise cause from None
         raise
 

@@ -6,6 +6,7 @@ A single training, `python -m unjam.training.executors`, is for programs that im
 
 import os
 import shlex
+import signal
 import subprocess
 import sys
 import threading
@@ -99,20 +100,23 @@ class LocalExecutor:
         with open(open_in_place(command.log, APPEND_FLAGS), "ab") as log:
             log.write(f"$ {shlex.join(argv)}\n".encode())
             log.flush()
-            with subprocess.Popen(
-                argv, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, cwd=self._folder
-            ) as process:
-                with self._lock:
-                    self._running.add(process)
+            with self._lock:  # `stop` waits until the process is started, and terminates it too
+                if self._is_stopped:
+                    return -signal.SIGTERM
+                process = subprocess.Popen(
+                    argv, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, cwd=self._folder
+                )
+                self._running.add(process)
+            with process:
                 exit_code = process.wait()
-                with self._lock:
-                    self._running.discard(process)
+            with self._lock:
+                self._running.discard(process)
         return exit_code
 
     def stop(self) -> None:
-        """Terminate all running processes; a training writes its checkpoint before it ends."""
-        self._is_stopped = True
+        """Terminate all processes and start no further ones; a training writes its checkpoint before it ends."""
         with self._lock:
+            self._is_stopped = True
             for process in self._running:
                 process.terminate()
 

@@ -38,7 +38,7 @@ STEADY_FUEL = 0.05
 """fuel of a mid-size car at a constant speed of 10 to 25 m/s [ml/m]"""
 STANDSTILL_SPEED = 1e-3
 """lower limit of the speed in time gaps [m/s]"""
-MAX_REWARD_TERM = 1e100
+MAX_REWARD_TERM = 1e30
 """largest magnitude of a term in one control step, so that no return overflows"""
 MAX_REWARD_CELLS = 4_000_000
 """maximum of control steps times vehicles in one call of a reward function, which limits the memory"""
@@ -353,7 +353,7 @@ def check_tensor_terms(reward: Reward, terms: dict[str, Array]) -> None:
         if is_complex is None or is_complex():
             kind = f"a {type(values).__name__} is not allowed for the term {name!r}"
             raise InputError(f"{label}: {kind}; allowed: a tensor of real numbers, made of those of the Outcome")
-        is_allowed = abs(1.0 * values.detach()) <= MAX_REWARD_TERM  # Booleans have no absolute value
+        is_allowed = abs(values.detach().double()) <= MAX_REWARD_TERM
         if not bool(is_allowed.all()):
             value, allowed = float(values.detach()[~is_allowed][0]), f"finite, at most {MAX_REWARD_TERM:g}"
             raise InputError(f"{label}: term {name!r} is {value:g}; allowed: {allowed}")

@@ -1,0 +1,90 @@
+"""Signals that code in between must not lose."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+LOSSES = {
+    "a bare except": """
+try:
+    send()
+except BaseException:
+    pass
+""",
+    "a destructor": """
+class Temporary:
+    def __del__(self):
+        send()
+
+Temporary()
+""",
+    "an extension that clears errors": """
+import numpy as np
+
+class Array:
+    def __getattribute__(self, name):
+        if name == "__array_interface__":
+            send()
+        return object.__getattribute__(self, name)
+
+np.asarray(Array())
+""",
+    "an error while a class is defined": """
+class Name:
+    def __set_name__(self, owner, name):
+        send()
+
+try:
+    class Owner:
+        name = Name()
+except Exception:
+    pass
+""",
+}
+"""programs that lose an exception of a signal"""
+PROGRAM = """
+import os, sys, time
+from unjam.interruptions import mark_as_handled, raise_signals
+
+def send():
+    os.kill(os.getpid(), int(sys.argv[1]))
+
+raise_signals()
+try:
+    exec(sys.argv[2])
+    time.sleep(60)
+except BaseException as error:
+    mark_as_handled()
+    print(type(error).__name__, error.signum, isinstance(error, KeyboardInterrupt), flush=True)
+"""
+CLEANUP = """
+try:
+    send()
+finally:
+    time.sleep(0.5)
+    print("clean", flush=True)
+"""
+
+
+def run(signum: int, code: str) -> str:
+    command = [sys.executable, "-c", PROGRAM, str(int(signum)), code]
+    return subprocess.run(command, capture_output=True, text=True, timeout=50, check=True).stdout
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_lost_signal_is_raised_again(loss: str) -> None:
+    assert run(signal.SIGTERM, LOSSES[loss]) == "TerminationSignal 15 False\n"
+    assert run(signal.SIGINT, LOSSES[loss]) == "InterruptSignal 2 True\n"
+
+
+def test_a_signal_does_not_interrupt_the_cleanup_after_it() -> None:
+    assert run(signal.SIGTERM, CLEANUP) == "clean\nTerminationSignal 15 False\n"
+
+
+def test_an_ignored_signal_stays_ignored() -> None:
+    code = "signal.signal(signal.SIGHUP, signal.SIG_IGN); raise_signals(); send(); print('goes on'); sys.exit()"
+    program = PROGRAM.replace("import os, sys", "import os, signal, sys").replace("\nraise_signals()\n", "\n")
+    command = [sys.executable, "-c", program, str(int(signal.SIGHUP)), code]
+    assert subprocess.run(command, capture_output=True, text=True, timeout=50, check=False).stdout == "goes on\n"
