@@ -75,8 +75,12 @@ def test_an_expert_that_always_amplifies_ends_the_tuning_with_its_smallest_gain(
     monkeypatch.setattr("unjam.training.tune.MAX_REFUSED_SETTINGS", 3)
     space: SearchSpace = {"catch_up_speed": FloatDistribution(1.0, 3.0)}
     message = r"3 settings of pi in a row have a string gain of at least 1\.\d+; allowed: at most 1.02, or another"
+    lines: list[str] = []
+    options: dict[str, Any] = {"max_string_gain": MAX_STRING_GAIN, "on_message": lines.append}
     with WorkerPool(1) as workers, pytest.raises(UnjamError, match=message):
-        tune({"ring": SMALL}, "pi", space, STEPS, tmp_path, workers, max_string_gain=MAX_STRING_GAIN)
+        tune({"ring": SMALL}, "pi", space, STEPS, tmp_path, workers, **options)
+    assert len(lines) == 3
+    assert all("not tried: a string gain of 1." in line for line in lines)
 
 
 def test_a_limit_on_an_open_road_is_refused(tmp_path: Path) -> None:

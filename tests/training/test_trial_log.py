@@ -23,3 +23,10 @@ def test_rows_of_other_versions_are_not_continued(name: str, tmp_path: Path, mon
     with pytest.raises(InputError, match=rf"made with other settings \(versions.{name}: '.+' there, '0.0' now\)"):
         open_log()
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+def test_long_texts_that_differ_in_the_middle_are_shown_as_a_whole(tmp_path: Path) -> None:
+    paths = [f"/home/project/{name}/networks/bottleneck.sumocfg" for name in ("spring", "autumn")]
+    RowLog(tmp_path / "log", {"file": paths[0]}, "rows.jsonl")
+    with pytest.raises(InputError, match=f"file: {paths[0]!r} there, {paths[1]!r} now"):
+        RowLog(tmp_path / "log", {"file": paths[1]}, "rows.jsonl")

@@ -23,7 +23,7 @@ from unjam.measures.recommendation import MIN_VERDICT_SEEDS
 from unjam.measures.statistics import Estimate, format_difference, format_percent
 from unjam.reports import figures, space_time
 from unjam.reports.html import render_template
-from unjam.reports.results import original_command, read_results, replace_null
+from unjam.reports.results import damaged_results_error, original_command, read_results, replace_null
 from unjam.text import split_label
 
 ASSESSMENT_FILE, ASSESSMENT_PAGE = "assessment.json", "assessment.html"
@@ -73,7 +73,11 @@ def write_assessment(folder: Path, target: Path) -> Path:
     Raise `InputError` if the folder contains no assessment, `DiskError` if the page cannot be written.
     """
     check_parent_folder(target)
-    atomic_write(target, render_assessment(folder))
+    try:
+        page = render_assessment(folder)
+    except INVALID_DATA_ERRORS as error:
+        raise damaged_results_error(folder, error) from error
+    atomic_write(target, page)
     return target
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from zlib import compress
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
@@ -72,7 +72,10 @@ def render_template(template: str, **values: Any) -> str:
     options: dict[str, Any] = {"undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=PackageLoader("unjam.reports", "page"), autoescape=True, **options)
     common = {"version": __version__, "style": _page_file("report.css"), "downloads": _page_file("downloads.js")}
-    return printable(environment.get_template(template).render(**common, **values))
+    try:
+        return printable(environment.get_template(template).render(**common, **values))
+    except UndefinedError as error:  # damaged values have other types than the template expects
+        raise AttributeError(str(error)) from error
 
 
 def _page_file(name: str) -> Markup:

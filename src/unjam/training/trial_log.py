@@ -82,7 +82,11 @@ def _first_change(old_request: dict[str, Any], new_request: dict[str, Any]) -> s
     name = next(key for key in {**new, **old} if key not in old or key not in new or old[key] != new[key])
     if name.startswith(FILES_PREFIX):
         return f"{name.removeprefix(FILES_PREFIX)} has changed"
-    return f"{name}: {short_repr(old.get(name))} there, {short_repr(new.get(name))} now"
+    values = old.get(name), new.get(name)
+    old_text, new_text = map(short_repr, values)
+    if old_text == new_text:  # long texts that differ in the middle, such as paths
+        old_text, new_text = map(repr, values)
+    return f"{name}: {old_text} there, {new_text} now"
 
 
 class TrialLog(RowLog):

@@ -230,8 +230,13 @@ def tune(
             log.add(*key, (max(gains, default=0.0), "largest string gain"))
         return log.verdicts[key][0] or 0.0
 
+    def proposal_gain(driver: str) -> float:
+        if (gain := string_gain(driver)) > max_string_gain:
+            on_message(f"{driver}: not tried: a string gain of {gain:.4g}; allowed: at most {max_string_gain:g}")
+        return gain
+
     trials: list[TuningTrial] = []
-    sampler = SettingSampler(expert, space, seed, string_gain, max_string_gain)
+    sampler = SettingSampler(expert, space, seed, proposal_gain, max_string_gain)
     shares_batches = any(required_batch_kind(roads[road]).has_own_drivers for road in batch_roads)
     batch_size = SCREENING_BATCH_SIZE if screen or shares_batches else 1  # many trials take as long as few
     for first in range(0, trial_count, batch_size):
