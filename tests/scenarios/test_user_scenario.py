@@ -11,7 +11,7 @@ from unjam.drivers import Human
 from unjam.errors import InputError
 from unjam.scenarios import SCENARIOS, Motorway, Ring, make_scenario, scenario_from_recipe, scenario_recipe
 from unjam.scenarios.road import ClosedRoad, RoadNetwork
-from unjam.scenarios.road_checks import check_road
+from unjam.scenarios.road_checks import check_repeated_road, check_road
 from unjam.scenarios.scenario import VEHICLE_LENGTH, Scenario
 from unjam.worlds.batch.support import statistically_unsupported_reason
 from unjam.worlds.worker_pool import EpisodeTask, WorkerPool
@@ -177,3 +177,38 @@ def test_what_is_no_road_is_refused() -> None:
 def test_roads_of_the_package_do_not_contradict_themselves(scenario: Scenario) -> None:
     road, _ = scenario.draw_from_seed((3,))
     check_road(road, VEHICLE_LENGTH, "it")
+
+
+UNREPEATABLE = """
+import os
+from unjam.scenarios import Ring
+
+class FromSystem(Ring):
+    def draw(self, generator):
+        length = 230 + int.from_bytes(os.urandom(2), "big") % 50000
+        return Ring(length=(length, length), vehicles=self.vehicles).draw(generator)
+
+class FromCount(Ring):
+    count = 0
+    def draw(self, generator):
+        FromCount.count += 1
+        return Ring(vehicles=20 + FromCount.count % 2).draw(generator)
+"""
+
+
+@pytest.mark.parametrize("name", ["FromSystem", "FromCount"])
+def test_a_road_that_differs_between_draws_of_one_seed_is_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / "roads.py").write_text(UNREPEATABLE)
+    scenario = make_scenario(f"{tmp_path / 'roads.py'}:{name}", {"horizon": 5})
+    with pytest.raises(InputError, match=rf"{name}: draw\(\) returns another road for the same seed: road\.\S+ "):
+        scenario.draw_from_seed((0,))
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_all_built_in_roads_are_equal_in_two_draws(name: str) -> None:
+    scenario = make_scenario(name)
+    roads = [scenario.draw(np.random.default_rng(seed)) for seed in (0, 0, 1)]
+    check_repeated_road(roads[0], roads[1], name)
+    if name == "ring":
+        with pytest.raises(InputError, match="ring: draw"):
+            check_repeated_road(roads[0], roads[2], name)

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -9,7 +10,8 @@ from unjam.errors import InputError
 from unjam.physics.arrays import Floats
 from unjam.physics.kinematics import gap_on_loop
 from unjam.scenarios.road import BuiltRoad, ClosedRoad, Edge, Road
-from unjam.text import format_count, shorten_list
+from unjam.text import format_count, shorten_list, to_one_line
+from unjam.tree import named_parts
 
 LENGTH_TOLERANCES = 1.0, 0.02
 """tolerances of lengths for rounding: absolute [m], and relative"""
@@ -28,6 +30,36 @@ def check_road(road: object, vehicle_length: float, context: str) -> None:
             _check_loop(road, vehicle_length)
     except ValueError as error:
         raise InputError(f"{context}: road.{error}") from None
+
+
+def check_repeated_road(road: Road, repeated_road: Road, context: str) -> None:
+    """Raise `InputError` unless two roads that were drawn from one seed have equal numbers and texts.
+
+    Otherwise different drivers of a comparison would drive on different roads.
+    """
+    if difference := _first_difference(road, repeated_road):
+        raise InputError(
+            f"{context}: draw() returns another road for the same seed: {difference}; allowed: equal roads"
+        )
+
+
+def _first_difference(value: object, repeated_value: object, name: str = "road") -> str:
+    """Return the name of the first part of two trees with other numbers or texts, and both values; empty: none."""
+    parts, repeated_parts = (_parts(tree) for tree in (value, repeated_value))
+    if type(value) is not type(repeated_value) or parts.keys() != repeated_parts.keys():
+        return f"{name} has other parts"
+    for key, part in parts.items():
+        if difference := _first_difference(part, repeated_parts[key], f"{name}.{key}"):
+            return difference
+    is_plain = isinstance(value, bool | int | float | str | np.generic | np.ndarray)
+    if not is_plain or np.array_equal(np.array(value).astype(str), np.array(repeated_value).astype(str)):
+        return ""
+    return f"{name} is {to_one_line(value, 60)} and {to_one_line(repeated_value, 60)}"
+
+
+def _parts(value: object) -> dict[Any, Any]:
+    """Return the parts of a record, dict, list or tuple by name or index."""
+    return (dict(enumerate(value)) if isinstance(value, list | tuple) else None) or named_parts(value) or {}
 
 
 def _refuse(field: str, value: object, allowed: str) -> None:

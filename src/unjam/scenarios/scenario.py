@@ -32,7 +32,7 @@ from unjam.physics.idm import IDMArrays, IDMParameters, desired_speed_from_accel
 from unjam.physics.kinematics import next_speed
 from unjam.scenarios.population import Population, population_file, read_population
 from unjam.scenarios.road import Road
-from unjam.scenarios.road_checks import check_road
+from unjam.scenarios.road_checks import check_repeated_road, check_road
 from unjam.text import format_count
 
 UNLIMITED_ACCELERATION = 20.0
@@ -377,12 +377,14 @@ class Scenario(Subclassable):
     def draw_from_seed(self, seed: Sequence[int]) -> tuple[Road, Sequence[np.random.SeedSequence]]:
         """Return the road of an episode's seed, and the seeds of noise, exploration, simulator and sensors."""
         road_seed, *other_seeds = _spawn_seeds(seed)
-        kind, generator = type(self), np.random.default_rng(road_seed)
+        kind = type(self)
         if is_packaged(kind):
-            return self.draw(generator), other_seeds
+            return self.draw(np.random.default_rng(road_seed)), other_seeds
         file = getattr(sys.modules.get(kind.__module__), "__file__", None) or ""
-        road = UserFunction(self.draw, kind.__name__, file)(generator)  # reports errors with their line
+        draw = UserFunction(self.draw, kind.__name__, file)  # reports errors with their line
+        road, repeated_road = (draw(np.random.default_rng(road_seed)) for _ in range(2))
         check_road(road, VEHICLE_LENGTH, kind.__name__)
+        check_repeated_road(road, repeated_road, kind.__name__)
         return road, other_seeds
 
     def possible_cav_ids(self) -> tuple[str, ...]:
