@@ -245,7 +245,7 @@ UNSAFE_BUT = {
     "training/tensorboard.py: SummaryWriter(str(log_folder), filename_suffix=f'.{secrets.token_hex(8)}')": (
         "the name of its file cannot be guessed, and its folder was made without following links"
     ),
-    "training/train.py: self._controllers.save(contents, is_best)": "through `unjam.files`",
+    "training/train.py: self._controllers.save(contents, is_scheduled)": "through `unjam.files`",
     "cli/__init__.py: os.open(os.devnull, os.O_WRONLY)": "no file",
     "cli/__init__.py: open(os.devnull, mode)": "no file",
     "sandbox.py: os.open(path, os.O_PATH | os.O_CLOEXEC)": "a handle, by which nothing can be written",

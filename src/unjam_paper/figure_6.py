@@ -21,7 +21,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from unjam.following.four_regimes import MIN_REGIME_GAP, FourRegimesSettings, make_four_regimes
 from unjam.following.leader_replay import add_residual, as_driver_model, idm_function
-from unjam.following.networks import NetworkSettings, batched_network, fit_one_step
+from unjam.following.networks import OneStepSettings, batched_network, fit_one_step
 from unjam.physics.arrays import Floats, clamp_min
 from unjam.physics.idm import PAPER_IDM, idm_acceleration
 from unjam.recordings.trajectories import SPLITS, FollowingSamples, following_samples, select_splits, split_by_driver
@@ -152,7 +152,7 @@ def _predict_learned(fit: FourRegimeFit, training: FollowingSamples, rows: DataS
     if fit.is_long:
         training = training.select(np.tile(np.arange(len(training)), LONG_PASS_REPEATS))
     indices = np.random.default_rng(0).permutation(len(rows.validation))[:MAX_VALIDATION_ROWS]
-    network, losses = fit_one_step(training, rows.validation.select(indices), base, NetworkSettings(), fit.repeat)
+    network, losses = fit_one_step(training, rows.validation.select(indices), base, OneStepSettings(), fit.repeat)
     model = add_residual(as_driver_model(base) if base else None, batched_network(network.to_numpy_network()))
     predicted = model(rows.test.speed[:1], rows.test.gap[:1])(*rows.test.inputs)
     loss_curves = {"training_loss": losses.training, "validation_loss": losses.validation}

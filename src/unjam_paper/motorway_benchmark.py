@@ -273,14 +273,14 @@ def parameter_effects_table(folder: Path) -> pd.DataFrame:
     table: Table = []
     for name, method in METHODS.items():
         samples = [
-            (method.candidate(row["candidate"]).numbers, episode)
+            (method.candidate(row["candidate"]).regression_values, episode)
             for row in rows
             for episode in row["episodes"]
             if row["method"] == name and episode["setting"] in times
         ]
         if not samples:
             continue
-        parameters = list(method.candidate(1).numbers)
+        parameters = list(method.candidate(1).regression_values)
         values = np.array([[numbers[parameter] for parameter in parameters] for numbers, _ in samples])
         changes = [
             (episode[TIME_METRIC] - times[episode["setting"]]) / delays[episode["setting"]] for _, episode in samples

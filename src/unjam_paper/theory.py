@@ -21,7 +21,7 @@ from unjam.drivers.network import Network
 from unjam.drivers.observation import observation_size
 from unjam.drivers.residual import ResidualDriver
 from unjam.measures.statistics import estimate_over_trainings, metric_estimate
-from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, new_figure, stacked_bars
+from unjam.reports.figures import LINE_COLORS, PLOT_STYLE, new_figure, stacked_bar_figure
 from unjam.reports.results import read_progress, seconds_by_part
 from unjam.seeds import held_out_seeds
 from unjam.training.evaluate import evaluate
@@ -183,7 +183,7 @@ def measure_training_time(steps: int, rounds: int, workers: int) -> dict[str, An
 def training_time_bars(seconds: dict[str, dict[str, float]]) -> Figure:
     """Draw the times of the parts of training as a stacked bar for each variant."""
     bars = {VARIANTS[variant].label: parts for variant, parts in seconds.items()}
-    figure = stacked_bars(bars, "wall time per 1,000 environment steps [s]", height=0.4 * len(bars) + 1.2)
+    figure = stacked_bar_figure(bars, "wall time per 1,000 environment steps [s]", height=0.4 * len(bars) + 1.2)
     figure.axes[0].invert_yaxis()
     figure.axes[0].grid(axis="y", visible=False)
     return figure

@@ -8,7 +8,7 @@ from unjam.following.networks import (
     CalibratedTrajectories,
     FollowingNetwork,
     MultiStepSettings,
-    NetworkSettings,
+    OneStepSettings,
     batched_network,
     fit_multi_step,
     fit_one_step,
@@ -17,7 +17,7 @@ from unjam.physics.idm import PAPER_IDM, IDMParameters
 from unjam.recordings.trajectories import FollowingSamples, following_samples, make_segments
 from unjam.scenarios.population import residual_inputs
 
-SETTINGS = NetworkSettings(hidden=(16, 16), learning_rate=1e-2, epochs=40, batch_size=128)
+SETTINGS = OneStepSettings(hidden=(16, 16), learning_rate=1e-2, epochs=40, batch_size=128)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def rows() -> FollowingSamples:
 
 
 def test_default_settings_are_those_of_the_paper() -> None:
-    settings = NetworkSettings()
+    settings = OneStepSettings()
     assert (settings.hidden, settings.learning_rate, settings.batch_size, settings.epochs) == (
         (128, 128),
         1e-4,
@@ -64,13 +64,13 @@ def test_fit_reduces_the_validation_error(rows: FollowingSamples, base: None) ->
 
 
 def test_same_seed_gives_the_same_losses(rows: FollowingSamples) -> None:
-    short = NetworkSettings(hidden=(8,), epochs=2)
+    short = OneStepSettings(hidden=(8,), epochs=2)
     one, other = (fit_one_step(rows, rows, None, short, seed=3)[1] for _ in range(2))
     assert one == other
 
 
 def test_fit_ends_without_improvement(rows: FollowingSamples) -> None:
-    settings = NetworkSettings(hidden=(4,), learning_rate=1e-12, epochs=50, patience=2)
+    settings = OneStepSettings(hidden=(4,), learning_rate=1e-12, epochs=50, patience=2)
     at_rest = FollowingSamples(rows.speed, rows.leader_speed, rows.gap, np.zeros(len(rows)))
     _, losses = fit_one_step(at_rest, rows, None, settings, seed=0)
     assert len(losses.training) < 50
@@ -100,7 +100,7 @@ def test_multi_step_residual_reduces_the_gap_error() -> None:
     assert min(errors) < 0.5 * errors[0]
     unseen = calibrated_trajectories(range(6, 8))
     segments = make_segments(unseen.trajectories)
-    base = unseen.model(segments.trajectory_index, LIMITS)
+    base = unseen.make_driver_model(segments.trajectory_index, LIMITS)
     without_residual = simulate_followers(base, segments)
     with_residual = simulate_followers(
         add_residual(base, batched_network(network.to_numpy_network()), LIMITS), segments

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from unjam.following.four_regimes import FourRegimesSettings
-from unjam.following.networks import NetworkSettings
+from unjam.following.networks import OneStepSettings
 from unjam.physics.idm import idm_acceleration
 from unjam.physics.kinematics import next_speed
 from unjam.recordings.trajectories import FollowingSamples
@@ -30,7 +30,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         name: FourRegimesSettings(samples=6000, driver=data.driver) for name, data in figure_6.DATA_SETTINGS.items()
     }
     monkeypatch.setattr(figure_6, "DATA_SETTINGS", settings)
-    monkeypatch.setattr(figure_6, "NetworkSettings", lambda: NetworkSettings(hidden=(4,), epochs=2))
+    monkeypatch.setattr(figure_6, "OneStepSettings", lambda: OneStepSettings(hidden=(4,), epochs=2))
     split_rows.cache_clear()
     yield
     split_rows.cache_clear()

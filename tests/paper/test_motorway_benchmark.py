@@ -124,7 +124,10 @@ def test_parts_follow_from_the_results_of_earlier_parts(tmp_path: Path) -> None:
 
 def test_effects_are_those_of_parameters_on_the_delay(tmp_path: Path) -> None:
     write_part(tmp_path, HUMAN_PART, human_rows())
-    gaps = [METHODS["ACC"].candidate(number).numbers["cruise.time_gap"] for number in range(1, CANDIDATES_PER_METHOD)]
+    gaps = [
+        METHODS["ACC"].candidate(number).regression_values["cruise.time_gap"]
+        for number in range(1, CANDIDATES_PER_METHOD)
+    ]
     rows = [
         {"method": "ACC", "candidate": 1 + index, "episodes": candidate_rows(-10.0 * gap)}
         for index, gap in enumerate(gaps)

@@ -25,7 +25,7 @@ from unjam.reports.figures import (
     CAV_PLOT_COLOR,
     LINE_COLORS,
     MAX_PLOT_TIMES,
-    color_table,
+    speed_colors,
     data_uri,
     last_vehicle_figure,
     learning_curve_figure,
@@ -273,8 +273,8 @@ def test_last_vehicles_are_drawn_with_the_recorded_vehicle_and_its_amplification
     last, damped, recorded = (np.asarray(line.get_ydata()) for line in drawn_lines(axes))
     np.testing.assert_allclose([np.ptp(last), np.ptp(damped), np.ptp(recorded)], [4.0, 2.0, 4.0], rtol=1e-3)
     assert [text.get_text() for text in legend.get_texts()] == [
-        "human: amplification 1.00, of waves of 20 to 60 s 1.00",
-        "pi: amplification 0.50, of waves of 20 to 60 s 0.50",
+        "human: amplification 1.00 (periods of 20 to 60 s: 1.00)",
+        "pi: amplification 0.50 (periods of 20 to 60 s: 0.50)",
         "recorded vehicle",
     ]
 
@@ -360,7 +360,7 @@ def test_training_time_has_a_bar_for_each_part() -> None:
 
 
 def test_colors_get_brighter_with_speed() -> None:
-    table = color_table()
+    table = speed_colors()
     assert len(table) == 32
     light = [0.299 * int(code[1:3], 16) + 0.587 * int(code[3:5], 16) + 0.114 * int(code[5:], 16) for code in table]
     assert all(np.diff(light) > 0)

@@ -13,9 +13,9 @@ from unjam.reports.summary import (
     baseline_differences,
     command_differences,
     common_baseline,
-    compare_alternative,
+    compare_networks,
     csv_text,
-    first_alternative,
+    first_network_column,
     format_difference,
     key_figures,
     main_finding,
@@ -351,26 +351,26 @@ def test_the_same_driver_on_another_road_has_its_own_column() -> None:
 def test_two_configurations_of_a_network_are_compared_on_the_same_seeds() -> None:
     plain = drive_results("runs/plain", "a.sumocfg", human=rows_of([1.0, 2.0]))
     limited = drive_results("runs/limited", "b.sumocfg", human=rows_of([5.0, 7.0]))
-    assert first_alternative([plain, limited]) == "plain: human"
+    assert first_network_column([plain, limited]) == "plain: human"
     assert mismatch_warning([plain, limited]).endswith("so compare travel times.")
     _, column = report_columns([plain, limited])
-    verdict = compare_alternative(column, plain.rows["human"]).verdict
+    verdict = compare_networks(column, plain.rows["human"]).verdict
     assert verdict is not None
     assert verdict.driver == "limited: human"
     assert "human drivers of the first network, 2 paired seeds" in verdict.comparison
     longer = drive_results("runs/longer", "b.sumocfg", human=rows_of([5.0, 7.0, 9.0]))
-    assert first_alternative([plain, longer]) == "plain: human"
-    column = compare_alternative(report_columns([plain, longer])[1], plain.rows["human"])
+    assert first_network_column([plain, longer]) == "plain: human"
+    column = compare_networks(report_columns([plain, longer])[1], plain.rows["human"])
     assert (len(column.rows), len(column.baseline_rows or ())) == (2, 2), "seeds of both"
     others = {
         "other seeds": drive_results("runs/c", "c.sumocfg", human=rows_of([1.0])),
         "no humans": drive_results("d", "d.sumocfg", pi=[]),
         "a built-in road": drive_results("e", "ring", human=rows_of([5.0, 7.0])),
     }
-    assert [first_alternative([plain, other]) for other in others.values()] == [""] * 3
-    assert first_alternative([plain]) == ""
+    assert [first_network_column([plain, other]) for other in others.values()] == [""] * 3
+    assert first_network_column([plain]) == ""
     same = drive_results("runs/limited", "b.sumocfg", human=rows_of([1.0, 2.0]))
-    assert first_alternative([plain, same]) == "", "the same human traffic"
+    assert first_network_column([plain, same]) == "", "the same human traffic"
 
 
 def test_the_baseline_of_several_folders_ran_the_same_episodes() -> None:

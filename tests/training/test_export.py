@@ -178,7 +178,7 @@ def test_a_formula_is_no_model_of_stable_baselines3(tmp_path: Path) -> None:
         ("pi", "it.zip", "", "a file that ends in .unjam"),
         ("ghost", "it.unjam", "", "driver: 'ghost' is not allowed"),
         ("pi", "it.unjam", "nowhere", "'nowhere' is not allowed"),
-        ("human", "it.unjam", "", "human is the simulator itself"),
+        ("human", "it.unjam", "", "the simulator drives this vehicle"),
         ("mine.py:gentle", "it.unjam", "", "mine.py is Python code"),
         ("none.unjam", "it.unjam", "", "does not exist"),
         (".", "it.unjam", "", "not a run folder"),
@@ -275,11 +275,11 @@ def test_files_that_belong_to_no_controller_are_not_overwritten(
 ) -> None:
     mine, options = tmp_path / f"mine{suffix}", dict[str, Any]({option: True})
     mine.write_text("mine")
-    with pytest.raises(InputError, match=rf"out: .*mine\{suffix} exists and belongs to no mine.unjam"):
+    with pytest.raises(InputError, match=rf"out: .*mine\{suffix} exists and is no export of mine.unjam"):
         export_controller(run, tmp_path / "mine.unjam", **options)
     assert mine.read_text() == "mine"
     export_controller(run, tmp_path / "mine.unjam")
-    with pytest.raises(InputError, match=rf"out: .*mine\{suffix} exists and belongs to no mine.unjam"):
+    with pytest.raises(InputError, match=rf"out: .*mine\{suffix} exists and is no export of mine.unjam"):
         export_controller(run, tmp_path / "mine.unjam", **options)
     assert mine.read_text() == "mine"
     mine.unlink()
@@ -298,4 +298,4 @@ def test_a_packaged_controller_for_ideal_cars_is_exported_with_the_filter_of_a_u
     driver = read_controller(result.file).driver
     assert isinstance(driver, FilteredDriver)
     assert (driver.actuator.delay, driver.actuator.lag) == car
-    assert result.car == driver.actuator.describe()
+    assert result.actuator == driver.actuator.describe()

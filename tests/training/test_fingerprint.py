@@ -169,8 +169,8 @@ def test_manifest_has_the_lineage_of_a_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("ended", "content"), [(True, b"last"), (False, b"best")])
 def test_longer_run_resumes_with_the_best_scheduled_controller(ended: bool, content: bytes, tmp_path: Path) -> None:
     controllers = ControllerStore([tmp_path])
-    controllers.save([b"best"], is_best=True)
-    controllers.save([b"last"], is_best=False)
+    controllers.save([b"best"], is_scheduled=True)
+    controllers.save([b"last"], is_scheduled=False)
     assert (tmp_path / "controller.unjam").read_bytes() == b"last"
     (tmp_path / "controller.unjam").write_bytes(b"another file")
     tensors = {**controllers.tensors(), "weight": torch.zeros(1)}

@@ -279,7 +279,7 @@ def run_with_controllers(folder: Path, *tasks: str) -> Path:
     create_run_folder(folder, config)
     store = ControllerStore([folder / name for name in tasks or ("",)])
     for first in (1, 11):
-        store.save([controller(first + number) for number in range(len(tasks) or 1)], is_best=first == 1)
+        store.save([controller(first + number) for number in range(len(tasks) or 1)], is_scheduled=first == 1)
     state = {"iteration": 1, "fingerprint": fingerprint(config)}
     save_checkpoint(folder / "checkpoint", state, store.tensors())
     return folder

@@ -80,7 +80,7 @@ def test_mixture_survives_toml(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("task", "words"),
     [
-        ({"expert": "follower-stopper"}, "tasks: the network would have other inputs on ring-2 than on ring"),
+        ({"expert": "follower-stopper"}, "tasks: ring-2 gives the network other inputs than ring; allowed"),
         ({"expert": "magic"}, "driver: 'magic'"),
         ({"reward": "magic"}, "reward: 'magic'"),
     ],

@@ -15,7 +15,7 @@ from unjam.drivers.driver import label_with_parameters
 from unjam.drivers.registry import driver_from_name
 from unjam.errors import InputError
 from unjam.measures.feasibility import overall_feasibility
-from unjam.measures.gain import MAX_GAIN, MEAN_GAIN, MIN_GAIN
+from unjam.measures.gain import MAX_GAIN, MEAN_GAIN_OBJECTIVE, MIN_GAIN
 from unjam.measures.metrics import measure
 from unjam.scenarios import FigureEight, Merge, Ring
 from unjam.scenarios.motorway import ON_RAMP
@@ -200,7 +200,7 @@ def test_several_roads_maximize_the_mean_gain(tmp_path: Path) -> None:
     assert all(one.score is not None and MIN_GAIN <= one.score <= MAX_GAIN for one in found.trials)
     assert found.best.verdict.startswith("worst on ")
     written = json.loads((tmp_path / TUNING_FILE).read_text())
-    assert written["reward"] == MEAN_GAIN
+    assert written["reward"] == MEAN_GAIN_OBJECTIVE
     assert set(written["scenario"]) == set(roads)
 
 

@@ -12,23 +12,23 @@ from unjam.physics.arrays import Array
 
 
 class SB3VecEnv(VecEnv):
-    """A `VectorEnv` as a `VecEnv`: environments start the next episode in the step that ends an episode.
+    """A `VectorEnv` of Gymnasium as a `VecEnv` of Stable-Baselines3.
 
-    Gymnasium starts the next episode one step later, in a step that ignores the action. Stable-Baselines3 never
-    receives this step, because `reset` with a mask starts the next episode. The `terminal_observation` of the info is
-    the last observation of the ended episode.
+    In Stable-Baselines3 the step that ends an episode also starts the next one; in Gymnasium the following step does,
+    and ignores the action. Therefore `step_wait` resets ended environments at once. The info contains the last
+    observation of the ended episode as `terminal_observation`.
     """
 
     def __init__(self, environment: VectorEnv[Any, Any, Any]) -> None:
-        """Check and store the environment."""
+        """Store the environment; raise `InputError` if it has a device, another mode or several CAVs."""
         mode = environment.metadata.get("autoreset_mode")
         if mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED):
             raise invalid_value("environment: autoreset_mode", mode, "NEXT_STEP or DISABLED")
         if device := getattr(environment.unwrapped, "device", ""):
-            raise invalid_value("environment: device", device, "'', NumPy arrays")
+            raise invalid_value("environment: device", device, "none, so that observations are NumPy arrays")
         if (shape := environment.single_action_space.shape) != (1,):
-            reason = f"actions of shape {shape}, as with slots, are not allowed"
-            raise InputError(f"environment: {reason}; allowed: (1,); slots need a policy with shared parameters")
+            reason = f"actions of shape {shape} are not allowed; allowed: (1,), one CAV for each environment"
+            raise InputError(f"environment: {reason}; for several CAVs: PettingZoo with a policy that they share")
         self._environment = DictInfoToList(environment)
         self._actions = np.zeros(0)
         super().__init__(environment.num_envs, environment.single_observation_space, environment.single_action_space)
@@ -45,7 +45,7 @@ class SB3VecEnv(VecEnv):
         return observations
 
     def step_async(self, actions: Array) -> None:
-        """Store the actions of the next step, shape (W, 1)."""
+        """Store the actions of the next step, shape (environments, 1)."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:

@@ -17,15 +17,16 @@ ALGORITHMS = {
     "td3": ("stable_baselines3", "TD3"),
 }
 """package and name of the algorithm for each agent of a training"""
-MIN_EXPLORATION = 1e-3  # smallest standard deviation of exploration noise, as a share of the authority
+MIN_EXPLORATION_STD = 1e-3
+"""smallest standard deviation of exploration noise, relative to the authority, which is 1 in the model"""
 
 
 def stable_baselines3_bytes(driver: ResidualDriver, agent: str) -> bytes:
     """Return the `.zip` file of a model with the residual of a driver [m/s2] as its deterministic action.
 
-    `agent` determines the algorithm by `ALGORITHMS`. The model takes observations of the Gymnasium environments with
-    the driver's expert and features. The actor has the weights of the driver; critics and optimizers are new. Raise
-    `InputError` for an unknown agent, and `MissingPartError` without Stable-Baselines3.
+    `agent` is a key of `ALGORITHMS`. The model's observations are those of a `RoadEnv` with the driver's expert and
+    features. The actor has the weights of the driver; critics and optimizers are untrained. Raise `InputError` for an
+    unknown agent, and `MissingPartError` without Stable-Baselines3.
     """
     if agent not in ALGORITHMS:
         raise unknown_name("agent", agent, ALGORITHMS)
@@ -38,9 +39,9 @@ def stable_baselines3_bytes(driver: ResidualDriver, agent: str) -> bytes:
     hidden_sizes = [len(bias) for _, bias in network.layers[:-1]]
     policy_options: dict[str, Any] = {"net_arch": hidden_sizes, "activation_fn": torch.nn.ReLU}
     arguments: dict[str, Any] = {"policy_kwargs": policy_options, "device": "cpu"}
-    std = max(network.exploration_std / network.authority, MIN_EXPLORATION)
+    std = max(network.exploration_std / network.authority, MIN_EXPLORATION_STD)
     is_on_policy = agent in ("trpo", "ppo")
-    if is_on_policy:  # their output is a tanh, like the residual, only with state-dependent exploration
+    if is_on_policy:  # these policies have the tanh of the residual only if they use state-dependent exploration
         policy_options |= {"squash_output": True, "log_std_init": log(std)}
         arguments["use_sde"] = True
     model = getattr(import_optional(package), algorithm)("MlpPolicy", environment, **arguments)
@@ -51,14 +52,16 @@ def stable_baselines3_bytes(driver: ResidualDriver, agent: str) -> bytes:
         modules = (actor.latent_pi, actor.mu) if agent == "sac" else (actor.mu,)
     linear_layers = [layer for module in modules for layer in module.modules() if isinstance(layer, torch.nn.Linear)]
     with torch.no_grad():
+        # The last layer of the driver may have a second output, the logarithm of the standard deviation.
         for layer, (weight, bias) in zip(linear_layers, network.layers, strict=True):
             layer.weight.copy_(torch.as_tensor(weight[:, : layer.out_features].T))
             layer.bias.copy_(torch.as_tensor(bias[: layer.out_features]))
         if agent == "sac":
-            log_std_layer: Any = np.zeros((hidden_sizes[-1], 1)), np.array([log(std)])
+            log_std_arrays = np.zeros((hidden_sizes[-1], 1)), np.array([log(std)])
             if network.squashes_noise:
-                log_std_layer = (array[..., 1:] for array in network.layers[-1])
-            for parameter, array in zip((actor.log_std.weight, actor.log_std.bias), log_std_layer, strict=True):
+                weight, bias = network.layers[-1]
+                log_std_arrays = weight[:, 1:], bias[1:]
+            for parameter, array in zip((actor.log_std.weight, actor.log_std.bias), log_std_arrays, strict=True):
                 parameter.copy_(torch.as_tensor(array.T))
         if agent == "td3":
             model.actor_target.load_state_dict(actor.state_dict())

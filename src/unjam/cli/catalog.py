@@ -21,7 +21,7 @@ from unjam.drivers.observation import FEATURES
 from unjam.drivers.registry import DRIVERS
 from unjam.errors import InputError, unknown_name
 from unjam.files import atomic_write, check_parent_folder
-from unjam.measures.gain import MEAN_GAIN
+from unjam.measures.gain import MEAN_GAIN_OBJECTIVE
 from unjam.parameters import flatten_keys
 from unjam.road_family import FAMILY_PREFIX, FAMILY_SCENARIOS
 from unjam.scenarios import SCENARIOS, example_scenario, make_scenario, scenario_recipe
@@ -166,7 +166,7 @@ def _packaged_summary(name: str, is_brief: bool) -> str:
     expert = full_expert.partition(":")[0] if is_brief else full_expert
     if tuning := manifest.get("tuning"):
         best, default = (f"{tuning[key]['score']:.4g}" for key in ("best", "default"))
-        score = tuning["reward"] if tuning["reward"] == MEAN_GAIN else "return"
+        score = tuning["reward"] if tuning["reward"] == MEAN_GAIN_OBJECTIVE else "return"
         return f"{expert}, tuned: {score} {best} on tuning seeds, default parameters {default}"
     if summary := manifest.get("summary"):
         return summary if is_brief else f"{summary}\n\n{controller.driver.describe()}"

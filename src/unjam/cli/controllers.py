@@ -79,9 +79,9 @@ def export_command(
     is_source = source.endswith((".onnx", ".toml")) and Path(source).with_suffix(".onnx").resolve() == graph.resolve()
     if result.graph is None and graph.exists() and not is_source:
         err_console.print(f"note: {graph} is not the graph of this controller; --onnx writes the graph")
-    car = f", {result.car}" if result.car else ""
+    actuator = f", {result.actuator}" if result.actuator else ""
     steps = f"{result.sample_steps:,} control steps of a test episode"
-    err_console.print(f"{result.driver}{car}, verified on {steps}")
+    err_console.print(f"{result.driver}{actuator}, verified on {steps}")
 
 
 def certify_command(

@@ -44,10 +44,10 @@ def drive_command(
             "--driver",
             "-d",
             help="Driver of the CAVs: a name, name:parameter=value, your own path.py:name, a run folder, a .unjam "
-            "file, or an .onnx file with a description; drivers joined by + share the CAVs. Several are compared on "
-            "the same traffic.",
-            show_default="human and unjam:best, on recorded roads unjam:recorded-tuned; on your own network "
-            "CAVs then have ACCs, as in assess",
+            "file, or an .onnx file with a description; drivers joined by + share the CAVs. Repeat the "
+            "option to compare drivers on the same traffic.",
+            show_default="human and unjam:best; on recorded roads human and unjam:recorded-tuned. On your own network "
+            "the default gives CAVs ACCs, as in assess",
         ),
     ] = None,
     episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Number of episodes.")] = 5,
@@ -82,7 +82,7 @@ def drive_command(
     """
     changes = opt.merge_settings(changes, opt.parse_settings(settings))
     if out is not None and not report:
-        raise InputError("out: it is not allowed with --no-report, which writes nothing")
+        raise InputError(f"out: {str(out)!r} is not allowed with --no-report; allowed: --report")
     if not driver and scenario.endswith(".sumocfg"):
         changes = ACC_SETTINGS | changes
     road = make_scenario(scenario, changes)
@@ -90,8 +90,12 @@ def drive_command(
     total = road.max_episode_steps * episodes * len(driver)
     folder = opt.new_folder(out, f"drive-{Path(scenario).stem}") if report else None
     with output.ProgressReporter(f"driving {Path(scenario).name}", "steps", total) as progress:
-        options = workers, folder, progress.update, test_seeds, backend, baseline
-        result = drive(scenario, driver, episodes, seed, changes, reward, *options)
+        result = drive(
+            *(scenario, driver, episodes, seed, changes, reward, workers, folder, progress.update),
+            test_seeds=test_seeds,
+            backend=backend,
+            baseline=baseline,
+        )
     if json:
         print_json(result.document())
     elif any(row["status"] != "failed" for rows in result.rows.values() for row in rows):
@@ -99,7 +103,7 @@ def drive_command(
         output.print_notes(result.notes)
         first = next(iter(result.rows.values()))[0]
         if command := road.plain_sumo_command(first["sumo_seed"]):
-            output.print_notes([f"plain SUMO has the traffic of the first episode without CAVs: {command}"])
+            output.print_notes([f"the traffic of the first episode in plain SUMO, without CAVs: {command}"])
         if result.report is not None:
             err_console.print(f"report: {result.report}")
         is_drawable = all(len(episode.outline) or len(episode.poses) for episode in result.plot_episodes.values())
@@ -132,9 +136,9 @@ def watch_command(
     from unjam.reports.video import check_video_format, write_video
 
     if len(drivers) > 1:
-        raise invalid_value("driver", ", ".join(drivers), "one")
+        raise invalid_value("driver", ", ".join(drivers), "one driver")
     if video is None and backend != "sumo":
-        raise invalid_value("backend", backend, "sumo, which has a window; others with --video")
+        raise invalid_value("backend", backend, "sumo, the only one with a window; or --video")
     (name,) = drivers
     road = make_scenario(scenario, opt.merge_settings(changes, opt.parse_settings(settings)))
     driver = make_driver(name, road.control_step)
@@ -148,17 +152,17 @@ def watch_command(
         with open_backend(backend) as simulator:
             check_support(simulator, road)
         output.print_notes(backend_notes(backend, road))
-        err_console.print("driving")
+        err_console.print("simulating the episode")
         with WorkerPool(1) as pool:
             episode = pool.run([EpisodeTask(road, driver, (seed,), record_details=True, backend=backend)])[0]
     row = measure(episode)
     output.print_notes(episode_notes({name: [row]}))
     if episode.has_run and video is not None:
-        err_console.print("drawing")
+        err_console.print("writing the video")
         write_video(episode, video, name, pace)
     if json:
-        request = {"scenario": scenario, "backend": backend, "driver": name}
-        print_json({**request, "video": str(video) if video else None, "episode": row})
+        entries = {"scenario": scenario, "backend": backend, "driver": name}
+        print_json({**entries, "video": str(video) if video else None, "episode": row})
     raise_failure([row])
     if not json and video is not None:
         console.print(f"video: {video}", soft_wrap=True)
@@ -172,10 +176,10 @@ def watch_in_window(scenario: Scenario, driver: Driver, seed: Sequence[int], pac
     """
     if not has_display():
         raise MissingPartError("watch: no display; write a video: --video FILE, or use xvfb-run unjam watch ...")
-    delay = 1000.0 / pace  # [ms] per second of simulation, for any number of steps
+    delay = 1000.0 / pace  # [ms] for each second of simulation: SUMO scales --delay with the step length
     window_options = ("--start", "true", "--quit-on-end", "true", "--delay", str(delay))
-    with Simulation("gui", gui_options=window_options) as window:
-        return run_episode(scenario, driver, seed, backend=SumoBackend(window))
+    with Simulation("gui", gui_options=window_options) as simulation:
+        return run_episode(scenario, driver, seed, backend=SumoBackend(simulation))
 
 
 @opt.with_options(changes=opt.network_changes)
@@ -194,15 +198,17 @@ def assess_command(
     penetration_rates: Annotated[
         str,
         Option(
-            "--penetration-rates", "--penetration-rate", help="Penetration rates among the vehicles of --cav-classes."
+            "--penetration-rates",
+            "--penetration-rate",
+            help="Penetration rates among the vehicles of --cav-classes, with commas.",
         ),
     ] = "0.05,0.1,0.2",
     episodes: Annotated[int, Option("--episodes", "-n", min=1, help="Maximum number of episodes.")] = 240,
     minutes: Annotated[
-        float | None, Option(help="Maximum time; only the minimum number of seeds for a verdict may exceed it.")
+        float | None, Option(help="Time limit [min], exceeded only by the minimum number of test seeds.")
     ] = None,
     precision: Annotated[
-        float, Option(help="Sufficient half-width of the confidence interval of travel time, relative to it.")
+        float, Option(help="Sufficient half-width of the confidence interval of travel time, as a share of it.")
     ] = 0.02,
     settings: opt.ScenarioSettingsOption = None,
     workers: opt.WorkersOption = opt.DEFAULT_WORKERS,
@@ -251,8 +257,8 @@ def assess_command(
     if missing := document["missing_budget"]:
         seeds, duration = missing["min_test_seeds"], format_duration(missing["min_seconds"])
         arguments = output.arguments_without("--out", "--driver", "-d", "--episodes", "-n", "--minutes")
-        drivers = [word for name in missing["drivers"] for word in ("-d", name)]
-        command = *arguments, *drivers, "--episodes", missing["min_episodes"], "--out", folder
+        driver_arguments = [word for name in missing["drivers"] for word in ("-d", name)]
+        command = *arguments, *driver_arguments, "--episodes", missing["min_episodes"], "--out", folder
         output.print_next_command(f"for a verdict ({seeds} test seeds at least, about {duration})", *command)
 
 

@@ -1,4 +1,4 @@
-"""Networks as driver models: alone (`vanilla`), or as a residual added to a base (`knowledge`, Eq. 4 of the paper).
+"""Networks as driver models: alone (`vanilla`), or as a residual of an IDM (`knowledge`, Eq. 4 of the paper).
 
 `fit_one_step` fits single accelerations: small errors can accumulate in a simulation. `fit_multi_step` fits gaps in a
 simulation behind recorded leaders, with gradients through all steps.
@@ -40,11 +40,13 @@ MAX_GRADIENT_NORM = 1.0
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
-class NetworkSettings:
+class OneStepSettings:
     """Settings of a network that learns single accelerations (`fit_one_step`); the defaults are those of the paper."""
 
     hidden: HiddenSizes = (128, 128)
+    """sizes of the hidden layers"""
     learning_rate: Positive = 1e-4
+    """learning rate of Adam"""
     batch_size: PositiveInt = 1024
     """number of samples in a gradient step"""
     epochs: PositiveInt = 200
@@ -62,7 +64,7 @@ class FollowingNetwork(nn.Module):
 
     def __init__(
         self,
-        settings: NetworkSettings | MultiStepSettings,
+        settings: OneStepSettings | MultiStepSettings,
         samples: FollowingSamples,
         seed: int,
         zero_init: bool = False,
@@ -76,7 +78,7 @@ class FollowingNetwork(nn.Module):
         if zero_init:
             nn.init.zeros_(self.layers[-1].weight)
             nn.init.zeros_(self.layers[-1].bias)
-        self.layer_list = nn.ModuleList(self.layers)
+        self.module_list = nn.ModuleList(self.layers)  # registers the parameters; `layers` has types
         self.authority = settings.authority
         inputs = residual_inputs(*samples.inputs)
         self.register_buffer("mean", _to_tensor(inputs.mean(0)))
@@ -95,6 +97,7 @@ class FollowingNetwork(nn.Module):
             (layer.weight.detach().double().numpy().T, layer.bias.detach().double().numpy()) for layer in self.layers
         ]
         mean, scale = self.mean.double().numpy(), self.scale.double().numpy()
+        # The first layer includes the normalization, and the last layer the division by the authority.
         weight, bias = layers[0]
         layers[0] = (weight / scale[:, None], bias - (mean / scale) @ weight)
         layers[-1] = (layers[-1][0] / self.authority, layers[-1][1] / self.authority)
@@ -123,7 +126,7 @@ def fit_one_step(
     samples: FollowingSamples,
     validation: FollowingSamples,
     base: leader_replay.AccelerationFunction | None,
-    settings: NetworkSettings,
+    settings: OneStepSettings,
     seed: int,
 ) -> tuple[FollowingNetwork, LossHistory]:
     """Fit a network to the accelerations of single samples, or to their differences to a base.
@@ -166,17 +169,20 @@ def fit_one_step(
 
 @dataclass(frozen=True)
 class CalibratedTrajectories:
-    """Trajectories with the calibrated IDMs of their drivers, which are the base of a residual."""
+    """Trajectories with the calibrated IDMs of their drivers, to which a residual is added."""
 
     trajectories: Sequence[FollowingTrajectory]
-    drivers: Sequence[IDMParameters]
-    """IDM parameters of the driver of each trajectory"""
+    idm_parameters: Sequence[IDMParameters]
+    """parameters of the driver of each trajectory"""
 
-    def model(
+    def make_driver_model(
         self, trajectory_index: NDArray[np.int64], limits: leader_replay.AccelerationBounds, as_tensors: bool = False
     ) -> leader_replay.DriverModel:
-        """Return the IDMs for segments with the given indices of trajectories, for NumPy arrays or torch tensors."""
-        parameters = stack_idm_parameters([self.drivers[index] for index in trajectory_index])
+        """Return the IDMs of the drivers of segments with accelerations within `limits` [m/s2].
+
+        `trajectory_index` has the index of the trajectory of each segment. With `as_tensors` the model takes tensors.
+        """
+        parameters = stack_idm_parameters([self.idm_parameters[index] for index in trajectory_index])
         if as_tensors:
             parameters = IDMArrays(*map(_to_tensor, parameters))
         return leader_replay.as_driver_model(leader_replay.idm_function(parameters, limits))
@@ -191,15 +197,15 @@ def fit_multi_step(
 ) -> tuple[FollowingNetwork, list[float]]:
     """Fit a residual that reduces the difference between simulated and recorded gaps of calibrated drivers.
 
-    The residual starts at zero, and has the weights with the smallest error on uncut `validation` trajectories. Also
-    return the mean RMS gap error at each validation [m]; the first one is the error of the base. `limits` are the
-    limits of the acceleration [m/s2]. Raise `UnjamError` if a loss is not finite.
+    The residual starts at zero. The returned network has the weights with the smallest error on whole trajectories of
+    `validation`. Also return the mean RMS gap error at each validation [m]; the first one is that of the IDM alone.
+    `limits` are the limits of the acceleration [m/s2]. Raise `UnjamError` if a loss is not finite.
     """
     torch.set_num_threads(1)
     network = FollowingNetwork(settings, following_samples(training.trajectories), seed, zero_init=True)
     segments = make_segments(training.trajectories, settings.segment_seconds)
     validation_segments = make_segments(validation.trajectories)
-    validation_base = validation.model(validation_segments.trajectory_index, limits)
+    validation_base = validation.make_driver_model(validation_segments.trajectory_index, limits)
 
     def gap_error() -> float:
         model = leader_replay.add_residual(validation_base, batched_network(network.to_numpy_network()), limits)
@@ -211,8 +217,8 @@ def fit_multi_step(
     errors, best_weights = [gap_error()], deepcopy(network.state_dict())
     for step in range(1, settings.gradient_steps + 1):
         batch = segments.select(generator.choice(segments.gap.shape[1], settings.batch_size))
-        base_model = training.model(batch.trajectory_index, limits, as_tensors=True)
-        loss = _gap_loss(network, base_model, limits, batch, settings)
+        base_model = training.make_driver_model(batch.trajectory_index, limits, as_tensors=True)
+        loss = _multi_step_loss(network, base_model, limits, batch, settings)
         if not torch.isfinite(loss):
             raise UnjamError(f"following network: the loss of step {step} is not finite")
         optimizer.zero_grad()
@@ -228,15 +234,16 @@ def fit_multi_step(
     return network, errors
 
 
-def _gap_loss(
+def _multi_step_loss(
     network: nn.Module,
     base: leader_replay.DriverModel,
     limits: leader_replay.AccelerationBounds,
     segments: Segments,
     settings: MultiStepSettings,
 ) -> Tensor:
-    speeds, leader_speeds, gaps, paths = (_to_tensor(getattr(segments, name)) for name in SEGMENT_FIELDS)
-    is_present = torch.as_tensor(segments.is_present)[1:]
+    """Return the mean RMS error of gaps and weighted speeds over segments, plus a penalty for large residuals."""
+    speeds, leader_speeds, gaps, leader_positions = (_to_tensor(getattr(segments, name)) for name in SEGMENT_FIELDS)
+    is_present = torch.as_tensor(segments.is_present)[1:]  # the states after each step
     residuals: list[Tensor] = []
 
     def compute_residual(inputs: Tensor) -> Tensor:
@@ -245,7 +252,7 @@ def _gap_loss(
 
     initial_state = speeds[0], gaps[0]
     acceleration_function = leader_replay.add_residual(base, compute_residual, limits)(*initial_state)
-    leader = leader_speeds, paths
+    leader = leader_speeds, leader_positions
     states = leader_replay.follow_leader(acceleration_function, initial_state, leader, segments.time_step)
     simulated_speeds, simulated_gaps = (torch.stack(values) for values in zip(*states, strict=True))
     squares = (simulated_gaps - gaps[1:]).square()

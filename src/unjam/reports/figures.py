@@ -22,10 +22,10 @@ SPEED_COLORMAP = "viridis"  # dark is slow, bright is fast: readable with color 
 TEXT_COLOR, MUTED_COLOR, GRID_COLOR = "#1f2933", "#697586", "#e4e7eb"
 CAV_PLOT_COLOR = "#d7263d"
 LINE_COLORS = ["#7b8794", "#e07a1f", "#2b6cb0", "#2f855a", "#b83280", "#805ad5", "#1a202c", "#00a3c4"]
-"""colors of drivers, in the order of the legend"""
-FIGURE_WIDTH = 10.5  # of a figure on the page, where it is at least 760 pixels wide and still legible [inch]
+"""colors of lines and bars, in the order of the legend"""
+FIGURE_WIDTH = 10.5  # [inch]; texts are legible if a page shows the figure 760 pixels wide
 MAX_LABEL_LENGTH = 34  # maximum length of the label of a driver in a figure [characters]
-DPI = 130  # of rasterized parts [pixels per inch]
+DPI = 130  # resolution of rasterized parts [pixels per inch]
 MAX_PLOT_TIMES = 600  # maximum number of snapshots of an episode in a figure
 
 PLOT_STYLE: dict[Any, Any] = {
@@ -80,7 +80,7 @@ def svg_bytes(figure: Figure) -> bytes:
     return re.sub(
         rb'(?<=data:image/png;base64,)[^"]+',
         lambda match: base64.b64encode(_reduce_colors(base64.b64decode(match[0]))),
-        printable(content.getvalue().decode()).encode(),  # comments in it contain labels
+        printable(content.getvalue().decode()).encode(),  # comments of the SVG contain labels
     )
 
 
@@ -107,13 +107,14 @@ def _reduce_colors(png: bytes) -> bytes:
 def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     """Draw quantities over time, with a line for each driver.
 
-    On closed and recorded roads: speed and gap of the CAV, or without CAVs the mean speed, and the standard deviation
-    of speed across all vehicles. On other open roads: mean speed, standard deviation, and any insertion backlog.
+    On closed and recorded roads: speed and gap of the first CAV, and of the same vehicle with a human driver; if no
+    driver has CAVs, the mean speed; and the standard deviation of speed across all vehicles. On other open roads: mean
+    speed, standard deviation, and any insertion backlog.
     """
     has_same_vehicles = all(episode.has_same_vehicles for episode in episodes)
     has_cav_panels = has_same_vehicles and any(episode.controlled_columns for episode in episodes)
-    has_no_backlog = has_same_vehicles or not any(np.any(episode.backlog) for episode in episodes)
-    all_series = [_time_series(episode, has_cav_panels, has_no_backlog) for episode in episodes]
+    shows_backlog = not has_same_vehicles and any(np.any(episode.backlog) for episode in episodes)
+    all_series = [_time_series(episode, has_cav_panels, shows_backlog) for episode in episodes]
     figure = new_figure(0.2 + 2.0 * len(all_series[0]))
     panels = figure.subplots(len(all_series[0]), 1, sharex=True)
     for episode, series, color in zip(episodes, all_series, LINE_COLORS, strict=False):
@@ -133,16 +134,17 @@ def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
     return figure
 
 
-def _time_series(episode: PlotEpisode, has_cav_panels: bool, has_no_backlog: bool) -> dict[str, np.ndarray]:
+def _time_series(episode: PlotEpisode, has_cav_panels: bool, shows_backlog: bool) -> dict[str, np.ndarray]:
     """Return the quantities of `time_series_figure` by label, each of shape (T + 1,)."""
-    speeds = np.where(np.isnan(episode.speeds).all(axis=1, keepdims=True), 0.0, episode.speeds)
-    waves = {"speed std across\nvehicles [m/s]": np.nanstd(speeds, axis=1)}
+    has_no_vehicles = np.isnan(episode.speeds).all(axis=1, keepdims=True)
+    speeds = np.where(has_no_vehicles, 0.0, episode.speeds)
+    speed_std = {"speed std across\nvehicles [m/s]": np.nanstd(speeds, axis=1)}
     if has_cav_panels:
         cav = episode.cav_columns[0]
-        return {"CAV's speed [m/s]": episode.speeds[:, cav], "CAV's gap [m]": episode.gaps[:, cav], **waves}
+        return {"CAV's speed [m/s]": episode.speeds[:, cav], "CAV's gap [m]": episode.gaps[:, cav], **speed_std}
     backlog = episode.backlog if len(episode.backlog) else np.zeros(len(speeds))
-    backlogs = {} if has_no_backlog else {"insertion backlog\n[vehicles]": backlog}
-    return {"mean speed [m/s]": np.nanmean(speeds, axis=1), **waves, **backlogs}
+    backlogs = {"insertion backlog\n[vehicles]": backlog} if shows_backlog else {}
+    return {"mean speed [m/s]": np.nanmean(speeds, axis=1), **speed_std, **backlogs}
 
 
 @rc_context(PLOT_STYLE)
@@ -156,7 +158,7 @@ def last_vehicle_figure(episodes: Sequence[PlotEpisode]) -> Figure:
             stride = max(1, len(episode.times) // MAX_PLOT_TIMES)
             ratios = (METRICS[name].function(episode) for name in ("amplification", "amplification_medium"))
             total, medium = ("–" if np.isnan(ratio) else f"{ratio:.2f}" for ratio in ratios)
-            label = f"{short_label(episode.driver)}: amplification {total}, of waves of 20 to 60 s {medium}"
+            label = f"{short_label(episode.driver)}: amplification {total} (periods of 20 to 60 s: {medium})"
             axes.plot(episode.times[::stride], episode.speeds[::stride, 0], color=color, lw=1.4, label=label)
     for index, episode in enumerate(recordings.values()):
         style = {"color": TEXT_COLOR, "lw": 1.0, "ls": (0, (3, 1.5)), "label": "" if index else "recorded vehicle"}
@@ -170,22 +172,23 @@ def last_vehicle_figure(episodes: Sequence[PlotEpisode]) -> Figure:
 @rc_context(PLOT_STYLE)
 def learning_curve_figure(
     runs: dict[str, list[dict[str, Any]]],
-    experts: dict[str, float],
+    expert_returns: dict[str, float],
     test_returns: dict[str, Estimate],
-    expert: str = "",
+    reference: str = "",
 ) -> Figure:
-    """Draw returns on validation seeds over environment steps, and below returns on test seeds after the trainings.
+    """Draw returns in training over environment steps, and returns on test seeds after training.
 
-    `runs` has rows of progress by label; a ring marks the selected network. Horizontal lines are the returns of
-    `experts` by label. `test_returns` has estimates by driver; with an `expert` they are differences to it. Returns on
-    different seeds are not comparable.
+    The upper panel has the returns on training and validation seeds: `runs` has rows of progress by label, a circle
+    marks the selected network, and horizontal lines are the `expert_returns` by label. The lower panel has the
+    `test_returns` by driver; with a `reference` they are differences to this driver. Returns on different seeds are
+    not comparable.
     """
     figure = new_figure(3.8 + (0.6 + 0.22 * len(test_returns) if test_returns else 0.0))
     heights = [3.4, 0.4 + 0.22 * len(test_returns)] if test_returns else [1.0]
     axes, *test_panels = figure.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
-    for (label, rows), color in zip(runs.items(), cycle(LINE_COLORS[2:]), strict=False):
+    for (run_label, rows), color in zip(runs.items(), cycle(LINE_COLORS[2:]), strict=False):
         steps = np.array([row["environment_steps"] for row in rows]) / 1000
-        prefix = f"{label}: " if len(runs) > 1 else ""
+        prefix = f"{run_label}: " if len(runs) > 1 else ""
         returns, label = [row["return_mean"] for row in rows], f"{prefix}training seeds, with exploration"
         axes.plot(steps, returns, color=color, lw=1, alpha=0.45, label=label)
         validations = [(0.0, rows[0]["return_expert"])]  # the untrained policy equals its expert
@@ -195,8 +198,8 @@ def learning_curve_figure(
         axes.plot(*points.T, color=color, lw=1.8, marker="o", ms=3.5, label=label)
         if (row := selected_row(rows)) and len(runs) == 1:
             point = row["environment_steps"] / 1000, row["return_validation"]
-            axes.scatter(*point, 110, "none", edgecolors=color, label="network that is kept")
-    for (label, value), style in zip(experts.items(), cycle(("--", ":", "-.", (0, (1, 3))))):
+            axes.scatter(*point, 110, "none", edgecolors=color, label="selected network")
+    for (label, value), style in zip(expert_returns.items(), cycle(("--", ":", "-.", (0, (1, 3))))):
         axes.axhline(value, color=TEXT_COLOR, lw=1.1, ls=style, label=f"{label}, validation seeds")
     axes.set(xlabel="environment steps [thousands]", ylabel="return of an episode")
     axes.margins(x=0.01, y=0.06)
@@ -205,9 +208,9 @@ def learning_curve_figure(
             errors = np.nan_to_num([[estimate.mean - estimate.low], [estimate.high - estimate.mean]])
             panel.errorbar([estimate.mean], [index], xerr=errors, fmt="o", ms=4, color=TEXT_COLOR, capsize=3)
         panel.set_yticks(range(len(test_returns)), list(map(short_label, test_returns)))
-        if expert:
+        if reference:
             panel.axvline(0.0, color=TEXT_COLOR, lw=0.9)
-        quantity = f"return minus that of {expert}" if expert else "return"
+        quantity = f"return minus that of {reference}" if reference else "return"
         panel.set(xlabel=f"{quantity} on test seeds, after training: mean and 95 % CI")
         panel.set(ylim=(len(test_returns) - 0.5, -0.5))
     figure.legend(loc="outside upper left", ncols=3)
@@ -218,7 +221,7 @@ def learning_curve_figure(
 def training_time_figure(progress: Sequence[dict[str, Any]]) -> Figure:
     """Draw the wall time of each part of training."""
     totals = {f"{part} {seconds:.0f} s": seconds for part, seconds in seconds_by_part(progress).items()}
-    figure = stacked_bars({"": totals}, "wall time [s]", height=1.5)
+    figure = stacked_bar_figure({"": totals}, "wall time [s]", height=1.5)
     axes = figure.axes[0]
     axes.set(yticks=[], xmargin=0.0)
     axes.spines["left"].set_visible(False)
@@ -226,7 +229,7 @@ def training_time_figure(progress: Sequence[dict[str, Any]]) -> Figure:
 
 
 @rc_context(PLOT_STYLE)
-def stacked_bars(bars: dict[str, dict[str, float]], label: str, height: float) -> Figure:
+def stacked_bar_figure(bars: dict[str, dict[str, float]], axis_label: str, height: float) -> Figure:
     """Draw a bar for each name with its parts end to end; a part has the same color in all bars."""
     figure = new_figure(height)
     axes, left = figure.subplots(), np.zeros(len(bars))
@@ -235,11 +238,11 @@ def stacked_bars(bars: dict[str, dict[str, float]], label: str, height: float) -
         widths = np.array([bar.get(part, 0.0) for bar in bars.values()])
         axes.barh(list(bars), widths, left=left, color=color, label=part)
         left = left + widths
-    axes.set_xlabel(label)
+    axes.set_xlabel(axis_label)
     figure.legend(loc="outside upper left", ncols=6)
     return figure
 
 
-def color_table() -> list[str]:
+def speed_colors() -> list[str]:
     """Return the colors of speeds as hexadecimal codes, slowest first, for drawings without matplotlib."""
     return [to_hex(color) for color in colormaps[SPEED_COLORMAP](np.linspace(0, 1, 32))]

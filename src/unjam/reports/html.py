@@ -30,10 +30,14 @@ from unjam.text import printable
 from unjam.worlds.record import assign_columns
 
 MAX_PANELS = 6  # maximum number of drivers in space-time diagrams and the replay
-Sources = Sequence[tuple[str, Results]]  # names and results of folders
-MAX_REPLAY_FRAMES = 600  # of a replay, which interpolates between frames
-MAX_REPLAY_VALUES = 600_000  # vehicles times frames of all drivers of a replay; about three megabytes
-MAX_MERGE_DISTANCE = 50.0  # between a merge and the vehicle at which it is drawn [m]
+NamedResults = Sequence[tuple[str, Results]]
+"""results of folders with the names of the folders"""
+MAX_REPLAY_FRAMES = 600
+"""maximum number of frames of a replay, which interpolates between frames"""
+MAX_REPLAY_VALUES = 600_000
+"""maximum of vehicles times frames of all drivers of a replay; about three megabytes"""
+MAX_MERGE_DISTANCE = 50.0
+"""maximum distance from a merge to the vehicle that marks its place in the plane [m]"""
 REPLAY_NAN = 65535  # code of NaN in the arrays of a replay
 WAVE_VARIANCE_RATIO = 0.9  # a replay starts when the variance of speeds reaches this ratio of its maximum
 REPLAY_STEP = 0.5  # time between two frames of the replay [s]
@@ -67,7 +71,7 @@ def _damaged_folder(results: Sequence[Results]) -> Path:
 def render_template(template: str, **values: Any) -> str:
     """Return a page of the folder `page/` as `printable` text, with common style and script; values are escaped.
 
-    Texts in figures, JSON and addresses are encoded there and must already be printable.
+    Figures, JSON and `data:` addresses are inserted as they are: their texts must be printable before.
     """
     options: dict[str, Any] = {"undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(loader=PackageLoader("unjam.reports", "page"), autoescape=True, **options)
@@ -88,45 +92,43 @@ def render_report(results: Sequence[Results]) -> str:
     panels = [replace(column.episode, driver=column.name) for column in columns if column.episode is not None]
     panels = panels[:MAX_PANELS]
     replay_panels = [panel for panel in panels if panel.has_poses]
-    single = results[0] if len(results) == 1 else None
+    single_result = results[0] if len(results) == 1 else None
     sources = list(zip(summary.folder_names(results), results, strict=True))
     counts = [len(column.rows) for column in columns]
     rows, baseline = {column.name: column.rows for column in columns}, summary.common_baseline(results)
-    first_alternative = "" if baseline else summary.first_alternative(results)
-    is_alternative = {
-        column.name: column.name.endswith(f": {HUMAN_LABEL}") and column.name != first_alternative for column in columns
-    }
-    if first_alternative in rows:  # drivers of CAVs are compared with human drivers of their own folder
+    first_network = "" if baseline else summary.first_network_column(results)
+    if first_network in rows:
+        other_networks = {name for name in rows if name.endswith(f": {HUMAN_LABEL}")} - {first_network}
         columns = [
-            summary.compare_alternative(column, rows[first_alternative]) if is_alternative[column.name] else column
+            summary.compare_networks(column, rows[first_network]) if column.name in other_networks else column
             for column in columns
         ]
     headings, table = metric_table(rows, baseline)
-    roads = (", ".join(format_drawn_values(episode.drawn_values)) for episode in panels)
+    drawn_values = (", ".join(format_drawn_values(episode.drawn_values)) for episode in panels)
     return render_template(
         "report.html",
         title=summary.report_title(results),
-        single=single is not None,
+        single=single_result is not None,
         verdicts=[column.verdict for column in columns if column.verdict is not None],
         baseline_name=summary.name_baselines(results),
-        first_alternative=first_alternative if first_alternative in rows else "",
+        first_network=first_network if first_network in rows else "",
         findings=[(name, finding) for name, result in sources if (finding := summary.main_finding(result))],
         warning=summary.mismatch_warning(results),
-        command_differences=[] if single else summary.command_differences(results),
+        command_differences=[] if single_result else summary.command_differences(results),
         notes=[(name, note) for name, result in sources for note in summary.report_notes(result)],
-        cards=summary.key_figures(single) if single else [],
+        cards=summary.key_figures(single_result) if single_result else [],
         figures={name: figures.data_uri(figure) for name, figure in _report_figures(sources, columns, panels).items()},
         panels=panels,
         space_time=[figures.data_uri(space_time.space_time_figure(panels, [panel])) for panel in panels],
         has_cavs=any(panel.controlled_columns for panel in panels),
         replay_panels=replay_panels,
-        road_values=list(dict.fromkeys(roads)),
+        road_values=list(dict.fromkeys(drawn_values)),
         has_lane_maps=space_time.has_lane_maps(panels),
         baseline_differences=summary.baseline_differences(columns),
         episodes_csv=summary.episodes_as_csv(columns),
-        model=model_section(single) if single else None,
+        model=model_section(single_result) if single_result else None,
         columns=columns,
-        episodes=list(dict.fromkeys((min(counts), max(counts)))),
+        episode_counts=list(dict.fromkeys((min(counts), max(counts)))),
         headings=headings,
         short_table=metric_table(rows, "", short_table_metrics(rows)),
         baseline=baseline,
@@ -139,7 +141,7 @@ def render_report(results: Sequence[Results]) -> str:
 
 
 def _report_figures(
-    sources: Sources, columns: Sequence[ReportColumn], panels: Sequence[PlotEpisode]
+    sources: NamedResults, columns: Sequence[ReportColumn], panels: Sequence[PlotEpisode]
 ) -> dict[str, Figure]:
     """Return the figures of the report for which there are data, by the name in the page."""
     report_figures: dict[str, Figure] = {}
@@ -148,8 +150,10 @@ def _report_figures(
     if any(panel.has_recorded_leader for panel in panels):
         report_figures["last_vehicle"] = figures.last_vehicle_figure(panels)
     if runs := {name: result.progress for name, result in sources if result.progress}:
-        curves = runs, _expert_returns(sources), *_test_returns(sources, columns)
-        report_figures["learning_curve"] = figures.learning_curve_figure(*curves)
+        test_returns, reference = _test_returns(sources, columns)
+        report_figures["learning_curve"] = figures.learning_curve_figure(
+            runs, _expert_returns(sources), test_returns, reference
+        )
     if len(sources) == 1 and sources[0][1].progress:
         progress, model = sources[0][1].progress, sources[0][1].model
         report_figures["training_time"] = figures.training_time_figure(progress)
@@ -161,22 +165,22 @@ def _report_figures(
     return report_figures
 
 
-def _test_returns(sources: Sources, columns: Sequence[ReportColumn]) -> tuple[dict[str, Estimate], str]:
-    """Return the returns on test seeds by driver, and an empty text.
+def _test_returns(sources: NamedResults, columns: Sequence[ReportColumn]) -> tuple[dict[str, Estimate], str]:
+    """Return estimates of the return on test seeds by driver, and the label of the driver of which they are differences.
 
-    For a single training, the returns are differences to its expert, and the text is the label of the expert. Human
-    drivers are left out, because other differences would often not be visible next to their small returns.
+    The label is empty for returns that are no differences. For a single training, the estimates are differences to its
+    expert, without human drivers: their large difference would stretch the axis.
     """
     rows = {column.name: column.rows for column in columns}
     expert = sources[0][1].metadata.get("expert", "")
     if len(sources) > 1 or expert not in rows:
         return {name: metric_estimate(driver_rows, "return") for name, driver_rows in rows.items()}, ""
-    compared = [name for name in rows if name not in (expert, HUMAN_LABEL)]
-    return {name: paired_difference(rows[name], rows[expert], "return") for name in compared}, expert
+    names = [name for name in rows if name not in (expert, HUMAN_LABEL)]
+    return {name: paired_difference(rows[name], rows[expert], "return") for name in names}, expert
 
 
-def _expert_returns(sources: Sources) -> dict[str, float]:
-    """Return the return of each expert on validation seeds, with which the curve of its run starts."""
+def _expert_returns(sources: NamedResults) -> dict[str, float]:
+    """Return the validation return of each expert, which is the first point of the learning curve of its run."""
     returns: dict[str, float] = {}
     has_several_roads = len({result.metadata.get("scenario") for _, result in sources}) > 1
     for _, result in sources:
@@ -187,27 +191,27 @@ def _expert_returns(sources: Sources) -> dict[str, float]:
 
 
 def replay_data(panels: Sequence[PlotEpisode]) -> dict[str, Any]:
-    """Return the data for the replay on the page: positions and speeds at a few frames per second.
+    """Return the data for the replay on the page: positions and speeds, one frame for each `REPLAY_STEP` at most.
 
     With many vehicles there are fewer frames, to limit the size of the page.
     """
     if not panels:
         return {"drivers": []}
-    longest = max(episode.times[-1] for episode in panels)
-    vehicles = sum(int((~np.isnan(episode.speeds)).sum(axis=1).max()) for episode in panels)
-    max_frames = min(MAX_REPLAY_FRAMES, max(1, MAX_REPLAY_VALUES // max(1, vehicles)))
-    step = max(REPLAY_STEP, longest / max_frames, *(episode.control_step for episode in panels))
-    frames = 1 + int(longest / step + 1e-9)
-    longest_platoon = max((-panel.lane_lines[:, 0].min() for panel in panels if panel.has_recorded_leader), default=0.0)
+    duration = max(episode.times[-1] for episode in panels)
+    vehicle_count = sum(int((~np.isnan(episode.speeds)).sum(axis=1).max()) for episode in panels)
+    max_frames = min(MAX_REPLAY_FRAMES, max(1, MAX_REPLAY_VALUES // max(1, vehicle_count)))
+    step = max(REPLAY_STEP, duration / max_frames, *(episode.control_step for episode in panels))
+    frame_count = 1 + int(duration / step + 1e-9)
+    platoon_length = max((-panel.lane_lines[:, 0].min() for panel in panels if panel.has_recorded_leader), default=0.0)
     scale = space_time.speed_scale(panels)
-    tracks = ((printable(panel.driver), _replay_track(panel, step, frames, longest_platoon)) for panel in panels)
+    tracks = ((printable(panel.driver), _replay_track(panel, step, frame_count, platoon_length)) for panel in panels)
     return {
         "step": step,
-        "frames": frames,
+        "frames": frame_count,
         "start": round(_wave_time(panels[0]), 1),
         "min_speed": scale.vmin,
         "max_speed": scale.vmax,
-        "colors": figures.color_table(),
+        "colors": figures.speed_colors(),
         "vehicle_length": VEHICLE_LENGTH,
         "no_value": REPLAY_NAN,
         "drivers": [{"name": name, **track} for name, track in tracks],
@@ -222,14 +226,14 @@ def _wave_time(episode: PlotEpisode) -> float:
     return float(episode.times[(variance >= WAVE_VARIANCE_RATIO * variance.max()).argmax()])
 
 
-def _replay_track(episode: PlotEpisode, step: float, frames: int, longest_platoon: float) -> dict[str, Any]:
+def _replay_track(episode: PlotEpisode, step: float, frame_count: int, platoon_length: float) -> dict[str, Any]:
     """Return the positions and speeds of the vehicles, and the lines of the road.
 
     Positions are along the loop on a closed road, and in the plane on other roads. A line has rows (coordinate along
-    the road, x, y) [m]. After an early end the vehicles stand still. Behind a recorded vehicle the line is as long as
-    the longest platoon of all drivers [m].
+    the road, x, y) [m]. After an early end the vehicles stand still. Behind a recorded vehicle, the line has the length
+    of the longest platoon of all drivers, `platoon_length` [m].
     """
-    snapshots = np.round(np.arange(frames) * step / episode.control_step).astype(int)
+    snapshots = np.round(np.arange(frame_count) * step / episode.control_step).astype(int)
     snapshots = snapshots.clip(max=len(episode.speeds) - 1)
     speeds = episode.speeds[snapshots]
     if episode.is_closed:
@@ -244,15 +248,15 @@ def _replay_track(episode: PlotEpisode, step: float, frames: int, longest_platoo
         }
     vehicles = np.flatnonzero(~np.isnan(speeds).all(axis=0))
     is_present, is_cav = ~np.isnan(speeds[:, vehicles]), np.isin(vehicles, episode.controlled_columns)
-    first, last = is_present.argmax(axis=0), frames - 1 - is_present[::-1].argmax(axis=0)
+    first, last = is_present.argmax(axis=0), frame_count - 1 - is_present[::-1].argmax(axis=0)
     columns = assign_columns(first, last, is_cav.tolist())
     values = np.concatenate([episode.poses[snapshots], speeds[..., None]], axis=-1)
-    packed = np.full((frames, int(columns.max(initial=-1)) + 1, 4), np.nan, np.float32)
+    packed = np.full((frame_count, int(columns.max(initial=-1)) + 1, 4), np.nan, np.float32)
     for vehicle, column, present in zip(vehicles, columns, is_present.T, strict=True):
         packed[present, column] = values[present, vehicle]
     lines = split_lines(episode.lane_lines)
     if episode.has_recorded_leader:
-        lines = [np.array([[-longest_platoon, 0.0], [0.0, 0.0]])]
+        lines = [np.array([[-platoon_length, 0.0], [0.0, 0.0]])]
     return {
         "vehicles": packed.shape[1],
         "cavs": np.unique(columns[is_cav]).tolist(),
@@ -278,11 +282,11 @@ def _merge_points(episode: PlotEpisode) -> list[list[float]]:
 def _encode_array(array: np.ndarray) -> dict[str, Any]:
     """Return values of shape (frames, columns) in the compressed format of the page.
 
-    Values are quantized to 65,534 steps between the smallest and the largest value (5 cm on three kilometers), and NaN
+    Values are quantized to 65,534 steps of a range that has all values and zero (5 cm on three kilometers), and NaN
     becomes `REPLAY_NAN`. The differences of each frame to the previous frame, modulo 65,536, are compressed with zlib
     and encoded as base64.
     """
-    low, high = (float(end(array, initial=0.0)) for end in (np.nanmin, np.nanmax))
+    low, high = float(np.nanmin(array, initial=0.0)), float(np.nanmax(array, initial=0.0))
     scale = (high - low) / (REPLAY_NAN - 1) or 1.0
     steps = np.where(np.isnan(array), REPLAY_NAN, np.round((array - low) / scale)).astype(np.int64)
     changes = np.diff(steps, axis=0, prepend=0).astype("<u2")

@@ -78,7 +78,7 @@ def common_baseline(results: Sequence[Results]) -> str:
     return baseline if len(set(baselines)) == 1 and has_same_episodes and not is_of_folder else ""
 
 
-def first_alternative(results: Sequence[Results]) -> str:
+def first_network_column(results: Sequence[Results]) -> str:
     """Return the name of the column of human drivers on the first of several user networks; else an empty text.
 
     Human drivers on the other networks, for example with a speed limit, are compared with it on common seeds.
@@ -97,7 +97,7 @@ def common_seeds(results: Sequence[Results]) -> set[str]:
     return set.intersection(*({str(row["seed"]) for row in result.rows.get(HUMAN_LABEL, [])} for result in results))
 
 
-def compare_alternative(column: ReportColumn, first_rows: Sequence[dict[str, Any]]) -> ReportColumn:
+def compare_networks(column: ReportColumn, first_rows: Sequence[dict[str, Any]]) -> ReportColumn:
     """Return the column of human drivers on another network, compared with the first network on common seeds."""
     label = "human drivers of the first network"
     rows, baseline_rows = (list(paired) for paired in zip(*pair_rows(column.rows, first_rows), strict=True))
@@ -149,7 +149,7 @@ def mismatch_warning(results: Sequence[Results]) -> str:
         "durations": [str(episode.times[-1]) for episode in comparable if episode.status == "completed"],
     }
     different = [name for name, values in properties.items() if len(set(values)) > 1]
-    if (first := first_alternative(results)) and "durations" not in different:
+    if (first := first_network_column(results)) and "durations" not in different:
         return (
             f"Human drivers of these networks are compared with {first}, on the seeds that both have. Delay is the "
             "time lost to the speed that is allowed at each moment: a speed limit hides its own cost, so compare "

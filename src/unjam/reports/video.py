@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from unjam.errors import DiskError, InputError, import_optional, invalid_value
 from unjam.files import atomic_write, check_parent_folder
 from unjam.processes import PrivateFolder
-from unjam.reports.figures import CAV_PLOT_COLOR, TEXT_COLOR, color_table
+from unjam.reports.figures import CAV_PLOT_COLOR, TEXT_COLOR, speed_colors
 from unjam.reports.results import PlotEpisode, to_plot_episode
 from unjam.reports.space_time import speed_scale
 from unjam.scenarios.scenario import VEHICLE_LENGTH
@@ -52,7 +52,7 @@ def draw_road(scene: RoadScene, max_speed: float, caption: str) -> Image.Image:
     pen = ImageDraw.Draw(image)
     for line in lines:
         pen.line(to_pixels(line), fill=ROAD_COLOR, width=max(OVERSAMPLING, round(4 * scale)), joint="curve")
-    colors = color_table()
+    colors = speed_colors()
     for vehicle in np.flatnonzero(~np.isnan(scene.speeds)):
         color = colors[min(len(colors) - 1, int(scene.speeds[vehicle] / max_speed * len(colors)))]
         outline, width = (CAV_PLOT_COLOR, 3 * OVERSAMPLING) if scene.is_cav[vehicle] else (None, 1)
@@ -69,7 +69,7 @@ def draw_road(scene: RoadScene, max_speed: float, caption: str) -> Image.Image:
 
 def _draw_legend(pen: ImageDraw.ImageDraw, max_speed: float, pixels: int) -> None:
     """Draw the scale of speeds into the bottom right corner, where roads of the package are not."""
-    colors, font = color_table(), ImageFont.load_default(14 * OVERSAMPLING)
+    colors, font = speed_colors(), ImageFont.load_default(14 * OVERSAMPLING)
     width, bottom = LEGEND_WIDTH * OVERSAMPLING, 0.97 * pixels
     left = bottom - width
     top = bottom - LEGEND_HEIGHT * OVERSAMPLING

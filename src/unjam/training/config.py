@@ -46,8 +46,10 @@ from unjam.worlds.backend import check_backend_name
 from unjam.worlds.batch.support import statistically_unsupported_reason, unsupported_reason
 from unjam.worlds.episode import Task
 
-CONFIG_FILE, MANIFEST_FILE = "config.toml", "manifest.json"
-"""files in a run folder: its configuration, which the folder of a search has too, and the origin of the run"""
+CONFIG_FILE = "config.toml"
+"""file with the configuration of a run, or of a search for hyperparameters, in its folder"""
+MANIFEST_FILE = "manifest.json"
+"""file with the origin of a run in its folder: versions, machine, start folder"""
 
 
 @parameter_dataclass(frozen=True, config=STRICT)
@@ -60,7 +62,7 @@ class EvaluationSettings:
     """training ends after this number of validations without a new best return; 0: it continues to `steps`"""
     convergence_window: NonNegativeInt = 0
     """training ends if the mean return of this number of iterations, with exploration, is not better than that of as
-    many iterations before them, checked once per window (the paper's rule); 0: it continues to `steps`"""
+    many iterations before them; this rule of the paper is checked once per window. 0: it continues to `steps`"""
     validation_episodes: PositiveInt = 4
     """episodes of a validation, with the same seeds in each validation; the controller is selected by their return"""
     episodes: PositiveInt = 20
@@ -81,7 +83,7 @@ class EvaluationSettings:
         return sum(returns[window:]) <= sum(returns[:window])
 
     def is_out_of_patience(self, progress: Sequence[dict[str, Any]]) -> bool:
-        """Return whether the last `patience` scheduled validations had no new best return."""
+        """Return whether the last `patience` scheduled validations had no new best return; the expert's counts too."""
         interval = self.validation_interval
         scheduled = [row for row in progress if interval and row["iteration"] % interval == 0]
         returns = [value for row in scheduled if (value := row.get("return_validation")) is not None]
@@ -94,13 +96,16 @@ class EvaluationSettings:
 
 @parameter_dataclass(frozen=True, config=STRICT)
 class TaskConfig:
-    """One of several roads of a training; missing and empty entries have the values of the run."""
+    """One task of a training run on several scenarios; missing and empty entries have the values of the run."""
 
     scenario: str = ""
+    """name of the scenario, or a file"""
     scenario_options: Options = field(default_factory=dict)
     """changes to the scenario's parameters, in addition to those of the run"""
     expert: str = ""
+    """driver to which the residual is added"""
     reward: str = ""
+    """a name or `path.py:name`"""
     weight: Positive = 1.0
     """share of the environment steps, relative to the weights of the other tasks"""
     name: Annotated[str, Field(pattern=r"^[\w-]*$")] = ""
@@ -122,14 +127,14 @@ class RunConfig(AgentSettings):
     steps: PositiveInt = 960_000
     """environment steps of training"""
     seed: Annotated[int, Field(ge=0, lt=TRAINING_SEED_LIMIT)] = 0
-    """seed of the whole run; larger numbers are reserved for validation, tuning and test seeds"""
+    """seed of the whole run; numbers from `TRAINING_SEED_LIMIT` are reserved for validation, tuning and test seeds"""
     workers: PositiveInt = 2
     """processes that run episodes; the result does not depend on their number"""
     backend: Annotated[str, AfterValidator(check_backend_name)] = "sumo"
     """the simulator: `sumo`, `batch`, or your own, `path.py:name`. `batch` runs all episodes of an iteration, or of a
-    validation, at once, which is faster for large iterations. On rings it equals SUMO except for rounding; a single
-    figure eight or on-ramp equals SUMO in distribution. The other roads of several tasks, and the final evaluation, run
-    in SUMO"""
+    validation, at once, which is faster for large iterations. On rings and recorded roads it equals SUMO except for
+    rounding, on figure eights and motorways in distribution. In runs with several tasks only rings and recorded roads
+    run in the batch. The final evaluation always runs in SUMO"""
     stratified: bool = True
     """whether the episodes of an iteration or validation cover the range of drawn values (the ring's length) evenly"""
     policy: PolicySettings = field(default_factory=PolicySettings)
@@ -137,10 +142,10 @@ class RunConfig(AgentSettings):
     """the learned model (the paper: virtual environment), in which the agent learns between environment episodes"""
     evaluation: EvaluationSettings = field(default_factory=EvaluationSettings)
     tasks: tuple[TaskConfig, ...] = ()
-    """roads of a training on several roads; empty: only `scenario`"""
+    """tasks of a training run on several scenarios; empty: only `scenario`"""
     task_sampling: TaskSampling = "weights"
-    """distribution of the steps among several roads: by their `weight`, or with `regret`: from each validation to the
-    next, half of all steps go to roads on which the return is below its best value so far"""
+    """distribution of the steps among several tasks, by their `weight`; with `regret`, from each validation to the next
+    only half of the steps, and the other half goes to tasks with a return below their best value so far"""
     preset: str = ""
     """name of the preset from which the configuration was made"""
 
@@ -153,28 +158,33 @@ class RunConfig(AgentSettings):
     @model_validator(mode="after")
     def _check_combinations(self) -> "RunConfig":
         policy, evaluation = self.policy, self.evaluation
-        scenarios = [road.make_scenario() for road in self.task_configs().values()]
-        reasons = list(map(unsupported_reason if self.tasks else statistically_unsupported_reason, scenarios))
+        scenarios = [task_config.make_scenario() for task_config in self.task_configs().values()]
+        batch_reasons = list(map(unsupported_reason if self.tasks else statistically_unsupported_reason, scenarios))
         model_kind = self.model.kind if self.model.model_ratio > 0 else ""
-        has_memory = "expert_memory" in policy.inputs or any(map(is_file_reference, policy.inputs))
-        has_pairs = not model_kind or (model_kind == "road" and not any(road.is_closed for road in scenarios))
+        has_memory_input = "expert_memory" in policy.inputs or any(map(is_file_reference, policy.inputs))
+        is_open_road_model = model_kind == "road" and not any(scenario.is_closed for scenario in scenarios)
+        allows_antithetic_pairs = not model_kind or is_open_road_model
         has_validated_tasks = len(self.tasks) > 1 and evaluation.validation_interval > 0
         device, patience, exploration = self.model.device, evaluation.patience, policy.exploration
         lacks_exit_reward = policy.reward_after_exit and model_kind == "row"
-        lacks_memory = policy.history_features and not has_memory
+        lacks_memory = policy.history_features and not has_memory_input
         lacks_validation = patience and not evaluation.validation_interval
         lacks_episode_noise = policy.episode_noise and self.agent in ("sac", "td3")
         allowed_exploration = "per_step, per_episode, because these model rollouts have no antithetic pairs"
-        allowed_sampling = "weights, except for several validated tasks"
+        allowed_sampling = "weights; regret needs several tasks and validations"
         checks = (
-            (self.backend == "batch" and all(reasons), "backend: batch", f"sumo ({reasons[0]})"),
+            (self.backend == "batch" and all(batch_reasons), "backend: batch", f"sumo ({batch_reasons[0]})"),
             (lacks_exit_reward, "policy.reward_after_exit: true", "false with a row model"),
             (self.unused_setting, self.unused_setting, f"none for the agent {self.agent}"),
-            (lacks_memory, "policy.history_features: true", "false without the input expert_memory"),
+            (lacks_memory, "policy.history_features: true", "false, or true with expert_memory among policy.inputs"),
             (lacks_validation, f"evaluation.patience: {patience}", "0 without validations"),
             (model_kind == "road" and device != "cpu", f"model.device: {device}", "cpu, for road models"),
             (lacks_episode_noise, f"policy.exploration: {exploration}", f"per_step, for {self.agent}"),
-            (exploration == "antithetic" and not has_pairs, "policy.exploration: antithetic", allowed_exploration),
+            (
+                exploration == "antithetic" and not allows_antithetic_pairs,
+                "policy.exploration: antithetic",
+                allowed_exploration,
+            ),
             (self.task_sampling == "regret" and not has_validated_tasks, "task_sampling: regret", allowed_sampling),
         )
         for is_wrong, value, allowed in checks:
@@ -188,7 +198,7 @@ class RunConfig(AgentSettings):
         return "sumo" if self.backend == "batch" else self.backend
 
     def task_configs(self) -> dict[str, "RunConfig"]:
-        """Return the configuration of each task by the name of its folder; a single road has an empty name."""
+        """Return the configuration of each task by the name of its folder; a run without tasks has one with an empty name."""
         if not self.tasks:
             return {"": self}
         configs: dict[str, RunConfig] = {}
@@ -199,7 +209,7 @@ class RunConfig(AgentSettings):
             while name in configs:
                 number += 1
                 name = f"{base}-{number}"
-            road = replace(
+            task_config = replace(
                 self,
                 scenario=scenario,
                 scenario_options=merge_changes(self.scenario_options, task.scenario_options),
@@ -209,21 +219,22 @@ class RunConfig(AgentSettings):
                 task_sampling="weights",
                 backend="sumo",
             )
-            in_sumo = self.backend == "batch" and unsupported_reason(road.make_scenario())
-            configs[name] = road if in_sumo else replace(road, backend=self.backend)
+            needs_sumo = self.backend == "batch" and unsupported_reason(task_config.make_scenario()) != ""
+            configs[name] = task_config if needs_sumo else replace(task_config, backend=self.backend)
         return configs
 
     def make_tasks(self) -> list[Task]:
-        """Return the tasks of the training; raise `InputError` if they have different inputs of the network."""
+        """Return the tasks of the training; raise `InputError` if the network would need different inputs."""
         weights = [task.weight for task in self.tasks] or [1.0]
         tasks = [
-            Task(road.make_scenario(), road.make_expert(), road.reward, weight, name)
-            for (name, road), weight in zip(self.task_configs().items(), weights, strict=True)
+            Task(task_config.make_scenario(), task_config.make_expert(), task_config.reward, weight, name)
+            for (name, task_config), weight in zip(self.task_configs().items(), weights, strict=True)
         ]
         inputs = [observation_inputs(self.policy.inputs, task.expert) for task in tasks]
         for task, task_inputs in zip(tasks, inputs, strict=True):
             if task_inputs != inputs[0]:
-                raise InputError(f"tasks: the network would have other inputs on {task.name} than on {tasks[0].name}")
+                reason = f"{task.name} gives the network other inputs than {tasks[0].name}"
+                raise InputError(f"tasks: {reason}; allowed: tasks with equal inputs")
         return tasks
 
     def make_scenario(self) -> Scenario:
@@ -250,12 +261,12 @@ def planned_steps(config: RunConfig) -> int:
 def load_config(file: Path | str | None = None, preset: str = "", changes: dict[str, Any] | None = None) -> RunConfig:
     """Return a configuration: the defaults, changed by a preset, a TOML file and `changes`, in this order.
 
-    Keys of `changes` may have dots: `trpo.gamma`. Raise `InputError` for an unknown key or preset, a value out of
-    range, an unreadable file, untrusted Python code in a file in a run folder, and for Python objects as values:
-    a training imports functions, classes and drivers in other processes, by `path.py:name`.
+    Keys of `changes` may have dots: `trpo.gamma`. Values are no Python objects, because a training imports functions,
+    classes and drivers in other processes: `path.py:name`. Raise `InputError` for an unknown key or preset, a value
+    that is not allowed, an unreadable file, and untrusted Python code in a file in a run folder.
     """
     file = None if file is None else Path(file)
-    file_values = read_values(file) if file is not None else {}
+    file_values = read_config_values(file) if file is not None else {}
     if file is not None and _is_in_run_folder(file):  # the code in other files is the user's own
         check_trusted_values(f"config file {file}", file_values)
     user_values = inline_toml_file(merge_changes(file_values, nest_keys(changes or {})))
@@ -280,14 +291,14 @@ def load_config(file: Path | str | None = None, preset: str = "", changes: dict[
     return build_dataclass(RunConfig, values, "")
 
 
-def read_values(file: Path) -> dict[str, Any]:
+def read_config_values(file: Path) -> dict[str, Any]:
     """Return the values of a configuration file, with absolute file names if its run was started in another folder."""
     values, start_folder = read_toml(file), _start_folder(file.absolute().parent)
     return values if start_folder == Path.cwd() else absolute_names(values, start_folder)
 
 
 def _start_folder(run: Path) -> Path:
-    """Return the working folder in which the run of a run folder or task folder was started, by default the present."""
+    """Return the folder in which the run of a run folder or task folder was started, or else the working folder."""
     for folder in (run, run.parent):
         with suppress(OSError, ValueError, LookupError, TypeError):
             if (folder / MANIFEST_FILE).is_file():
@@ -297,7 +308,7 @@ def _start_folder(run: Path) -> Path:
 
 
 def _expand_toml_file_of_task(values: Any) -> Any:
-    """Return the values of a task with the content of its scenario's TOML file, if it has one, and the file's name."""
+    """Return the values of a task; the content of a TOML file of a scenario replaces its name, which names the task."""
     if not isinstance(values, dict) or (expanded := inline_toml_file(values)) is values:
         return values
     return {"name": re.sub(r"[^\w-]", "-", Path(values["scenario"]).stem), **expanded}

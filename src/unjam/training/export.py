@@ -57,16 +57,20 @@ ControllerKind = Literal["best", "latest"]
 
 
 class ControllerStore:
-    """Controller files of a run, one per task folder: the `best` of scheduled validations, and the `latest`."""
+    """The controllers of a run, one for each task.
+
+    The file in the folder of a task is the `latest` controller. Checkpoints also contain the `best` controller of the
+    scheduled validations.
+    """
 
     def __init__(self, folders: Sequence[Path]) -> None:
         """Start without contents for the folders of the tasks."""
         self._folders = folders
         self._contents: dict[ControllerKind, list[bytes]] = {}
 
-    def save(self, contents: list[bytes], is_best: bool) -> None:
-        """Write these contents into the controller files of the folders."""
-        self._contents |= {"latest": contents, **({"best": contents} if is_best else {})}
+    def save(self, contents: list[bytes], is_scheduled: bool) -> None:
+        """Write better controllers into the files; those of a scheduled validation are the `best` for checkpoints."""
+        self._contents |= {"latest": contents, **({"best": contents} if is_scheduled else {})}
         self._write_latest()
 
     def tensors(self) -> "Tensors":
@@ -80,7 +84,10 @@ class ControllerStore:
         }
 
     def restore(self, tensors: "Tensors", is_finished: bool) -> None:
-        """Remove the contents from a checkpoint's `tensors` and write them: `latest` if finished, else `best`."""
+        """Take the controllers out of the `tensors` of a checkpoint, and write their files.
+
+        An unfinished run continues with `best`, so that its result does not depend on a validation at an interruption.
+        """
         for kind in CONTROLLER_KINDS if "best/0" in tensors else ():
             stored = [tensors.pop(f"{kind}/{index}") for index in range(len(self._folders))]
             self._contents[kind] = [tensor.numpy().tobytes() for tensor in stored]
@@ -100,14 +107,14 @@ class ExportResult:
 
     file: Path
     graph: Path | None
-    """file of the ONNX graph with a description as metadata; the controller's file has the graph without it"""
+    """the ONNX graph, with a description in its metadata; the `.unjam` file has the same graph without description"""
     model: Path | None
     """file of the Stable-Baselines3 model"""
     driver: str
     """description of the driver"""
     sample_steps: int
     """length of the recorded sample [control steps]"""
-    car: str
+    actuator: str
     """actuator that the safety filter expects; empty without a filter"""
 
 
@@ -120,22 +127,24 @@ def export_controller(
     stable_baselines3: bool = False,
     settings: dict[str, Any] | None = None,
 ) -> ExportResult:
-    """Write a controller into a self-contained `.unjam` file, and optionally an ONNX graph and a model of its residual.
+    """Write a controller into a self-contained `.unjam` file, and optionally into an ONNX graph and an SB3 model.
 
-    A test episode is run for the recorded sample. The controller includes the safety filter of the road, if it has one.
+    A test episode is run to record a sample of local states and accelerations, with which readers verify the file. The
+    controller includes the safety filter of the scenario, if there is one.
 
     Args:
         source: a run folder, or any driver as in `unjam.drive`.
         out: the file, which ends in `.unjam`.
         onnx: whether to write the graph of the whole controller into a file with the same name and `.onnx`.
-        scenario: scenario for time step and limits of a driver; runs and controller files have their own scenario.
+        scenario: scenario that gives time step and limits; by default that of a controller file, or `ring`. Runs have
+            their own scenario: another one is refused.
         stable_baselines3: whether to write the residual as a model of Stable-Baselines3, with the same name and `.zip`.
         settings: changes to the scenario, such as `{"actuator.delay": 0.5}`. With `settings` or `scenario`, the safety
             filter of a controller is replaced by that of the scenario.
 
     Raises:
-        InputError: there is no such controller, it is Python code, it has no graph (`onnx`), or it is no residual
-            (`stable_baselines3`).
+        InputError: there is no such controller, it is Python code, it has no graph (`onnx`), it is not a residual
+            (`stable_baselines3`), or `out` is a signed controller or would replace another file.
         MissingPartError: a package for graphs, or Stable-Baselines3, is needed and not installed.
     """
     source, out = Path(source), Path(out)
@@ -152,27 +161,29 @@ def export_controller(
         if os.path.lexists(file) and (is_new or not _is_exported(file))
     ]
     if foreign_files:
-        raise InputError(f"out: {', '.join(foreign_files)} exists and belongs to no {out.name}; allowed: another name")
-    read_origin = _read_run_origin if source.is_dir() else _read_driver_origin
-    road, driver, metadata = read_origin(str(source), scenario, settings or {})
+        raise InputError(
+            f"out: {', '.join(foreign_files)} exists and is no export of {out.name}; allowed: another name"
+        )
+    read_source = _read_run if source.is_dir() else _read_driver
+    exported_scenario, driver, metadata = read_source(str(source), scenario, settings or {})
     code = user_code_recipes(driver_recipe(driver)[0])
     if driver.is_driven_by_simulator or code:
-        reason = f"{Path(code[0]['path']).name} is Python code" if code else "human is the simulator itself"
+        reason = f"{Path(code[0]['path']).name} is Python code" if code else "the simulator drives this vehicle"
         raise InputError(f"export: {driver.describe()} is not allowed: {reason}; allowed: drivers without Python code")
     model = _residual_model(driver, metadata) if stable_baselines3 else None
-    if road.safety.active:
-        driver = driver_with_filter(driver, road)
-    low, high = driver.limits or road.acceleration_limits
+    if exported_scenario.safety.active:
+        driver = driver_with_filter(driver, exported_scenario)
+    low, high = driver.limits or exported_scenario.acceleration_limits
     limit = max(-low, high)
     backend = read_config(source).episode_backend if source.is_dir() else "sumo"
-    states, graph = _sample_states(road, driver, backend), dict[str, bytes]()
+    states, graph = _sample_states(exported_scenario, driver, backend), dict[str, bytes]()
     if onnx:
         import_optional("torch")
         from unjam.controller.onnx_graph import onnx_graph  # imported late: torch.onnx is slow to import
 
         missing = [name for name in driver.requirements().input_fields if getattr(states, name) is None]
         if missing:  # the graph needs samples of all inputs of the driver
-            reason = f"{road.title} does not provide {', '.join(missing)}; allowed: --scenario of a road that does"
+            reason = f"{exported_scenario.title} does not provide {', '.join(missing)}; allowed: a scenario that does"
             raise InputError(f"onnx: {driver.describe()} is not allowed: {reason}")
         graph = {GRAPH_PART: onnx_graph(driver, limit)}
     content = controller_bytes(driver, metadata, {SAMPLE_PART: sample_bytes(driver, states, limit), **graph})
@@ -185,16 +196,16 @@ def export_controller(
     if graph_file is not None:
         from unjam.controller.onnx_graph import describe_graph
 
-        atomic_write(graph_file, describe_graph(graph[GRAPH_PART], driver, limit, road.control_step))
+        atomic_write(graph_file, describe_graph(graph[GRAPH_PART], driver, limit, exported_scenario.control_step))
     model_file = None if model is None else out.with_suffix(".zip")
     if model is not None and model_file is not None:
         atomic_write(model_file, model)
-    car = driver.actuator.describe() if isinstance(driver, FilteredDriver) else ""
-    return ExportResult(out, graph_file, model_file, driver.describe(), len(states.speed), car)
+    actuator = driver.actuator.describe() if isinstance(driver, FilteredDriver) else ""
+    return ExportResult(out, graph_file, model_file, driver.describe(), len(states.speed), actuator)
 
 
 def _is_exported(file: Path) -> bool:
-    """Return whether an export wrote a graph or a model of Stable-Baselines3."""
+    """Return whether a file is a graph or a model of Stable-Baselines3 that an export has written."""
     with suppress(InputError, OSError):
         if file.suffix == ".zip":
             return bool(read_policy(file).unjam)
@@ -209,25 +220,25 @@ def read_exported_controller(source: str, settings: dict[str, Any], scenario: st
         return read_controller(export_controller(source, file, scenario=scenario, settings=settings).file)
 
 
-def has_default_actuator(road: Scenario) -> bool:
-    """Return whether the CAVs of a road have the default actuator of its scenario class; true on open roads."""
-    return not road.is_closed or road.actuator == type(road)().actuator
+def has_default_actuator(scenario: Scenario) -> bool:
+    """Return whether CAVs have the default actuator of the scenario's class; true for open roads, without a check."""
+    return not scenario.is_closed or scenario.actuator == type(scenario)().actuator
 
 
 def measure_test_episode(controller: Controller) -> dict[str, Any]:
     """Return the metrics of a controller in the first test episode on the road of its manifest."""
-    road = scenario_from_recipe(controller.manifest["scenario"])
+    scenario = scenario_from_recipe(controller.manifest["scenario"])
     with WorkerPool(1) as workers:
-        (episode,) = workers.run([EpisodeTask(road, controller.driver, held_out_seeds(1)[0], record_details=True)])
+        (episode,) = workers.run([EpisodeTask(scenario, controller.driver, held_out_seeds(1)[0], record_details=True)])
     return measure(episode)
 
 
-def driver_with_filter(driver: Driver, road: Scenario) -> FilteredDriver:
-    """Return a driver with the limits, the safety filter and the actuator of a road, unless it has a filter."""
+def driver_with_filter(driver: Driver, scenario: Scenario) -> FilteredDriver:
+    """Return a driver with the limits, the safety filter and the actuator of a scenario, unless it has a filter."""
     if isinstance(driver, FilteredDriver):
         return driver
-    max_acceleration = (driver.limits or road.acceleration_limits).highest
-    return FilteredDriver(driver, max_acceleration, road.safety, road.control_step, road.actuator)
+    max_acceleration = (driver.limits or scenario.acceleration_limits).highest
+    return FilteredDriver(driver, max_acceleration, scenario.safety, scenario.control_step, scenario.actuator)
 
 
 def remove_filter(driver: Driver) -> Driver:
@@ -252,43 +263,47 @@ def _is_signed(file: Path) -> bool:
     return False
 
 
-def _read_run_origin(run: str, scenario: str, settings: dict[str, Any]) -> tuple[Scenario, Driver, dict[str, Any]]:
-    if scenario:
-        raise invalid_value("scenario", scenario, "none for a run, which has its own")
+def _read_run(run: str, scenario_name: str, settings: dict[str, Any]) -> tuple[Scenario, Driver, dict[str, Any]]:
+    if scenario_name:
+        raise invalid_value("scenario", scenario_name, "none for a run, which has its own")
     folder = Path(run)
     config = read_config(folder)
     check_run_files(folder, config, "export")
     check_controller(folder, "export")
-    road, controller = make_scenario(config.make_scenario(), settings), read_controller(folder)
+    scenario, controller = make_scenario(config.make_scenario(), settings), read_controller(folder)
     metadata = {
-        **controller_origin(road, config.make_expert()),
+        **controller_origin(scenario, config.make_expert()),
         "run": {"scenario": config.scenario, "agent": config.agent, "seed": config.seed},
         **{key: controller.manifest.get(key) for key in ("iteration", "environment_steps")},
         "metrics": _test_metrics(folder),
     }
-    return road, controller.driver, metadata
+    return scenario, controller.driver, metadata
 
 
-def _read_driver_origin(
-    driver_name: str, scenario: str, settings: dict[str, Any]
+def _read_driver(
+    driver_name: str, scenario_name: str, settings: dict[str, Any]
 ) -> tuple[Scenario, Driver, dict[str, Any]]:
-    """Return road, driver and manifest entries; for a controller's file the stored ones, with changed settings."""
-    file = None if scenario else controller_path(driver_name)
+    """Return scenario, driver and manifest entries; without a scenario's name, those of a controller's file.
+
+    With settings, or with a scenario's name, the driver has no safety filter.
+    """
+    file = None if scenario_name else controller_path(driver_name)
     if file is not None:
         controller = read_controller(file)
         metadata = {name: controller.manifest[name] for name in PROVENANCE_ENTRIES if name in controller.manifest}
-        road, driver = _read_manifest_scenario(file, metadata.get("scenario")), controller.driver
-        if driver_name.startswith(PACKAGED_PREFIX) and not has_default_actuator(road):
-            settings = {"actuator": asdict(type(road)().actuator), **settings}
+        scenario, driver = _read_manifest_scenario(file, metadata.get("scenario")), controller.driver
+        if driver_name.startswith(PACKAGED_PREFIX) and not has_default_actuator(scenario):
+            # Packaged controllers for ideal actuators are exported for real cars.
+            settings = {"actuator": asdict(type(scenario)().actuator), **settings}
         if not settings:
-            return road, driver, metadata
-        road = make_scenario(road, settings)
-        metadata["scenario"] = scenario_recipe(road)
-        return road, remove_filter(driver), metadata
-    road = make_scenario(example_scenario(scenario or "ring"), settings)
-    driver = remove_filter(make_driver(driver_name, road.control_step))
+            return scenario, driver, metadata
+        scenario = make_scenario(scenario, settings)
+        metadata["scenario"] = scenario_recipe(scenario)
+        return scenario, remove_filter(driver), metadata
+    scenario = make_scenario(example_scenario(scenario_name or "ring"), settings)
+    driver = remove_filter(make_driver(driver_name, scenario.control_step))
     expert = driver.expert if isinstance(driver, ResidualDriver) else driver
-    return road, driver, controller_origin(road, expert)
+    return scenario, driver, controller_origin(scenario, expert)
 
 
 def _read_manifest_scenario(file: Path, recipe: dict[str, Any] | None) -> Scenario:
@@ -301,12 +316,15 @@ def _read_manifest_scenario(file: Path, recipe: dict[str, Any] | None) -> Scenar
 
 
 def _test_metrics(folder: Path) -> dict[str, Any] | None:
-    """Return the test metrics of the controller and the expert of a run; None if this controller is not evaluated."""
+    """Return the test metrics of the controller and the expert of a run; None before its evaluation."""
     if not (folder / EVALUATION_FILE).is_file():
         return None
     evaluation, rows_by_driver = read_evaluation(folder)
     if is_outdated(folder, evaluation):
-        _LOG.warning("export: metrics in %s are of an earlier controller, left out; unjam evaluate measures", folder)
+        _LOG.warning(
+            "export: the metrics in %s belong to an earlier controller and are left out; measure with unjam evaluate",
+            folder,
+        )
         return None
     metrics: dict[str, Any] = {"reward": evaluation["reward"]}
     for label in (TRAINED_LABEL, evaluation["expert"]):

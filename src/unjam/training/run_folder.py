@@ -36,7 +36,7 @@ from unjam.processes import LOCK_FILE, is_locked, lock_folder
 from unjam.reports.results import CONTROLLER_FILE, EVALUATION_FILE, read_progress
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.scenario import Scenario
-from unjam.training.config import CONFIG_FILE, MANIFEST_FILE, RunConfig, load_config, read_values, to_toml
+from unjam.training.config import CONFIG_FILE, MANIFEST_FILE, RunConfig, load_config, read_config_values, to_toml
 from unjam.training.fingerprint import check_file_hashes, check_fingerprint, check_settings, fingerprint
 from unjam.tree import map_leaves
 from unjam.trust import check_trusted_values
@@ -205,7 +205,7 @@ def read_config(folder: Path, check_trust: bool = True) -> RunConfig:
     try:
         if check_trust:
             return load_config(path)
-        values = read_values(path)
+        values = read_config_values(path)
         check_trusted_values(f"config file {path}", {name: values.get(name) for name in ("scenario", "tasks")})
         return build_dataclass(RunConfig, values, "")
     except InputError:

@@ -255,7 +255,7 @@ class Trainer:
         if self.collector.iteration == 0:
             self._expert_returns = self.validation_returns([task.expert for task in self.tasks])
             self._sampler.best_returns = self._expert_returns
-            self._save_controllers(self.network(), is_best=True)
+            self._save_controllers(self.network(), is_scheduled=True)
             self._best_validation = self._sampler.weighted_mean(self._expert_returns)
         if not self.config.evaluation.should_stop_early(read_progress(self.folder)):
             config = self.config
@@ -297,7 +297,7 @@ class Trainer:
             if is_scheduled:
                 self._sampler.update(returns)
         elif is_last:
-            self._save_controllers(network, is_best=False)
+            self._save_controllers(network, is_scheduled=False)
         return returns
 
     def finish_iteration(self, log: IterationLog) -> bool:
@@ -403,9 +403,9 @@ class Trainer:
             "seconds": log.seconds,
         }
 
-    def _save_controllers(self, network: Network, is_best: bool) -> None:
+    def _save_controllers(self, network: Network, is_scheduled: bool) -> None:
         contents = [
             controller_bytes(driver, {**run_folder.controller_origin(task.scenario, task.expert), **self._counters})
             for task, driver in zip(self.tasks, self.make_drivers(network), strict=True)
         ]
-        self._controllers.save(contents, is_best)
+        self._controllers.save(contents, is_scheduled)

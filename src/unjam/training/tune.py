@@ -24,7 +24,7 @@ from unjam.errors import InputError, UnjamError, invalid_value, raise_failure, u
 from unjam.files import atomic_write, to_json
 from unjam.manifest import manifest
 from unjam.measures.feasibility import FEASIBLE, HARD_BRAKING_METRIC, overall_feasibility
-from unjam.measures.gain import MEAN_GAIN, EpisodeRows, normalized_gain, performance_bound
+from unjam.measures.gain import MEAN_GAIN_OBJECTIVE, EpisodeRows, normalized_gain, performance_bound
 from unjam.measures.metrics import measure
 from unjam.scenarios import scenario_recipe
 from unjam.scenarios.file_watch import watch_files
@@ -266,7 +266,7 @@ def tune(
     recipe = next(iter(recipes.values())) if is_single else recipes
     scenario = next(iter(roads.values()))
     tuning = {
-        "reward": reward or (scenario.reward if is_single else MEAN_GAIN),
+        "reward": reward or (scenario.reward if is_single else MEAN_GAIN_OBJECTIVE),
         "seed": seed,
         "environment_steps": sumo_steps,
         "batch_steps": batch_steps,
