@@ -4,7 +4,7 @@ Each method has `CANDIDATES_PER_METHOD` candidates: its default parameters, and 
 random before any evaluation.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -166,10 +166,10 @@ def _report_figures(
 
 
 def _test_returns(sources: NamedResults, columns: Sequence[ReportColumn]) -> tuple[dict[str, Estimate], str]:
-    """Return estimates of the return on test seeds by driver, and the label of the driver of which they are differences.
+    """Return estimates of the return on test seeds by driver, and the label of a driver.
 
-    The label is empty for returns that are no differences. For a single training, the estimates are differences to its
-    expert, without human drivers: their large difference would stretch the axis.
+    For a single training, the estimates are differences to its expert, which is the driver of the label. They exclude
+    human drivers, because their large difference would stretch the axis. Otherwise the label is empty.
     """
     rows = {column.name: column.rows for column in columns}
     expert = sources[0][1].metadata.get("expert", "")

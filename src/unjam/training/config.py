@@ -198,7 +198,7 @@ class RunConfig(AgentSettings):
         return "sumo" if self.backend == "batch" else self.backend
 
     def task_configs(self) -> dict[str, "RunConfig"]:
-        """Return the configuration of each task by the name of its folder; a run without tasks has one with an empty name."""
+        """Return the configuration of each task by the name of its folder; without tasks, the name is empty."""
         if not self.tasks:
             return {"": self}
         configs: dict[str, RunConfig] = {}
