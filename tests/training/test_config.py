@@ -125,7 +125,7 @@ def test_merging_does_not_change_its_arguments() -> None:
         ),
         (
             {"policy.history_features": True, "policy.inputs": ["local"]},
-            "policy.history_features: true is not allowed; allowed: false, or true with expert_memory among policy.inputs",
+            "policy.history_features: true is not allowed; allowed: false, or true with expert_memory",
         ),
         (
             {"scenario_options.simulation_step": 0.0333},

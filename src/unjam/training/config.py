@@ -176,7 +176,7 @@ class RunConfig(AgentSettings):
             (self.backend == "batch" and all(batch_reasons), "backend: batch", f"sumo ({batch_reasons[0]})"),
             (lacks_exit_reward, "policy.reward_after_exit: true", "false with a row model"),
             (self.unused_setting, self.unused_setting, f"none for the agent {self.agent}"),
-            (lacks_memory, "policy.history_features: true", "false, or true with expert_memory among policy.inputs"),
+            (lacks_memory, "policy.history_features: true", "false, or true with expert_memory among the inputs"),
             (lacks_validation, f"evaluation.patience: {patience}", "0 without validations"),
             (model_kind == "road" and device != "cpu", f"model.device: {device}", "cpu, for road models"),
             (lacks_episode_noise, f"policy.exploration: {exploration}", f"per_step, for {self.agent}"),
