@@ -9,7 +9,7 @@ from unjam.errors import InputError
 from unjam.text import to_one_line
 
 _SEPARATOR = re.compile(r"\+(?=[^\W\d]|[./~])")  # + between two names, but not the + in 1e+5
-_MAX_LENGTH = 4096  # of a path [characters], the limit of Linux
+_MAX_LENGTH = 4096  # maximum length of a path in Linux [characters]
 MAX_NAMES = 100  # joined by +
 _PATH_END = re.compile(rf":|$|{_SEPARATOR.pattern}")
 

@@ -25,7 +25,8 @@ ReduceMean ReduceMin ReduceSum Relu Reshape Round ScatterElements Selu Shape Sig
 Softsign Split Sqrt Squeeze Sub Sum Tan Tanh ThresholdedRelu Transpose Unsqueeze Where
 """
 ALLOWED_OPERATORS = set(_OPERATORS.split())  # arithmetic, without subgraphs
-VALUE_FIELDS = {"INT": "i", "FLOAT": "f", "STRING": "s", "TENSOR": "t", "INTS": "ints"}  # by attribute type
+VALUE_FIELDS = {"INT": "i", "FLOAT": "f", "STRING": "s", "TENSOR": "t", "INTS": "ints"}
+"""field with the value of an attribute, by the type of the attribute"""
 REFUSED_ATTRIBUTES = {"value_string", "value_ints", "saturate", "round_mode"}  # policies do not need these
 TENSOR_KINDS = "double", "float", "int32", "int64"
 ALLOWED_FIELDS = {
@@ -87,7 +88,7 @@ def check_model(model: Any, size: int, opsets: range, ir_versions: range) -> Non
         allowed = f"[('', {opsets[0]})]" + (f" to [('', {opsets[-1]})]" if len(opsets) > 1 else "")
         raise invalid_value("graph: opset_import", model_opsets, allowed)
     graph = model.graph
-    input_dependent = {tensor.name for tensor in graph.input}  # on values of inputs, not only on shapes
+    input_dependent = {tensor.name for tensor in graph.input}  # depend on values, not only on shapes
     if constant_inputs := {tensor.name for tensor in graph.initializer} & input_dependent:
         raise invalid_value("graph: initializer", min(constant_inputs), "constants, not inputs")
     for node in graph.node:

@@ -25,13 +25,14 @@ from unjam.folders import PROTECTED_FOLDERS_VARIABLE, protect_folder, protected_
 from unjam.sandbox import confine_process, limit_resources
 
 PARENT_VARIABLE = "UNJAM_PARENT"  # variable with the id of the parent, with which a child ends
-TRACI_VARIABLES = "LIBSUMO_AS_TRACI", "LIBTRACI_AS_TRACI"  # with them traci is replaced by a library that prints so
+TRACI_VARIABLES = "LIBSUMO_AS_TRACI", "LIBTRACI_AS_TRACI"  # if they are set, traci is a library that prints so
 LOCK_FILE = ".lock"  # the file that locks a folder for its writer
-HEARTBEAT_INTERVAL, MAX_MISSED_HEARTBEATS = 10.0, 6  # of the owner of a folder [s], and how many may be missing
+HEARTBEAT_INTERVAL, MAX_MISSED_HEARTBEATS = 10.0, 6
+"""interval of heartbeats of the owner of a folder [s], and how many may be missing"""
 PRIVATE_FOLDER_PREFIX, PRIVATE_LOCK_FILE = "unjam-", ".temporary"
 """beginning of the names of private temporary folders, and the file that locks such a folder for its process"""
 PR_SET_PDEATHSIG = 1  # option of prctl on Linux
-MAX_CHILD_MEMORY, MAX_CHILD_TIME = 8 * 2**30, 600  # for reading an untrusted file [bytes, s]
+MAX_CHILD_MEMORY, MAX_CHILD_TIME = 8 * 2**30, 600  # limits for reading an untrusted file [bytes, s]
 _is_command_line = False
 
 

@@ -28,10 +28,10 @@ from unjam.measures.statistics import Estimate, is_expert_unchanged
 from unjam.measures.verdict import short_table_metrics, verdicts
 from unjam.text import format_duration, printable, split_label
 
-PROGRESS_LINE_SECONDS = 5.0  # between two lines of progress without a terminal
+PROGRESS_LINE_SECONDS = 5.0  # interval of lines of progress without a terminal [s]
 MIN_TIMED_SECONDS = 1.0  # elapsed time from which the remaining time is estimated
 NARROW_COLUMN_WIDTHS = 18, 7  # columns of metrics and units in a narrow terminal [characters]
-WIDE_OPTIONS_WIDTH = 130  # of a terminal for one line per row in the main table of an assessment [characters]
+WIDE_OPTIONS_WIDTH = 130  # width of a terminal from which each row of an assessment is one line [characters]
 MAX_HEADING_LENGTH = 45  # headings shorten longer names of drivers [characters]
 TEXT_COLUMN_WIDTHS = {" ": 22, "\n": 15}
 """width of headings and verdicts, as that of most numbers [characters]; by separator of mean and interval"""

@@ -19,7 +19,8 @@ from unjam.worlds.record import Episode
 IRRELEVANT_PARAMETERS = {
     *("horizon", "emission_class", "remember_warmup", "population", "recordings", "begin", "window", "platoon")
 }  # parameters in which the scenario of a controller may differ without a note
-KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")  # in descriptions of scenarios
+KEY_PARAMETERS = ("length", "radius", "vehicles", "cavs", "penetration_rate", "warmup")
+"""parameters in descriptions of scenarios"""
 MAX_LISTED_PARAMETERS = 3  # largest number of parameters that a note lists
 SB3_SUFFIX = ".zip"  # end of the file names of models of Stable-Baselines3
 OUTSIDE_DOMAIN_THRESHOLD = 0.05  # share of control steps outside of the domain above which there is a note

@@ -12,7 +12,8 @@ from unjam.physics.idm import IDMParameters, equilibrium_gap, idm_acceleration
 from unjam.worlds.drive import drive_world
 from unjam.worlds.world import CarFollowingWorld
 
-OSCILLATION_FREQUENCIES = np.geomspace(0.001, 1.0, 25)  # of the leader's speed [Hz]: periods of 17 minutes to 1 s
+OSCILLATION_FREQUENCIES = np.geomspace(0.001, 1.0, 25)
+"""frequencies of the leader's speed [Hz]: periods of 17 minutes to 1 s"""
 OSCILLATION_AMPLITUDE = 0.05  # share of the mean speed; the response to such a small change is nearly linear
 SETTLING_SECONDS = 300.0  # time behind a leader with constant speed, before the oscillations start
 GAIN_TOLERANCE = 0.02  # a vehicle counts as string stable with gains up to one plus this tolerance

@@ -83,7 +83,7 @@ def measure_traffic(episode: Episode, scenario: Motorway, ramp_index: int = 0) -
             has_passed = (positions[:-1] <= position) & (positions[1:] > position)
         if lane is not None:
             has_passed &= lane_indices[1:] == lane
-        steps = len(has_passed) // per_interval * per_interval  # in whole intervals
+        steps = len(has_passed) // per_interval * per_interval  # steps in whole intervals
         has_passed = has_passed[:steps].reshape(-1, per_interval, positions.shape[1])
         passing_speeds = np.where(has_passed, speeds[1 : steps + 1].reshape(has_passed.shape), 0.0)
         counts = has_passed.sum((1, 2))

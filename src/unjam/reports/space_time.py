@@ -17,7 +17,7 @@ from unjam.reports.results import Float32s, PlotEpisode
 SPEED_FIELD_POSITIONS = 250  # number of positions along the road with a speed
 FILL_DISTANCE, FILL_SECONDS = 10.0, 1.4
 """a figure shows the speed of a vehicle up to this distance from it [m], plus this time of driving [s]"""
-MAX_TIME_BINS, MAX_POSITION_BINS = 240, 100  # of a lane map, in time and along the road
+MAX_TIME_BINS, MAX_POSITION_BINS = 240, 100  # maximum number of bins of a lane map, in time and along the road
 MIN_SAMPLES_PER_CELL = 4  # mean number of samples per cell at which hardly any cell is empty
 PANEL_WIDTH = 4.75  # width of the figure of a driver [inch]; up to three are next to each other, on a phone one
 SCALE_QUANTILE = 0.98  # quantile of all speeds from which vehicles have the brightest color

@@ -48,7 +48,7 @@ class ReportColumn:
     name: str
     rows: list[dict[str, Any]]
     episode: PlotEpisode | None
-    baseline_rows: list[dict[str, Any]] | None = None  # of the baseline in the folder; None for the baseline itself
+    baseline_rows: list[dict[str, Any]] | None = None  # rows of the baseline; None for the baseline itself
     verdict: Verdict | None = None  # compared with the baseline
 
 

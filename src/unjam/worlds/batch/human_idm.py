@@ -58,7 +58,7 @@ def visible_leaders(
     """
     xp, lane_length, lap_position = namespace(speed), loop_length / RING_EDGES, position % loop_length
     lane = xp.floor(lap_position / lane_length)
-    distance = (lane + 1.0) * lane_length - lap_position  # to the end of the last lane so far
+    distance = (lane + 1.0) * lane_length - lap_position  # distance to the end of the last lane so far
 
     def leader_if_present(is_present: Array, leader_speed: Array, gap: Array) -> Leader:
         return Leader(xp.where(is_present, leader_speed, parameters.desired_speed), xp.where(is_present, gap, FREE_GAP))

@@ -257,7 +257,7 @@ def _yield_to_stuck(
         return vehicles
     is_stuck = np.zeros(len(position), np.intp)
     is_stuck[stuck_rows] = 1
-    index = is_stuck.cumsum() - is_stuck - 1  # of the next stuck vehicle ahead
+    index = is_stuck.cumsum() - is_stuck - 1  # index of the next stuck vehicle ahead
     stuck = stuck_rows[clamp_min(index, 0)]
     gap = position[stuck] - geometry.vehicle_length - position - vehicles.minimum_gap
     yields = crawls & (index >= 0) & (vehicles.road[stuck] == vehicles.road) & (gap > SUMO_POSITION_TOLERANCE)

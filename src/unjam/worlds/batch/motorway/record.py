@@ -150,7 +150,7 @@ class MotorwayLog:
         has_crashed = self.end_steps[road_index] < len(backlog)
         entry_indices, first_rows, inverse = np.unique(placements.entry, return_index=True, return_inverse=True)
         order = np.argsort(first_rows, kind="stable")
-        vehicle = np.argsort(order)[inverse]  # in order of appearance
+        vehicle = np.argsort(order)[inverse]  # vehicles in order of appearance
         first_steps, last_steps = steps[first_rows[order]], np.zeros(len(order), np.intp)
         np.maximum.at(last_steps, vehicle, steps)
         cav_ids = dict.fromkeys(trip.vehicle for trip in trips)
