@@ -1,8 +1,10 @@
 """Signals that code in between must not lose."""
 
+import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -88,3 +90,24 @@ def test_an_ignored_signal_stays_ignored() -> None:
     program = PROGRAM.replace("import os, sys", "import os, signal, sys").replace("\nraise_signals()\n", "\n")
     command = [sys.executable, "-c", program, str(int(signal.SIGHUP)), code]
     assert subprocess.run(command, capture_output=True, text=True, timeout=50, check=False).stdout == "goes on\n"
+
+
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize("package", ["numpy", "gymnasium", "typer"])
+def test_a_signal_during_imports_ends_a_command_with_one_line(
+    signum: signal.Signals, code: int, package: str, tmp_path: Path
+) -> None:
+    """A package that is imported early sends the signal."""
+    code_of_package = f"import os\nos.kill(os.getpid(), {int(signum)})\n"
+    (tmp_path / f"{package}.py").write_text(code_of_package)
+    command = [sys.executable, "-m", "unjam", "scenarios"]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    found = subprocess.run(command, capture_output=True, text=True, timeout=50, check=False, env=environment)
+    word = "interrupted" if signum == signal.SIGINT else "terminated"
+    assert (found.returncode, found.stdout, found.stderr) == (code, "", f"unjam: {word}\n")
+
+
+def test_an_import_of_the_package_changes_no_signal_handler() -> None:
+    code = "import signal; handlers = [*map(signal.getsignal, range(1, 16))]\n"
+    code += "import unjam; assert handlers == [*map(signal.getsignal, range(1, 16))]"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=50)

@@ -57,8 +57,8 @@ ALLOWED = {
 """what else a part may import"""
 LAZY = {
     "__init__": {
-        *("controller", "drivers", "environments", "errors", "kernels", "resource_limits", "measures", "scenarios"),
-        *("benchmarks", "models", "seeds", "training", "trust", "worlds"),
+        *("controller", "drivers", "environments", "errors", "interruptions", "kernels", "resource_limits"),
+        *("benchmarks", "measures", "models", "scenarios", "seeds", "training", "trust", "worlds"),
     },
     "__main__": {"cli"},
     "resource_limits": {"child_processes", "controller", "errors", "trust"},

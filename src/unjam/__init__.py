@@ -19,10 +19,14 @@ if sys.argv[:1] == ["-m"] and sys.orig_argv[-len(sys.argv)].endswith("unjam") an
     del sys.path[0]
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from unjam.interruptions import exit_on_signals
 from unjam.kernels import pin_kernels
 
+if Path(*sys.argv[:1]).stem in ("unjam", "-m") and sys.orig_argv[-len(sys.argv)].endswith("unjam"):
+    exit_on_signals()  # this process is the command line, and its imports take a second
 pin_kernels()  # before anything imports NumPy
 
 from unjam.environments import register_environments  # noqa: E402

@@ -5,12 +5,14 @@ for instance while packages are imported. The command would then run on to its e
 """
 
 import _thread
+import os
 import signal
 import threading
 import time
+from collections.abc import Callable
 from types import FrameType
-from typing import Any
 
+SignalHandler = Callable[[int, FrameType | None], None]
 RESEND_DELAY = 0.02
 """time after which a lost signal is raised again [s]: it must not be raised within the destructor of its exception"""
 _is_handled = False
@@ -36,21 +38,35 @@ class InterruptSignal(_Signal, KeyboardInterrupt):
     """The process received SIGINT, by Ctrl-C for instance."""
 
 
+def exit_on_signals() -> None:
+    """Let SIGINT, SIGTERM and SIGHUP end the process with one line, unless they are ignored."""
+    _handle_signals(_exit, _exit)
+
+
 def raise_signals() -> None:
     """Let SIGINT, SIGTERM and SIGHUP raise an exception in the main thread, unless they are ignored."""
     global _is_handled
     _is_handled = False
-    handlers: dict[str, Any] = {"SIGINT": _interrupt, "SIGTERM": _terminate, "SIGHUP": _terminate}
-    for name, handler in handlers.items():  # Windows has no SIGHUP, and nohup ignores it
-        signum = getattr(signal, name, None)
-        if signum is not None and signal.getsignal(signum) != signal.SIG_IGN:
-            signal.signal(signum, handler)
+    _handle_signals(_interrupt, _terminate)
 
 
 def mark_as_handled() -> None:
     """Raise no further signal again: the command ends."""
     global _is_handled
     _is_handled = True
+
+
+def _handle_signals(interrupt: SignalHandler, terminate: SignalHandler) -> None:
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and nohup ignores it
+        signum = getattr(signal, name, None)
+        if signum is not None and signal.getsignal(signum) != signal.SIG_IGN:
+            signal.signal(signum, interrupt if name == "SIGINT" else terminate)
+
+
+def _exit(signum: int, frame: FrameType | None) -> None:
+    word = "interrupted" if signum == signal.SIGINT else "terminated"
+    os.write(2, f"unjam: {word}\n".encode())
+    os._exit(128 + signum)
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:
