@@ -85,6 +85,62 @@ def test_a_signal_does_not_interrupt_the_cleanup_after_it() -> None:
     assert run(signal.SIGTERM, CLEANUP) == "clean\nTerminationSignal 15 False\n"
 
 
+REPEATED_SIGNALS = """
+def send_all():
+    for signum in (int(sys.argv[1]), 1, 15, 2):
+        os.kill(os.getpid(), signum)
+
+try:
+    send_all()
+finally:
+    send_all()
+    time.sleep(0.2)
+    print("clean", flush=True)
+"""
+
+
+def test_further_signals_do_not_interrupt_the_cleanup() -> None:
+    assert run(signal.SIGTERM, REPEATED_SIGNALS) == "clean\nTerminationSignal 15 False\n"
+
+
+SIGNAL_OF_ANOTHER_THREAD = """
+import signal, threading
+
+def send_to_this_thread():
+    time.sleep(0.2)
+    signal.pthread_kill(threading.get_ident(), int(sys.argv[1]))
+    time.sleep(60)
+
+threading.Thread(target=send_to_this_thread, daemon=True).start()
+lock = threading.Lock()
+lock.acquire()
+lock.acquire()
+"""
+
+
+def test_a_signal_that_another_thread_receives_ends_a_wait_for_a_lock() -> None:
+    assert run(signal.SIGTERM, SIGNAL_OF_ANOTHER_THREAD) == "TerminationSignal 15 False\n"
+    assert run(signal.SIGINT, SIGNAL_OF_ANOTHER_THREAD) == "InterruptSignal 2 True\n"
+
+
+SIGNAL_OF_A_FORK = """
+import signal
+if not (child := os.fork()):
+    try:
+        send()
+    finally:
+        os._exit(7)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+time.sleep(0.5)
+print("goes on", flush=True)
+os._exit(0)
+"""
+
+
+def test_a_signal_to_a_fork_is_not_one_to_its_parent() -> None:
+    assert run(signal.SIGTERM, SIGNAL_OF_A_FORK) == "goes on\n"
+
+
 def test_an_ignored_signal_stays_ignored() -> None:
     code = "signal.signal(signal.SIGHUP, signal.SIG_IGN); raise_signals(); send(); print('goes on'); sys.exit()"
     program = PROGRAM.replace("import os, sys", "import os, signal, sys").replace("\nraise_signals()\n", "\n")
