@@ -38,11 +38,11 @@ class Collector:
     def __init__(self, run: Callable[[Network, int], TaskEpisodes]) -> None:
         self._run = run
         self.iteration = 0
-        """index of the present iteration, from 1"""
+        """index of the current iteration, from 1"""
         self.environment_steps = 0
         """environment steps of all iterations so far"""
         self.episodes: list[list[Episode]] = []
-        """episodes of the present iteration, by task"""
+        """episodes of the current iteration, by task"""
         self.seconds = 0.0
         """wall time of these episodes [s]"""
 
@@ -69,7 +69,7 @@ class Agent(Protocol):
     """A policy that learns; the common part of the protocols `Algorithm` and `Learner`."""
 
     def network(self) -> Network:
-        """Return the present policy as a NumPy network: workers and exported controllers need no torch for it."""
+        """Return the current policy as a NumPy network: workers and exported controllers need no torch for it."""
         ...
 
     def state(self) -> tuple[dict[str, Any], Tensors]:

@@ -67,7 +67,7 @@ class Algorithm1:
 
         plan = self._plan_updates(collect.environment_steps)
         for with_environment, part, parts in plan:
-            # Line 7: collect model transitions using T, the present pi_theta, and pi_H: D_v.
+            # Line 7: collect model transitions using T, the current pi_theta, and pi_H: D_v.
             model_rows = None
             if parts:
                 with _measure_seconds(seconds, "roll_out"):
@@ -123,7 +123,7 @@ class Algorithm1:
         return [without_model, *((False, part, settings.model_updates) for part in range(settings.model_updates))]
 
     def _model_experience(self, iteration: int, part: int, parts: int) -> Experience | None:
-        """Return the part with index `part` of the present policy's experience in all models, or None."""
+        """Return the part with index `part` of the current policy's experience in all models, or None."""
         network = self.network()
         results = [rollouts.roll_out(network, iteration, part, parts) for rollouts in self.model_rollouts]
         rows = [experience for experience in results if experience is not None]

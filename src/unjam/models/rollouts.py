@@ -286,7 +286,7 @@ class ModelWorld:
     ) -> None:
         self.limits, self.cav_count = limits, len(starts.state.speed)
         self.states = [starts.state]
-        """states at all steps so far; the last is the present state"""
+        """states at all steps so far; the last is the current state"""
         self._dynamics, self._starts, self._control_steps, self._generator = dynamics, starts, control_steps, generator
         self._actuators = starts.actuators
         speed = starts.state.speed
@@ -305,7 +305,7 @@ class ModelWorld:
         return len(self._rewards) >= self._control_steps
 
     def local_state(self) -> LocalState:
-        """Return the present states, tensors of shape (n,)."""
+        """Return the current states, tensors of shape (n,)."""
         return self.states[-1]
 
     def advance(self, command: Command | None) -> None:

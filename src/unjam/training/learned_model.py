@@ -87,7 +87,7 @@ class LearnedModel:
         return observed
 
     def state(self) -> ModelState:
-        """Return the present state, which later steps do not change."""
+        """Return the current state, which later steps do not change."""
         return self._state._replace(generator_state=self._generator.get_state())
 
     def set_state(self, state: ModelState) -> None:
@@ -131,7 +131,7 @@ class LearnedModel:
 
     @torch.no_grad()
     def roll_out(self, driver: DriverLike, control_steps: int) -> ModelTrajectories:
-        """Let a driver with its initial memory drive all rows from the present state on.
+        """Let a driver with its initial memory drive all rows from the current state on.
 
         Raise `InputError` if the driver needs fields that rows do not have, or returns a value that is not finite, or
         if `control_steps` is below 1.

@@ -263,7 +263,7 @@ class Trainer:
                 run_iterations(self.algorithm, self.collector, config.steps, config.seed, self.finish_iteration)
 
     def network(self) -> Network:
-        """Return the present policy."""
+        """Return the current policy."""
         with convert_user_errors(self.config.agent):
             return check_network(self.config.agent, self.algorithm.network(), self.spec)
 
