@@ -7,7 +7,7 @@ environment experience and D_v model experience, k* the rollout length of Eq. 15
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -22,6 +22,16 @@ from unjam.learners.settings import LearnerSettings
 
 MAX_COMPARED_ROWS = 2000
 """maximum number of visited states at which the policies before and after an iteration are compared"""
+
+
+class PlannedUpdate(NamedTuple):
+    """Data of an update of an iteration: environment rows, or a part of the model rows, or both."""
+
+    uses_environment: bool
+    part: int
+    """index of the part of the model rows"""
+    part_count: int
+    """number of parts of the model rows; 0: the update uses no model rows"""
 
 
 class Algorithm1:
@@ -66,17 +76,17 @@ class Algorithm1:
                 rollouts.learn(task_episodes, collect.iteration)
 
         plan = self._plan_updates(collect.environment_steps)
-        for with_environment, part, parts in plan:
+        for uses_environment, part, part_count in plan:
             # Line 7: collect model transitions using T, the current pi_theta, and pi_H: D_v.
             model_rows = None
-            if parts:
+            if part_count:
                 with _measure_seconds(seconds, "roll_out"):
-                    model_rows = self._model_experience(collect.iteration, part, parts)
-                if model_rows is None and not with_environment:
+                    model_rows = self._model_experience(collect.iteration, part, part_count)
+                if model_rows is None and not uses_environment:
                     continue
             # Line 8: update pi_theta and its value network with D_a and D_v.
-            seed_iteration(self.spec.seed, collect.iteration, None if with_environment else part)
-            rows = environment_rows if with_environment else None, model_rows
+            seed_iteration(self.spec.seed, collect.iteration, None if uses_environment else part)
+            rows = environment_rows if uses_environment else None, model_rows
             with _measure_seconds(seconds, "update"):
                 try:
                     learner.learn(Update(*rows, 1.0 / len(plan), collect.environment_steps))
@@ -109,23 +119,21 @@ class Algorithm1:
         string_gain = self.spec.string_gain
         return string_gain is None or string_gain(network) <= self.spec.policy.max_string_gain
 
-    def _plan_updates(self, environment_steps: int) -> list[tuple[bool, int, int]]:
-        """Return the updates of this iteration.
-
-        Each is (whether it uses environment rows, index of its part of the model rows, number of these parts).
-        """
-        without_model = (True, 0, 0)
+    def _plan_updates(self, environment_steps: int) -> list[PlannedUpdate]:
+        """Return the updates of this iteration."""
+        without_model = PlannedUpdate(True, 0, 0)
         if not self.model_rollouts or not self.learner.is_learning(environment_steps):
             return [without_model]
         settings = self.spec.model
         if settings.update_mode == "union":
-            return [(True, 0, 1)]
-        return [without_model, *((False, part, settings.model_updates) for part in range(settings.model_updates))]
+            return [PlannedUpdate(True, 0, 1)]
+        part_count = settings.model_updates
+        return [without_model, *(PlannedUpdate(False, part, part_count) for part in range(part_count))]
 
-    def _model_experience(self, iteration: int, part: int, parts: int) -> Experience | None:
-        """Return the part with index `part` of the current policy's experience in all models, or None."""
+    def _model_experience(self, iteration: int, part: int, part_count: int) -> Experience | None:
+        """Return part `part` of the current policy's experience in all models; None if there is none."""
         network = self.network()
-        results = [rollouts.roll_out(network, iteration, part, parts) for rollouts in self.model_rollouts]
+        results = [rollouts.roll_out(network, iteration, part, part_count) for rollouts in self.model_rollouts]
         rows = [experience for experience in results if experience is not None]
         return join_experience(rows) if rows else None
 
