@@ -46,9 +46,12 @@ GAPS_STUDY = "recorded-gaps"
 MEAN_GAPS = (73.0, 60.0, 50.0, 40.0)
 """largest mean gaps for which a formula is tuned [m]; the mean gap of human drivers is 30 m"""
 LARGEST_GAP_RATIO = PlanLimits().largest_gap / PlanLimits().largest_mean_gap
-AVERAGING, LIMITED = "smooth-acc", "acc with the limits of smooth-acc"
-FIXED_BY_FORMULA: dict[str, dict[str, float]] = {AVERAGING: {}, LIMITED: {"averaging_time": 0.0, "leader_weight": 1.0}}
-"""fixed parameters of `smooth-acc` by formula; without averaging it follows the present speed of its leader"""
+SMOOTH_ACC, LIMITED_ACC = "smooth-acc", "acc with the limits of smooth-acc"
+FIXED_BY_FORMULA: dict[str, dict[str, float]] = {
+    SMOOTH_ACC: {},
+    LIMITED_ACC: {"averaging_time": 0.0, "leader_weight": 1.0},
+}
+"""fixed parameters of `smooth-acc` by formula; without averaging it follows the current speed of its leader"""
 GAPS_BUDGET = SearchBudget(generations=14, size=24)
 START_SECONDS = 60.0
 """time at the start of each episode in which controllers open their gaps [s]"""
@@ -77,7 +80,7 @@ def gap_limits(mean_gap: float) -> PlanLimits:
 
 def search_space(formula: str, limits: PlanLimits) -> dict[str, FloatDistribution]:
     """Return the ranges of the parameters of a formula that are searched."""
-    space = SEARCH_SPACES[AVERAGING] | {"largest_gap": FloatDistribution(35.0, limits.largest_gap - 1.0)}
+    space = SEARCH_SPACES[SMOOTH_ACC] | {"largest_gap": FloatDistribution(35.0, limits.largest_gap - 1.0)}
     fixed = FIXED_BY_FORMULA[formula]
     return {name: distribution for name, distribution in space.items() if name not in fixed}
 
@@ -94,7 +97,7 @@ def tune_formula(folder: str, formula: str, mean_gap: float, workers: int) -> Ta
 def _tuned_driver(row: dict[str, Any]) -> str:
     """Return the name of the driver with the best parameters of a search."""
     parameters = FIXED_BY_FORMULA[row["law"]] | row["parameters"]
-    return f"{AVERAGING}:" + ",".join(f"{key}={value:g}" for key, value in parameters.items())
+    return f"{SMOOTH_ACC}:" + ",".join(f"{key}={value:g}" for key, value in parameters.items())
 
 
 def _formula_label(formula: str, mean_gap: float) -> str:
@@ -167,7 +170,7 @@ def gaps_table(folder: Path) -> pd.DataFrame:
 def _gap_row(results: DriveResults, label: str) -> dict[str, str]:
     formula, _, gap = label.rpartition(", ")
     is_tuned = formula in FIXED_BY_FORMULA
-    acc = f"{LIMITED}, {gap}" if formula == AVERAGING else label
+    acc = f"{LIMITED_ACC}, {gap}" if formula == SMOOTH_ACC else label
     mean_gap, largest = results.values(label, "cav_mean_gap").mean(), results.values(label, "cav_max_gap").max()
     return {
         "law": formula if is_tuned else label,
