@@ -163,6 +163,14 @@ def test_a_signal_during_imports_ends_a_command_with_one_line(
     assert (found.returncode, found.stdout, found.stderr) == (code, "", f"unjam: {word}\n")
 
 
+def test_a_signal_before_a_command_is_found_ends_in_one_line() -> None:
+    code = "import os, sys; sys.argv = ['unjam']; from unjam import cli\n"
+    code += "cli.exit_with_parent = lambda signum: os.kill(os.getpid(), 15)\n"
+    code += "import atexit, time; atexit.register(time.sleep, 0.2); cli.main()"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=50, check=False)
+    assert (found.returncode, found.stdout, found.stderr) == (143, "", "unjam: terminated\n")
+
+
 def test_an_import_of_the_package_changes_no_signal_handler() -> None:
     code = "import signal; handlers = [*map(signal.getsignal, range(1, 16))]\n"
     code += "import unjam; assert handlers == [*map(signal.getsignal, range(1, 16))]"

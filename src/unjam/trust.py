@@ -113,7 +113,7 @@ def forget_expected_code() -> Iterator[None]:
 
 
 def remember_trusted(code: Path, sha256: str = "") -> None:
-    """Remember code at this path, with `sha256` or its present hash, as trusted, at least for child processes."""
+    """Remember code at this path, with `sha256` or its current hash, as trusted, at least for child processes."""
     try:
         key = _trust_key(code, sha256 or read_code(code).sha256)
     except OSError:  # loading the code will report the error

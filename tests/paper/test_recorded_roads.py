@@ -25,7 +25,7 @@ from unjam_paper.information_ahead import (
     roads_with_vehicles_between,
 )
 from unjam_paper.parameter_search import SearchBudget, measure_candidates
-from unjam_paper.recorded_gaps import FIXED_BY_FORMULA, LIMITED, RECORDED_GAPS, gap_limits, search_space
+from unjam_paper.recorded_gaps import FIXED_BY_FORMULA, LIMITED_ACC, RECORDED_GAPS, gap_limits, search_space
 from unjam_paper.recorded_residuals import MODEL_RATIOS, planned_residuals
 from unjam_paper.recorded_roads import (
     DRIVE_SETTINGS,
@@ -216,9 +216,13 @@ def test_laws_are_tuned_for_each_gap_with_the_same_limits(folder: Path, monkeypa
     study = folder / "recorded-gaps"
     RECORDED_GAPS.run(StudyFolder(folder), 1, study, 1)
     names = {law: set(row["parameters"]) for row in read_part(study, "search") if (law := row["law"])}
-    assert names["smooth-acc"] - names[LIMITED] == {"averaging_time", "leader_weight"} == set(FIXED_BY_FORMULA[LIMITED])
+    assert (
+        names["smooth-acc"] - names[LIMITED_ACC]
+        == {"averaging_time", "leader_weight"}
+        == set(FIXED_BY_FORMULA[LIMITED_ACC])
+    )
     table = pd.read_csv(study / "gaps.csv", keep_default_na=False)
-    assert table["law"].tolist() == [*PUBLISHED_FILES, "smooth-acc", "smooth-acc", LIMITED, LIMITED]
+    assert table["law"].tolist() == [*PUBLISHED_FILES, "smooth-acc", "smooth-acc", LIMITED_ACC, LIMITED_ACC]
     assert table["tuned for a mean gap of"].tolist()[2:] == ["60 m", "40 m"] * 2
     assert (table["difference to that ACC [points]"] == NO_VALUE_TEXT).tolist() == [
         True,

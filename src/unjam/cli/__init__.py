@@ -198,6 +198,7 @@ def _has_working_folder() -> bool:
 
 def _print_error(message: str, code: int) -> int:
     """Print an error as one line; return the exit code."""
+    mark_as_handled()
     try:
         print(f"unjam: {printable(' '.join(message.split()))}", file=sys.stderr)
     except BrokenPipeError:

@@ -34,7 +34,7 @@ class SmoothACC(FormulaDriver):
     averaging_time: NonNegative = 8.0
     """time constant of the exponential mean of the leader's speed [s]"""
     leader_weight: Annotated[float, Field(ge=0, le=1)] = 0.2
-    """weight of the leader's present speed; the weight of its mean speed is 1 minus this weight"""
+    """weight of the leader's current speed; the weight of its mean speed is 1 minus this weight"""
     time_gap: NonNegative = 6.0
     """time gap in the long run [s]"""
     standstill_gap: NonNegative = 2.0

@@ -92,7 +92,7 @@ class WorldModel(Generic[EnsembleT, EpisodeSamplesT]):
         raise NotImplementedError
 
     def fit(self, seed: Seed) -> ModelFit:
-        """Continue to fit the ensemble to the present data."""
+        """Continue to fit the ensemble to the current data."""
         raise NotImplementedError
 
     def roll_out(self, plan: RolloutPlan) -> Iterator[Rollouts]:
