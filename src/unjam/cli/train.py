@@ -96,30 +96,30 @@ def train_command(
 
         result = train(config, folder, resume is not None, on_row, display and display.show_evaluation)
     if json:
-        roads = {name: _result_facts(road, result) for name, road in result.tasks.items()}
-        print_json(_result_facts(result, result) | ({"roads": roads} if roads else {}))
+        facts_by_task = {name: _result_facts(task_result, result) for name, task_result in result.tasks.items()}
+        print_json(_result_facts(result, result) | ({"roads": facts_by_task} if facts_by_task else {}))
         return
-    for name, road in (result.tasks or {"": result}).items():
+    for name, task_result in (result.tasks or {"": result}).items():
         if name:
             console.print(f"{name}:")
-        results = read_results(road.folder)
+        results = read_results(task_result.folder)
         output.print_wrapped(main_finding(results))
-        output.print_results(road.rows, show_all, first_metrics=["return"])
+        output.print_results(task_result.rows, show_all, first_metrics=["return"])
         output.print_notes(results.metadata["notes"])
-        err_console.print(f"controller: {road.controller}")
+        err_console.print(f"controller: {task_result.controller}")
         steps = max(config.steps, results.progress[-1]["environment_steps"])
         is_finished = config.evaluation.should_stop_early(read_progress(result.folder))
-        output.suggest_after_training(road.folder, road.gain, steps, result.folder, is_finished)
+        output.suggest_after_training(task_result.folder, task_result.gain, steps, result.folder, is_finished)
     err_console.print(f"report: {result.report}")
 
 
-def _result_facts(road: "TrainResult", run: "TrainResult") -> dict[str, Any]:
-    """Return the results of a run on one road for JSON; for a run on a single road both arguments are the same."""
+def _result_facts(task: "TrainResult", run: "TrainResult") -> dict[str, Any]:
+    """Return the results of a task of a run for JSON; a run without tasks is its own task."""
     return {
-        **{"folder": str(road.folder), "controller": str(road.controller), "report": str(run.report)},
-        "gain": asdict(road.gain) if road.gain else None,
-        "drivers": Evaluation(road.rows, {}).means(),
-        "notes": episode_notes(road.rows),
+        **{"folder": str(task.folder), "controller": str(task.controller), "report": str(run.report)},
+        "gain": asdict(task.gain) if task.gain else None,
+        "drivers": Evaluation(task.rows, {}).means(),
+        "notes": episode_notes(task.rows),
     }
 
 
@@ -164,8 +164,8 @@ class _TrainingProgress(output.ProgressReporter):
     def show_evaluation(self, episode: tuple[str, int], steps: int) -> None:
         """Show the progress of an episode in the evaluation after the training."""
         if not self._done:
-            roads = self._config.task_configs().items()
-            self._total = sum(evaluation_steps(road, self._folder / name) for name, road in roads)
+            configs = self._config.task_configs().items()
+            self._total = sum(evaluation_steps(config, self._folder / name) for name, config in configs)
             self._label = EVALUATION_LABEL
             self._bar.reset(self._task, description=EVALUATION_LABEL, total=self._total)
             if self._is_plain:

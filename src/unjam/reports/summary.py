@@ -27,11 +27,11 @@ from unjam.measures.verdict import Verdict, is_better, road_metrics, verdicts
 from unjam.reports.results import PlotEpisode, Results, is_outdated, original_command, selected_row
 from unjam.text import format_count, printable
 
-CLOSE_TIME_GAP = 1.0  # the report has a note on smaller time gaps [s]; h_max of the paper
+CLOSE_TIME_GAP = 1.0  # time gap below which the report has a note [s]; h_max of the paper
 IRRELEVANT_OPTIONS, IRRELEVANT_FLAGS = ("--out", "--workers"), ("--json", "--all")
 """options of a command with and without a value that have no effect on its results"""
 FORMULA_STARTS = {*"=+-@\t\r\n"}  # first characters of cells that a spreadsheet reads as formulas
-MAX_LIMIT_RATIO = 1.01  # the report has a note on larger ratios of mean speed to the limit
+MAX_LIMIT_RATIO = 1.01  # ratio of mean speed to the limit above which the report has a note
 COMPARED_METRICS = (
     *("mean_speed", "mean_speed_steady", "outflow_veh_per_h", "travel_time", "delay", "insertion_backlog_veh"),
     *(POWER_FUEL_METRIC, "share_standing", "speed_std_fleet", "speed_std_fleet_steady"),
@@ -134,8 +134,8 @@ def report_title(results: Sequence[Results]) -> str:
 def mismatch_warning(results: Sequence[Results]) -> str:
     """Return a warning if several folders have different roads, seeds or durations; else an empty text.
 
-    Networks that are compared as alternatives have an explanation instead. The roads of one training are different on
-    purpose and have no warning.
+    If user networks are compared with the first of them, an explanation replaces the warning. There is none for the
+    tasks of a training, which have different roads on purpose.
     """
     parents = {result.folder.resolve().parent for result in results}
     if len(parents) == 1 and (parents.pop() / "config.toml").is_file():

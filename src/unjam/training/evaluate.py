@@ -1,4 +1,4 @@
-"""Evaluation of several drivers on the same seeds, also of a run's controller on test seeds, saved for reports."""
+"""Evaluate several drivers on the same seeds, for instance the controller of a run, and save the results."""
 
 from collections.abc import Callable, Collection, Sequence
 from contextlib import nullcontext, suppress
