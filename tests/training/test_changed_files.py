@@ -13,6 +13,7 @@ from tests.worlds.sumo.user_networks import straight
 from unjam.controller import make_driver
 from unjam.errors import InputError
 from unjam.scenarios import Ring, make_scenario
+from unjam.scenarios.user_network import load_user_network
 from unjam.training.assess import assess
 from unjam.training.assessment_request import make_request
 from unjam.training.calibrate import FACTOR_RANGES, calibrate, load_corridor
@@ -165,3 +166,18 @@ def test_command_ends_if_a_recording_is_added(tmp_path: Path) -> None:
     options = {"recordings": str(folder)}
     with pytest.raises(InputError, match=r"^b\.csv: has changed since the start"):
         drive("recorded", "pi", 2, scenario_options=options, workers=1, progress=lambda *_: add("b.csv"))
+
+
+def test_detectors_that_change_while_the_network_is_read_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, detectors = straight(tmp_path, FLOW), tmp_path / "detectors.csv"
+    detectors.write_text(DETECTORS)
+
+    def load_slowly(*arguments: Any) -> Any:
+        detectors.write_text(DETECTORS.replace("1800", "1200"))
+        return load_user_network(*arguments)
+
+    monkeypatch.setattr("unjam.training.calibrate.load_user_network", load_slowly)
+    with pytest.raises(InputError, match=r"detectors\.csv: has changed since the start"):
+        load_corridor(str(file), detectors)

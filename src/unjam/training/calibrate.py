@@ -106,6 +106,7 @@ def load_corridor(file: str, detectors: Path, begin: float | None = None, end: f
     """
     if not file.endswith(".sumocfg"):
         raise invalid_value("scenario", file, "your own .sumocfg file")
+    watch = FileWatch(lambda: filter(Path.is_file, [detectors]))  # before the network, which can take minutes to read
     kind, all_measurements = read_detectors(detectors)
     # The penetration rate is so small that no vehicle is a CAV.
     times = {name: time for name, time in (("begin", begin), ("end", end)) if time is not None}
@@ -125,6 +126,7 @@ def load_corridor(file: str, detectors: Path, begin: float | None = None, end: f
     loop_indices = tuple(tuple(map(loops.index, detector_loops)) for detector_loops in loops_by_measurement)
     end_time = max(measurement.end for measurement in measurements)
     excluded_count = len(all_measurements) - len(measurements)
+    watch.check()
     return Corridor(files, detectors, first, end_time, measurements, excluded_count, loops, loop_indices)
 
 
