@@ -1,5 +1,6 @@
 """Pages of the documentation are plain Markdown, with the tables and pictures that the results give."""
 
+import ast
 import re
 from importlib import import_module
 from pathlib import Path
@@ -66,3 +67,15 @@ def test_tables_are_markdown_with_numbers_to_the_right_and_intervals_on_one_line
         "| a:b=1, c=2 | 1.0 | +1 [-2,_3] % | 5 |  |",
         r"| d | 2.0 | – | 12 | `e:f=1,g=2\|h` i |",
     ]
+
+
+def test_settings_in_texts_are_fields_of_the_package() -> None:
+    """A renamed setting also changes in the documentation."""
+    trees = [ast.parse(path.read_text()) for path in (ROOT / "src").rglob("*.py")]
+    classes = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    fields = {ast.unparse(node.target) for cls in classes for node in cls.body if isinstance(node, ast.AnnAssign)}
+    texts = [path.read_text() for path in (*PAGES, *ROOT.glob("*.md"), *(ROOT / "src").rglob("*.py"))]
+    keys = {key for text in texts for key in re.findall(r"""--set\s+['"]?([A-Za-z_][\w.]*)=""", text)}
+    assert len(keys) > 50
+    unknown = {part for key in keys for part in key.split(".") if not part.isdigit()} - fields
+    assert unknown <= {"key"}
