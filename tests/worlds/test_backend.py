@@ -146,6 +146,11 @@ def set_nan(self, commands):
     if self.control_steps == 20: self.speeds[3] = np.nan
 NaNSpeed = make_backend("NaNSpeed", simulate=set_nan)
 
+def reverse(self, commands):
+    IDMRing.simulate(self, commands)
+    if self.control_steps == 20: self.speeds[3] = -1.0
+Reverses = make_backend("Reverses", simulate=reverse)
+
 change_state = lambda **fields: lambda self: IDMRing.exact_state(self)._replace(**fields)
 NaNGap = make_backend("NaNGap", exact_state=change_state(leader_gap=np.full(1, np.nan)))
 WrongShape = make_backend("WrongShape", exact_state=change_state(leader_gap=np.ones(7)))
@@ -200,6 +205,7 @@ def faulty(own: str) -> str:
         ("AnswersNothing", r"supports\(\) returns None; allowed: a reason"),
         ("ReturnsTheWorld", r"open\(\) returns IDMRing; allowed: a context manager"),
         ("NaNSpeed", "speed of human_3 is nan at 2.1 s; allowed: finite"),
+        ("Reverses", "speed of human_3 is -1.00 at 2.1 s; allowed: at least 0"),
         ("NoCount", "control_steps is 0 at 0.1 s; allowed: 1"),
         ("Fails", r"ZeroDivisionError: division by zero \(idm_rings.py, line \d+\)"),
         ("NaNGap", "leader_gap of cav_0 is nan at 6 s; allowed: finite"),

@@ -84,7 +84,10 @@ class CheckedWorld:
             raise self._error(f"control_steps is {self.control_steps}", f"{self._step_count}, the number of calls")
         ids = getattr(self.road, "vehicle_ids", None)
         speeds = self._as_array("speeds", self.speeds, (len(ids) if ids else np.size(self.speeds),))
-        self._check_finite("speed", speeds, ids or [f"vehicle {row}" for row in range(len(speeds))])
+        ids = ids or [f"vehicle {row}" for row in range(len(speeds))]
+        self._check_finite("speed", speeds, ids)
+        if len(speeds) and speeds.min() < -STATE_TOLERANCE:
+            raise self._error(f"speed of {ids[int(speeds.argmin())]} is {speeds.min():.2f}", "at least 0")
 
     def record(self, driver_log: DriverLog) -> Episode:
         """Return the record; commands that were not carried out count as overridden in its audit."""
