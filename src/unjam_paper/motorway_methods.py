@@ -68,7 +68,7 @@ class Method:
 
 
 def _draw_value(generator: np.random.Generator, domain: Domain) -> Any:
-    """Draw a number of three digits from an interval, or a value of a list."""
+    """Draw a number from an interval, rounded to three significant digits, or a value of a list."""
     if isinstance(domain, tuple):
         low, high = domain
         return float(f"{generator.uniform(low, high):.3g}")

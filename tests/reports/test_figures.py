@@ -261,7 +261,7 @@ def test_time_series_of_human_drivers_alone_are_those_of_all_vehicles() -> None:
 def test_time_series_have_drivers_and_limit_in_the_legend() -> None:
     figure = time_series_figure(drivers(2))
     [legend] = figure.legends
-    assert [text.get_text() for text in legend.get_texts()] == ["driver 0", "driver 1", "limit"]
+    assert [text.get_text() for text in legend.get_texts()] == ["driver 0", "driver 1", "limit speed"]
     limit = panels_of(figure)[0].lines[-1]
     assert set(np.asarray(limit.get_ydata())) == {6.5}
 

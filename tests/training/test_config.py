@@ -121,7 +121,7 @@ def test_merging_does_not_change_its_arguments() -> None:
         ),
         (
             {"policy.reward_after_exit": True},
-            "policy.reward_after_exit: true is not allowed; allowed: false with a row model",
+            "policy.reward_after_exit: true is not allowed; allowed: false with model.kind: row",
         ),
         (
             {"policy.history_features": True, "policy.inputs": ["local"]},

@@ -134,7 +134,7 @@ def fit_one_step(
     The network has the weights of the epoch with the smallest error on `validation`. Raise `UnjamError` if a loss is
     not finite.
     """
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # results must not depend on the number of cores
     network = FollowingNetwork(settings, samples, seed)
 
     def to_tensors(samples: FollowingSamples) -> tuple[Tensor, Tensor]:
@@ -201,7 +201,7 @@ def fit_multi_step(
     `validation`. Also return the mean RMS gap error at each validation [m]; the first one is that of the IDM alone.
     `limits` are the limits of the acceleration [m/s2]. Raise `UnjamError` if a loss is not finite.
     """
-    torch.set_num_threads(1)
+    torch.set_num_threads(1)  # results must not depend on the number of cores
     network = FollowingNetwork(settings, following_samples(training.trajectories), seed, zero_init=True)
     segments = make_segments(training.trajectories, settings.segment_seconds)
     validation_segments = make_segments(validation.trajectories)

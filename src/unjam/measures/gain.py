@@ -31,7 +31,10 @@ def performance(row: dict[str, Any]) -> float:
 
 
 def performance_bound(row: dict[str, Any]) -> float:
-    """Return an upper bound of performance: that in free flow on open roads, and without waves on closed roads."""
+    """Return an upper bound of performance: free flow on open roads, and the limit speed on closed roads.
+
+    The limit speed is that of the road without waves, recovered from the ratio of the mean speed to it.
+    """
     if np.isfinite(row["travel_time"]):
         return row["delay"] - row["travel_time"]
     return row["mean_speed"] / row["speed_limit_ratio"]
@@ -82,7 +85,7 @@ def normalized_gain(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequenc
 
 
 def gain_by_seed(rows: EpisodeRows, baseline: EpisodeRows, reference: Sequence[float]) -> Floats:
-    """Return the gain on one road for each seed; the mean over seeds is that of `normalized_gain`.
+    """Return the clipped gain for each seed, shifted so that the mean over seeds is that of `normalized_gain`.
 
     The CI of a mean over roads that share seeds is computed from these values, shape (seeds,). The arguments are those
     of `normalized_gain`.

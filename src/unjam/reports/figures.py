@@ -125,7 +125,7 @@ def time_series_figure(episodes: Sequence[PlotEpisode]) -> Figure:
         panels[0].plot([], [], color=color, lw=1.2, label=short_label(episode.driver))
     limit = episodes[0].limit_speed
     if np.isfinite(limit):
-        panels[0].axhline(limit, color=TEXT_COLOR, lw=0.8, ls=":", label="limit")
+        panels[0].axhline(limit, color=TEXT_COLOR, lw=0.8, ls=":", label="limit speed")
     for axes in panels:
         axes.set_ylim(bottom=0)
     panels[-1].set_xlabel("time [s]")

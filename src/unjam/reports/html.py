@@ -229,9 +229,9 @@ def _wave_time(episode: PlotEpisode) -> float:
 def _replay_track(episode: PlotEpisode, step: float, frame_count: int, platoon_length: float) -> dict[str, Any]:
     """Return the positions and speeds of the vehicles, and the lines of the road.
 
-    Positions are along the loop on a closed road, and in the plane on other roads. A line has rows (coordinate along
-    the road, x, y) [m]. After an early end the vehicles stand still. Behind a recorded vehicle, the line has the length
-    of the longest platoon of all drivers, `platoon_length` [m].
+    Positions are along the loop on a closed road, and in the plane on other roads. A line has rows (position along a
+    loop, or 0 on other roads; x; y) [m]. After an early end the vehicles stand still. Behind a recorded vehicle, the
+    line has the length of the longest platoon of all drivers, `platoon_length` [m].
     """
     snapshots = np.round(np.arange(frame_count) * step / episode.control_step).astype(int)
     snapshots = snapshots.clip(max=len(episode.speeds) - 1)

@@ -174,7 +174,7 @@ class RunConfig(AgentSettings):
         allowed_sampling = "weights; regret needs several tasks and validations"
         checks = (
             (self.backend == "batch" and all(batch_reasons), "backend: batch", f"sumo ({batch_reasons[0]})"),
-            (lacks_exit_reward, "policy.reward_after_exit: true", "false with a row model"),
+            (lacks_exit_reward, "policy.reward_after_exit: true", "false with model.kind: row"),
             (self.unused_setting, self.unused_setting, f"none for the agent {self.agent}"),
             (lacks_memory, "policy.history_features: true", "false, or true with expert_memory among the inputs"),
             (lacks_validation, f"evaluation.patience: {patience}", "0 without validations"),
@@ -344,7 +344,7 @@ def _check_preset_conflicts(preset: str, tasks: Sequence[dict[str, Any]], user_v
     names = ("scenario", "reward", "scenario_options")
     for name, value in flatten_keys({key: value for key, value in user_values.items() if key in names}).items():
         if all(flatten_keys(task).get(name, "") not in ("", value) for task in tasks):
-            raise invalid_value(name, value, f"none with the preset {preset}: its roads have their own")
+            raise invalid_value(name, value, f"no value with the preset {preset}: its tasks set it")
 
 
 def to_toml(config: RunConfig) -> str:
