@@ -278,7 +278,7 @@ def test_expert_is_made_by_name() -> None:
     ],
 )
 def test_conflict_with_all_tasks_of_a_preset_is_refused(changes: dict[str, Any], name: str) -> None:
-    with pytest.raises(InputError, match=re.escape(f"{name} is not allowed; allowed: none with the preset rings")):
+    with pytest.raises(InputError, match=re.escape(f"{name} is not allowed; allowed: no value with the preset rings")):
         load_config(None, "rings", changes)
     assert load_config(None, "rings", {"scenario_options.horizon": 200}).make_tasks()[0].scenario.horizon == 200
 
